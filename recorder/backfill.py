@@ -141,6 +141,9 @@ class GapRepair:
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
         """Receives the replies of the site, and sends the next request if messages are missing.
 
+        The recorder calls this regularly for each site, the process that runs one arm. The
+        method does not wait for replies.
+
         Args:
             now_ns: Present time on the monotonic clock, in ns.
             alive: True if the site is present on the network, so that it can reply.
@@ -163,7 +166,9 @@ class GapRepair:
         if self._reception.final_ticks is not None:
             if self._ended_ns is None:
                 self._ended_ns = now_ns
-            if now_ns - max(self._ended_ns, self._progress_ns) > GIVE_UP_NS:
+            # After its end, the site sends what it still has, until nothing more comes.
+            waited_since_ns = max(self._ended_ns, self._progress_ns)
+            if now_ns - waited_since_ns > GIVE_UP_NS:
                 self._reception.give_up()
 
     def _probe_if_silent(self, now_ns: int) -> None:
@@ -178,8 +183,9 @@ class GapRepair:
         """
         last_received_ns = self._reception.last_received_ns or 0
         silence_ns = now_ns - max(last_received_ns, self._probed_ns)
-        longest_ns = max(SILENT_NS, 3 * self._reception.period_ns)
-        if self._reception.final_ticks is None and silence_ns > longest_ns:
+        longest_silence_ns = max(SILENT_NS, 3 * self._reception.period_ns)
+        is_running = self._reception.final_ticks is None
+        if is_running and silence_ns > longest_silence_ns:
             self._probed_ns = now_ns
             self.probe()
 
@@ -238,7 +244,8 @@ class GapRepair:
                 continue
 
             first, last_missing = requested_range
-            last = self._extend_over_gaps(account, last_missing, first + self._request_size - 1)
+            highest = first + self._request_size - 1
+            last = self._extend_over_gaps(account, last_missing, highest)
             return BackfillRequest(channel=channel, first=first, last=last)  # type: ignore[arg-type]
         return None
 
@@ -257,9 +264,12 @@ class GapRepair:
         """
         while last_missing < limit:
             next_gap = account.find_requestable_gap(last_missing + 1)
-            if next_gap is None or next_gap[0] > limit:
+            if next_gap is None:
                 break
-            last_missing = next_gap[1]
+            gap_first, gap_last = next_gap
+            if gap_first > limit:
+                break
+            last_missing = gap_last
         return min(last_missing, limit)
 
     def _receive_reply(
@@ -344,7 +354,10 @@ class GapRepair:
     def _accept_reply(
         self, backfill: Backfill, request: BackfillRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Counts the messages of a reply, yields those that are new, and schedules a request.
+        """Evaluates a reply that contains messages which were lost before.
+
+        The messages that are new are yielded. A reply that fills no gap is counted, because the
+        recorder gives up after several of them. Finally the next request is scheduled.
 
         Args:
             backfill: The reply.
@@ -384,6 +397,7 @@ class GapRepair:
         self._due_ns = now_ns
         if is_useful:
             self._progress_ns = now_ns
+
         is_gap_closed = gap is None or gap[0] > request.first
         if is_useful or is_gap_closed:
             self._vain_requests[channel] = 0
@@ -392,7 +406,7 @@ class GapRepair:
             self._count_vain_request(channel)
 
     def _count_vain_request(self, channel: str) -> None:
-        """Counts a reply that filled no gap. After `MAX_VAIN_REQUESTS`, the gaps are given up.
+        """Counts a reply that filled no gap, and gives up after `MAX_VAIN_REQUESTS` of them.
 
         All messages that are missing in the channel then count as missing for good.
 

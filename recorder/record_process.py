@@ -143,6 +143,8 @@ class Recorder:
     def join(self, timeout_s: float | None) -> Epoch | None:
         """Waits until the session begins. If it is running already, the recorder joins it.
 
+        The members of a session, the recorder included, first agree on a common start time.
+
         Args:
             timeout_s: Longest time to wait, in s. None means no limit.
 
@@ -154,13 +156,15 @@ class Recorder:
         Raises:
             SessionError: The session did not begin in time.
         """
-        begun_ns = self._clock.monotonic_ns()
+        started_ns = self._clock.monotonic_ns()
         while not (self._stopped() or self._is_ending()):
             epoch = self._joining.poll()
             if epoch is not None:
                 return epoch
+
             now_ns = self._clock.monotonic_ns()
-            if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
+            is_too_late = timeout_s is not None and now_ns - started_ns > timeout_s * 1e9
+            if is_too_late:
                 members = ", ".join(self._joining.membership.others) or "none"
                 raise SessionError(
                     f"the recorder waited {timeout_s:g} s for session {self._session!r} "
@@ -240,20 +244,24 @@ class Recorder:
     def _find_scenario(self, epoch: Epoch) -> RecordedScenario:
         """Returns the scenario to record, which a member has sent with its identity.
 
-        A recorder needs no scenario file. Members that were started again since the agreement,
-        and so have another boot (random number of a start), are ignored.
+        A recorder needs no scenario file. Members that were started again after the common
+        start was agreed are ignored. They have another boot, the random number of a start.
 
         Args:
             epoch: Agreed start of the session, with the boots of its members.
         """
-        return next(
-            self._read_scenario(info.scenario, info.member)
+        agreed_members = [
+            info
             for info in self._joining.membership.others.values()
-            if info.scenario and epoch.boots.get(info.member) == info.boot
-        )
+            if epoch.boots.get(info.member) == info.boot
+        ]
+        sender = next(info for info in agreed_members if info.scenario)
+        return self._read_scenario(sender.scenario, sender.member)
 
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
         """Announces that the recorder runs. If it joins late, it requests the earlier messages.
+
+        The other members then know that their messages are recorded.
 
         Args:
             recording: The recording.
@@ -264,11 +272,14 @@ class Recorder:
         now_ns = self._clock.monotonic_ns()
         self._publisher.update(running=True)
         text = "the session begins"
-        if epoch.boots.get(info.member) != info.boot:
-            text = f"joins the session, which runs since {(now_ns - epoch.mono_ns) / 1e9:.1f} s"
+        joins_late = epoch.boots.get(info.member) != info.boot
+        if joins_late:
+            elapsed_s = (now_ns - epoch.mono_ns) / 1e9
+            text = f"joins the session, which runs since {elapsed_s:.1f} s"
             recording.assume_gone()
             self._receive_presence(recording)
             recording.join_late(now_ns)
+
         self._say(f"recorder: {text}, writing {path}")
         for clock_text in describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns):
             self._say(f"recorder: {clock_text}")
@@ -289,28 +300,30 @@ class Recorder:
             recording: The recording.
             report: Publishes the statistics.
         """
-        ending_ns: int | None = None
+        ending_since_ns: int | None = None
         while not (self._stopped() or recording.is_over(self._clock.monotonic_ns())):
             now_ns = self._clock.monotonic_ns()
-            if ending_ns is None and self._is_ending():
-                ending_ns = now_ns
+            if ending_since_ns is None and self._is_ending():
+                ending_since_ns = now_ns
                 self._say(
                     "recorder: asks for the records that are missing, until none comes for "
                     f"{_END_S} s; Ctrl-C a second time ends it at once"
                 )
-            if ending_ns is not None:
-                unrepaired_ns = now_ns - max(ending_ns, recording.repaired_ns)
-                has_waited = unrepaired_ns > END_NS or now_ns - ending_ns > LONGEST_END_NS
-                if has_waited or recording.is_up_to_date(ending_ns, now_ns):
+            if ending_since_ns is not None:
+                # Wait for missing messages as long as some of them arrive, but not for ever.
+                waited_ns = now_ns - ending_since_ns
+                without_arrival_ns = now_ns - max(ending_since_ns, recording.repaired_ns)
+                has_waited = without_arrival_ns > END_NS or waited_ns > LONGEST_END_NS
+                if has_waited or recording.is_up_to_date(ending_since_ns, now_ns):
                     return
 
             self._publisher.answer_queries()
             recording.write(self._queue, now_ns)
             self._receive_presence(recording)
             report.poll()
-            written_ns = self._clock.monotonic_ns()
+            flush_start_ns = self._clock.monotonic_ns()
             recording.flush()
-            report.note_flush(self._clock.monotonic_ns() - written_ns)
+            report.note_flush(self._clock.monotonic_ns() - flush_start_ns)
             self._repair_until(recording, now_ns + FLUSH_NS)
 
     def _repair_until(self, recording: Recording, until_ns: int) -> None:

@@ -247,9 +247,12 @@ class Recording:
             now_ns: Present time on the monotonic clock, in ns.
         """
         text = f"every record of {site.name} is stored"
-        missing = site.describe_missing()
-        if missing:
-            text = f"all that can be had of {site.name} is stored; missing for good: {missing}"
+        missing_text = site.describe_missing()
+        if missing_text:
+            text = (
+                f"all that can be had of {site.name} is stored; "
+                f"missing for good: {missing_text}"
+            )
         t_ns = now_ns - self.epoch.mono_ns
         self.publisher.publish(
             "stored", text, t_ns=t_ns, about=site.name, ticks=site.final_ticks
@@ -257,6 +260,9 @@ class Recording:
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
         """Writes the messages of the queue, and counts those that cannot be written as dropped.
+
+        The writing thread calls this regularly. A message that cannot be written, for example
+        because it is invalid, must not end the recording.
 
         Args:
             queue: Queue of the received messages.
@@ -313,7 +319,7 @@ class Recording:
                 self._gone_sites.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
-        """Notes that a site was started again, if a message is its event of joining.
+        """Notes that a site was started again, if a message is the event that announces it.
 
         From then on, messages of the new start are expected. A message that announces another
         member, or a scenario in which sites may not return, changes nothing.
@@ -326,9 +332,11 @@ class Recording:
             WireError: The message is not an event.
         """
         event = decode(payload, Event)
-        if event.kind not in ("coming", "join") or event.member != name:
+        is_announcement = event.kind in ("coming", "join") and event.member == name
+        if not is_announcement:
             return
-        if event.boots.get(name) == event.boot and self._scenario.sites_may_return:
+        names_own_boot = event.boots.get(name) == event.boot
+        if names_own_boot and self._scenario.sites_may_return:
             self._next_boots[name] = event.boot
             self._admit_starts()
 
@@ -428,7 +436,10 @@ class Recording:
         self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
 
     def _write_block(self, key: str, block: bytes, mono_ns: int) -> None:
-        """Writes the records of a block up to the first payload that is not a valid record.
+        """Writes the records of a block, the results of several control periods of a site.
+
+        The first payload that is not a valid record ends the block, because its sender is
+        faulty.
 
         Args:
             key: Key under which the block arrived.
@@ -438,11 +449,11 @@ class Recording:
         Raises:
             WireError: A payload is not a valid record.
         """
-        site = self._channels[key][0]
-        since_ns = mono_ns - self.epoch.mono_ns
-        site.since_ns = since_ns
-        log_time_ns = self.epoch.unix_ns + since_ns
-        add = self._writer.add
+        site, _ = self._channels[key]
+        since_epoch_ns = mono_ns - self.epoch.mono_ns
+        site.since_ns = since_epoch_ns
+        log_time_ns = self.epoch.unix_ns + since_epoch_ns
+        add = self._writer.add  # read once, because this loop runs for every record
         for payload, record in site.accept_records(split_states(block), mono_ns):
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
@@ -554,8 +565,8 @@ class Recording:
         """
         # Every site is examined, because `_has_left` notes the time at which a site
         # disappeared.
-        left = [self._has_left(name, now_ns) for name in self._sites]
-        return all(left)
+        have_left = [self._has_left(name, now_ns) for name in self._sites]
+        return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
         """Finds out whether the recorder need not wait for any more messages of a site.
@@ -648,20 +659,25 @@ class Recording:
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
         """Formats the numbers of received and missing messages, as they are stored in the log.
 
+        A reader of the log can see from these numbers whether the log is complete.
+
         Args:
             queue: Queue of the received messages, which counts those for which it had no room.
 
         Returns:
             A line for each topic, and the number of dropped messages for each reason.
         """
-        event_accounts = {
-            topics.key(self.session, name, topics.EVENT): site.event_accounts
-            for name, site in self._sites.items()
-        }
+        # Counts of the events of earlier starts of a site, by key.
+        event_accounts = {}
+        for name, site in self._sites.items():
+            event_key = topics.key(self.session, name, topics.EVENT)
+            event_accounts[event_key] = site.event_accounts
         texts = {}
         for key, account in self.accounts.items():
-            counts = account.describe(*event_accounts.get(key, ()))
+            earlier_accounts = event_accounts.get(key, ())
+            counts = account.describe(*earlier_accounts)
             texts[f"/{key}"] = f"{counts}, overflowed {queue.overflowed[key]}"
+
         for reason, count in self.dropped.items():
             texts[f"dropped: {reason}"] = str(count)
         return texts
@@ -669,14 +685,16 @@ class Recording:
     def render_summary(self) -> list[str]:
         """Summarises the recording for the user.
 
+        The user sees there whether the log is complete.
+
         Returns:
             A line for each site with the numbers of its records, and a line for each reason why
             messages were not written.
         """
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
-            messages = count_nouns(self._overflowed, "message")
-            lines.append(f"recorder: {messages} turned away because the queue was full")
+            messages_text = count_nouns(self._overflowed, "message")
+            lines.append(f"recorder: {messages_text} turned away because the queue was full")
         for reason, count in self.dropped.items():
             lines.append(f"recorder: {count_nouns(count, 'message')} dropped: {reason}")
         return lines
@@ -690,36 +708,39 @@ class Recording:
             site: Reception of the site.
         """
         account = site.accounts[topics.STATE]
-        total = f" of {count_nouns(account.expected, 'record')}"
+        total_text = f" of {count_nouns(account.expected, 'record')}"
         if site.final_ticks is None:
-            total = " records, its end is unknown"
+            total_text = " records, its end is unknown"
+
         line = (
-            f"recorder: {site.name}: {account.received}{total}, {account.missing} missing, "
-            f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
+            f"recorder: {site.name}: {account.received}{total_text}, "
+            f"{account.missing} missing, {account.duplicate} duplicate, "
+            f"largest gap {account.largest_gap}"
         )
+
         if account.refilled:
             line += f", {account.refilled} from its memory"
         if site.skipped_ticks:
             line += f", {site.skipped_ticks} skipped"
-        not_made_away = account.unpublished - site.skipped_ticks
-        if not_made_away:
-            line += f", {not_made_away} not made while it was away"
+        absent_ticks = account.unpublished - site.skipped_ticks
+        if absent_ticks:
+            line += f", {absent_ticks} not made while it was away"
         return line
 
     def describe_problem(self) -> str | None:
-        """Describes the first problem of the recording, for the error message at its end.
+        """Returns the first problem of the recording, for the error message at its end.
 
         Returns:
-            The site that disappeared or lacks messages, as a string. None if there is no
+            A sentence about a site that disappeared or lacks messages. None if there is no
             problem.
         """
         for name, site in self._sites.items():
             if site.final_ticks is None:
-                records = count_nouns(site.accounts[topics.STATE].received, "record")
-                return f"{name} disappeared after {records}"
-            missing = site.describe_missing()
-            if missing:
-                return f"missing of {name}: {missing}"
+                records_text = count_nouns(site.accounts[topics.STATE].received, "record")
+                return f"{name} disappeared after {records_text}"
+            missing_text = site.describe_missing()
+            if missing_text:
+                return f"missing of {name}: {missing_text}"
         return None
 
 
@@ -777,11 +798,13 @@ class RecorderReport:
         messages.
         """
         now_ns = self._clock.monotonic_ns()
-        if now_ns >= self._due_ns:
-            # After a long delay, the missed statistics are not published later.
-            is_on_time = now_ns - self._due_ns < REPORT_EVERY_NS
-            self._due_ns = (self._due_ns if is_on_time else now_ns) + REPORT_EVERY_NS
-            self.publish()
+        if now_ns < self._due_ns:
+            return
+        # After a long delay, the missed statistics are not published later.
+        is_on_time = now_ns - self._due_ns < REPORT_EVERY_NS
+        counted_from_ns = self._due_ns if is_on_time else now_ns
+        self._due_ns = counted_from_ns + REPORT_EVERY_NS
+        self.publish()
 
     def publish(self) -> None:
         """Publishes the statistics of the recording now, and also writes them into the log.
@@ -795,7 +818,11 @@ class RecorderReport:
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
-        """Returns the present statistics: expected, received and missing messages, and gaps."""
+        """Returns the present statistics of the recording, for people who watch the session.
+
+        They have, for each channel, the numbers of expected, received and missing messages, and
+        the ranges of the missing ones.
+        """
         recording = self._recording
         now_ns = self._clock.monotonic_ns()
         stats = RecorderStats(
@@ -811,7 +838,9 @@ class RecorderReport:
             mono_ns=now_ns,
             unix_ns=self._clock.unix_ns(),
         )
-        gap_limit = max(1, min(_MAX_GAPS_REPORTED, _ALL_GAPS // len(recording.accounts)))
+        # The size of the statistics is bounded, however many channels there are.
+        gaps_per_channel = _ALL_GAPS // len(recording.accounts)
+        gap_limit = max(1, min(_MAX_GAPS_REPORTED, gaps_per_channel))
         for key, account in recording.accounts.items():
             # A key is "trilat/SESSION/MEMBER/CHANNEL". The statistics use "MEMBER/CHANNEL".
             name = "/".join(key.split("/")[2:])

@@ -109,9 +109,10 @@ class InboundQueue:
         return len(self._queue)
 
     def receive(self, key: str, payload: bytes) -> None:
-        """Adds a message with the time of its arrival, if there is room.
+        """Adds a message to the queue with the time of its arrival, if there is room.
 
-        The network calls this.
+        The network calls this method in its threads. The bytes of each key are limited, so that
+        one sender cannot fill the queue.
 
         Args:
             key: Key under which the message was published.
@@ -119,9 +120,11 @@ class InboundQueue:
         """
         size = len(payload) + _OVERHEAD_BYTES
         with self._receive_lock:
+            # The number of counted keys is limited too. Further keys share one counter.
             counted_key = key
             if key not in self._received_bytes and len(self._received_bytes) >= KEYS:
                 counted_key = _OTHER_KEYS
+
             waiting_bytes = self._total_received_bytes - self._total_drained_bytes
             key_bytes = self._received_bytes[counted_key] - self._drained_bytes[counted_key]
             is_full = len(self._queue) >= CAPACITY or waiting_bytes >= CAPACITY_BYTES
@@ -134,6 +137,9 @@ class InboundQueue:
 
     def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
         """Removes waiting messages from the queue, so that they can be written.
+
+        The threads of the network fill the queue, and the thread that writes the log calls this
+        method.
 
         Args:
             until_ns: Messages that arrived after this time stay in the queue, in ns on the
@@ -227,17 +233,20 @@ class SiteReception:
         self.event_accounts: tuple[Account, ...] = ()
         self.skipped_ticks = 0
         self.since_ns: float = math.inf
+
         if before is not None:
             self.accounts = {**before.accounts, topics.EVENT: Account()}
             self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
             self.skipped_ticks = before.skipped_ticks
             self.since_ns = before.since_ns
+
         self.final_ticks: int | None = None
         self.last_received_ns: int | None = None
         self._boot = boot
         self._ticks = scenario.ticks(name)
         self._rate_hz = scenario.sites[name].rate_hz
         self.period_ns = 1_000_000_000 // self._rate_hz
+
         layout = scenario.layout(name)
         self._decoders = {
             channel: make_decoder(CHANNEL_TYPES[channel], layout=layout)
@@ -248,6 +257,7 @@ class SiteReception:
             channel: StartGap(self.accounts[channel], count_under_way(channel, self._rate_hz))
             for channel in (topics.STATE, topics.LINK)
         }
+
         self._event_bytes_left = EVENT_BYTES + round(_EVENT_BYTES_PER_S * scenario.duration_s)
         self._largest_counts = {
             channel: count_messages(channel, self._ticks, self._rate_hz)
@@ -257,6 +267,8 @@ class SiteReception:
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
         """Decodes a message of the site and checks its sender and number, without counting it.
+
+        The message is written to the log only if this method accepts it.
 
         Args:
             channel: Name of the channel in which the message arrived.
@@ -285,6 +297,9 @@ class SiteReception:
     def _read_event(self, payload: bytes) -> SiteMessage:
         """Decodes and checks an event, and subtracts its size from the permitted bytes.
 
+        An event is a rare message, for example about the end of the run. The total size of a
+        site's events is limited, so that a faulty sender cannot fill the disk.
+
         Raises:
             WireError: The payload is not a valid event of this site, or there were too many.
         """
@@ -295,18 +310,24 @@ class SiteReception:
                 f"{self.name} reports {count_nouns(event.ticks, 'tick')}, but must report 0 to "
                 f"{self._ticks}",
             )
+        # Only these two events state how many ticks the site has executed.
+        stated_ticks = event.ticks if event.kind in ("join", "end") else 0
         self._check(
             channel=topics.EVENT,
             sender=event.member,
             boot=event.boot,
             number=event.n,
-            ticks=event.ticks if event.kind in ("join", "end") else 0,
+            ticks=stated_ticks,
         )
         self._reserve_event_bytes(event, len(payload))
         return SiteMessage(event.n, event.n, event.t_ns, event)
 
     def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
         """Checks that a message comes from the current start of the site and is plausible now.
+
+        A site that was restarted has a new start, and messages of its earlier process must no
+        longer be accepted. A number that is too large would make the recorder request messages
+        that do not exist.
 
         Args:
             channel: Channel of the message.
@@ -420,6 +441,9 @@ class SiteReception:
     def accept(self, channel: str, message: SiteMessage, received_ns: int) -> bool:
         """Counts a message that the site published in the normal way, without a request.
 
+        A gap between its number and that of the previous message shows that messages are
+        missing.
+
         Args:
             channel: Name of the channel.
             message: The message, decoded and checked by `read`.
@@ -437,6 +461,9 @@ class SiteReception:
     def refill(self, channel: str, message: SiteMessage) -> bool:
         """Counts a message that the site sent again from its buffer after a request.
 
+        The log may contain each message only once. Therefore a message that has arrived already
+        is not counted again.
+
         Args:
             channel: Name of the channel.
             message: The message, as `read` has decoded and checked it.
@@ -450,6 +477,9 @@ class SiteReception:
 
     def check_sender(self, reply: Backfill) -> None:
         """Checks that a reply with missing messages comes from the right process of this site.
+
+        The reply of an earlier start of the process would contain messages with the same
+        numbers but other contents.
 
         Args:
             reply: The reply.
@@ -523,6 +553,7 @@ class SiteReception:
         skipped = count_skipped_ticks(record.cmd) if record.cmd else 0
         if not skipped:
             return
+
         for channel in (topics.STATE, topics.LINK):
             next_number, published = skipped_numbers(
                 channel, record.tick, skipped, self._rate_hz
@@ -547,6 +578,7 @@ class SiteReception:
         previous_ticks = 0
         if self._before is not None and self._before.final_ticks is not None:
             previous_ticks = self._before.final_ticks
+
         for channel, gap in self._start_gaps.items():
             first_number = count_messages(channel, first_tick, self._rate_hz)
             previously_published = count_messages(channel, previous_ticks, self._rate_hz)
@@ -584,5 +616,6 @@ class SiteReception:
         for channel, account in self.accounts.items():
             if account.missing:
                 counts = f"{account.missing} of {account.expected} {_CHANNEL_NOUNS[channel]}"
-                texts.append(f"{counts} ({' '.join(account.format_gaps(5))})")
+                first_gaps = " ".join(account.format_gaps(5))
+                texts.append(f"{counts} ({first_gaps})")
         return ", ".join(texts)

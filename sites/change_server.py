@@ -116,17 +116,20 @@ class ChangeServer:
         self.marks: list[tuple[int, str]] = []
         self.sources: dict[str, str] = {}
 
-    def pop_changes(self, k: int) -> Sequence[CoreChange]:
-        """Replies to all waiting requests, and returns the changes for the next tick.
+    def pop_changes(self, next_tick: int) -> Sequence[CoreChange]:
+        """Replies to all waiting requests of users, and returns the changes for the next tick.
+
+        A tick is one period of the control loop of the arm, which calls this method before each
+        tick.
 
         Args:
-            k: Number of the next tick, a period of the control loop.
+            next_tick: Number of the next tick.
 
         Returns:
             The changes that the site applies in that tick. Empty if none was accepted since the
             last call.
         """
-        self._update_stopped(k)
+        self._update_stopped(next_tick)
 
         changes: list[CoreChange] = []
         has_order = False
@@ -139,48 +142,56 @@ class ChangeServer:
                     self._deferred = query
                     break
 
-                text, tick, change = self._accept(request, k)
+                text, effect_tick, change = self._accept(request, next_tick)
                 if change is not None:
                     changes.append(change)
                     has_order = has_order or bool(request.order)
                     if isinstance(request.source, str):
                         self.sources[change.text] = request.source
-                reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
+                reply = ChangeReply(
+                    member=self._site, accepted=True, text=text, tick=effect_tick
+                )
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
+
             query.reply(encode(reply))
         return changes
 
-    def _accept(self, request: ChangeRequest, k: int) -> tuple[str, int, CoreChange | None]:
-        """Accepts a request, or refuses it with an error.
+    def _accept(
+        self, request: ChangeRequest, next_tick: int
+    ) -> tuple[str, int, CoreChange | None]:
+        """Carries out the request of a user, or refuses it with an error.
+
+        A request changes a setting, marks the present moment in the log, gives an order such as
+        "stop" to the arm, or ends the run.
 
         Args:
             request: The request.
-            k: Next tick.
+            next_tick: Number of the next tick, a period of the control loop.
 
         Returns:
             The text of the reply, the tick from which on the request has an effect, and the
-            change for the simulation kernel. The change is None for marks and for the end of
-            the run.
+            change that the computation of the tick applies. The change is None for marks and
+            for the end of the run.
 
         Raises:
             ScenarioError: The site refuses the request.
         """
         if request.stop_s is not None:
-            text, tick = self._schedule_stop(k, request.stop_s)
-            return text, tick, None
+            text, end_tick = self._schedule_stop(next_tick, request.stop_s)
+            return text, end_tick, None
         if request.mark:
-            return self._add_mark(k, request.mark), k, None
+            return self._add_mark(next_tick, request.mark), next_tick, None
         if request.order:
-            change = self._make_order_change(k, request.order)
-            return f"{self._site}: {request.order} at tick {k}", k, change
+            change = self._make_order_change(next_tick, request.order)
+            return f"{self._site}: {request.order} at tick {next_tick}", next_tick, change
 
         # A change of a link or of weights, which takes effect later.
-        start_ns = tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000
+        start_ns = tick_ns(next_tick, self._rate_hz) + AHEAD_MS * 1_000_000
         first = first_tick_at(start_ns, self._rate_hz)
         change = self._make_change(request, first)
         text = (
-            f"{self._site} accepts the change at tick {k}; "
+            f"{self._site} accepts the change at tick {next_tick}; "
             f"the change takes effect at tick {first}"
         )
         return text, first, change
@@ -200,7 +211,8 @@ class ChangeServer:
     def _poll_stop(self) -> Query | None:
         """Returns the next order to stop from a member that may send no other request.
 
-        Other requests of such a member are refused here. The order may name its source.
+        Any member of a session may stop an arm for safety, while only the operator may change
+        more. Other requests of such a member are refused here. The order may name its source.
         """
         while self._stops is not None and (query := self._stops.poll()) is not None:
             with suppress(WireError):
@@ -212,11 +224,13 @@ class ChangeServer:
             query.reply(encode(ChangeReply(member=self._site, accepted=False, text=text)))
         return None
 
-    def _add_mark(self, k: int, text: str) -> str:
+    def _add_mark(self, next_tick: int, text: str) -> str:
         """Stores a mark, a text for the log, until its event is published.
 
+        For example, a user marks the moment of a contact, to find it in the log later.
+
         Args:
-            k: Next tick, which the mark names.
+            next_tick: Next tick, which the mark names.
             text: Text of the mark, for example "contact".
 
         Returns:
@@ -229,14 +243,14 @@ class ChangeServer:
             raise ScenarioError(
                 f"at most {MARKS_WAITING} marks can be pending at once; try again in 100 ms"
             )
-        self.marks.append((k, text))
-        return f"{self._site} marks tick {k}"
+        self.marks.append((next_tick, text))
+        return f"{self._site} marks tick {next_tick}"
 
-    def _make_order_change(self, k: int, order: SiteOrder) -> CoreChange:
+    def _make_order_change(self, tick: int, order: SiteOrder) -> CoreChange:
         """Returns the change with which the order of a user takes effect in a tick.
 
         Args:
-            k: The tick.
+            tick: Number of the tick, a period of the control loop.
             order: The order: "stop", "enable" or "reset".
 
         Raises:
@@ -250,20 +264,24 @@ class ChangeServer:
                 f"{self._site} is in mode {MODE_WORDS[mode]}; "
                 f"{order} is possible only in mode {MODE_WORDS[needed]}"
             )
+
         if needed is not None and not self._is_held():
             raise ScenarioError(
                 f"the dead-man switch of {self._site} is not held; {order} the site while the "
                 "switch is held"
             )
-        change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))
+
+        change = make_site_order(
+            self._scenario, self._site, order, tick_ns(tick, self._rate_hz)
+        )
         return to_core_change(self._scenario, change)
 
-    def _schedule_stop(self, k: int, stop_s: float) -> tuple[str, int]:
+    def _schedule_stop(self, next_tick: int, stop_s: float) -> tuple[str, int]:
         """Schedules the end of the run, unless an earlier end is scheduled already.
 
         Args:
-            k: Next tick. It is executed in any case, so that the run ends after it at the
-                earliest.
+            next_tick: Number of the next tick, a period of the control loop. It is executed in
+                any case, so that the run ends after it at the earliest.
             stop_s: Requested end, in s since the epoch, the common start of the session.
 
         Returns:
@@ -271,22 +289,25 @@ class ChangeServer:
         """
         planned_end = self._ticks if self._stop_tick is None else self._stop_tick
         requested_end = first_tick_at(round(stop_s * 1e9), self._rate_hz)
-        earliest_end = k + 1
+        earliest_end = next_tick + 1
         self._stop_tick = min(max(requested_end, earliest_end), planned_end)
-        self._update_stopped(k)
+
+        self._update_stopped(next_tick)
         text = f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s"
         return text, self._stop_tick
 
-    def _update_stopped(self, k: int) -> None:
-        """Sets `stopped` if tick `k`, the next one, is the last tick before a requested end.
+    def _update_stopped(self, next_tick: int) -> None:
+        """Sets `stopped` if the next tick is the last one before a requested end of the run.
 
         If nobody has requested the end, nothing changes.
         """
         if self._stop_tick is not None:
-            self.stopped = k + 1 >= self._stop_tick
+            self.stopped = next_tick + 1 >= self._stop_tick
 
     def _make_change(self, request: ChangeRequest, first: int) -> CoreChange:
-        """Returns the requested change of a link or of the weights of the peers.
+        """Returns the requested change of a link between sites, or of the weights of the peers.
+
+        The weights say how strongly the arm follows each of the other sites (peers).
 
         Args:
             request: The request.
@@ -307,7 +328,8 @@ class ChangeServer:
 
         # The kernel stores a limited number of weight changes that have not begun yet.
         pending_ns = self._pending_ramps_ns
-        while pending_ns and pending_ns[0] <= from_ns - AHEAD_MS * 1_000_000:
+        present_ns = from_ns - AHEAD_MS * 1_000_000
+        while pending_ns and pending_ns[0] <= present_ns:
             pending_ns.popleft()
         if request.dominance and len(pending_ns) >= MAX_RAMPS:
             raise ScenarioError(
@@ -326,9 +348,11 @@ class ChangeServer:
         change = resolve_change(
             self._scenario, self._links, {**settings, "to": request.to}, from_ns
         )
-        if find_owner(change) != self._site:
+
+        responsible_site = find_owner(change)
+        if responsible_site != self._site:
             raise ScenarioError(
-                f"{self._site} cannot make this change; send the change to {find_owner(change)}"
+                f"{self._site} cannot make this change; send the change to {responsible_site}"
             )
 
         if change.link:

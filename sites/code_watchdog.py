@@ -104,11 +104,14 @@ class WatchedCode:
         self._first_tick = -1
         self._checked_count = -1  # the number of finished calls at the last check
 
-    def run(self, k: int, call: Callable[[], T]) -> T:
-        """Calls the code, and measures how long it takes.
+    def run(self, tick: int, call: Callable[[], T]) -> T:
+        """Calls the user's code, and measures how long it takes.
+
+        If the operating system has interrupted the thread meanwhile, the time of other programs
+        does not count.
 
         Args:
-            k: Number of the tick, a period of the control loop, in which the code is called.
+            tick: Number of the tick, a period of the control loop, in which the code is called.
             call: Function that calls the code.
 
         Returns:
@@ -120,9 +123,9 @@ class WatchedCode:
         """
         computed_ns, switches = self._usage()
         begun_ns = self._clock.monotonic_ns()
-        self._running_tick = k
+        self._running_tick = tick
         if self._first_tick < 0:
-            self._first_tick = k
+            self._first_tick = tick
         try:
             result = call()
         finally:
@@ -134,14 +137,17 @@ class WatchedCode:
             computed_after_ns, switches_after = self._usage()
             if switches_after != switches:
                 elapsed_ns = min(elapsed_ns, computed_after_ns - computed_ns)
-        self._count_call(k, elapsed_ns)
+        self._count_call(tick, elapsed_ns)
         return result
 
-    def _count_call(self, k: int, elapsed_ns: int) -> None:
-        """Adds a call to the statistics and to the overtime.
+    def _count_call(self, tick: int, elapsed_ns: int) -> None:
+        """Adds the duration of a call to the statistics, and fails if the code is too slow.
+
+        Each call may take a share of the time between two calls. The excess is summed as
+        overtime, which shorter calls reduce again. Thus single slow calls are tolerated.
 
         Args:
-            k: Tick of the call.
+            tick: Tick of the call.
             elapsed_ns: Time that the call took, in ns.
 
         Raises:
@@ -152,7 +158,7 @@ class WatchedCode:
         self._calls += 1
         if elapsed_ns > self.longest_ns:
             self.longest_ns = elapsed_ns
-            self.longest_tick = k
+            self.longest_tick = tick
 
         permitted_ns = int(SHARE * self._period_ns)
         self._overtime_ns += min(elapsed_ns, HICCUP_NS) - permitted_ns
@@ -165,7 +171,7 @@ class WatchedCode:
                 f"only {SHARE:.0%} of the {period_ms:.3g} ms between two calls; make the code "
                 "faster, or lower rate_hz"
             )
-            raise self._fail(k, problem)
+            raise self._fail(tick, problem)
 
     def describe_hiccups(self) -> str:
         """Describes the calls that took longer than a period of the control loop, for the user.
@@ -194,7 +200,10 @@ class WatchedCode:
         tick = self._running_tick
         is_running = tick >= 0
         is_same_call = is_running and self._calls == self._checked_count
-        self._same_call_checks = self._same_call_checks + 1 if is_same_call else 0
+        if is_same_call:
+            self._same_call_checks += 1
+        else:
+            self._same_call_checks = 0
         self._checked_count = self._calls if is_running else -1
 
         # The first check that sees a call does not count: the call may have just begun.

@@ -114,7 +114,7 @@ class ExternalArm:
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement of the arm.
+        """Waits for the first measurement of the arm, without which the session cannot start.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -140,6 +140,7 @@ class ExternalArm:
                 if reason not in reported:
                     reported.add(reason)
                     say(f"its arm sends measurements {reason}")
+
             now_ns = self._clock.monotonic_ns()
             if now_ns > give_up_ns:
                 raise self._describe_silence()
@@ -177,13 +178,16 @@ class ExternalArm:
         self.poll()
         self._is_bound = True
         self._silent_ns = 0
-        pose = self.newest.q if self.newest else q0_rad
-        distance_rad = max(abs(a - b) for a, b in zip(pose, q0_rad, strict=True))
-        warning = (
+
+        pose_rad = self.newest.q if self.newest else q0_rad
+        joints = zip(pose_rad, q0_rad, strict=True)
+        distance_rad = max(abs(angle - expected) for angle, expected in joints)
+        if distance_rad <= _START_POSE_TOLERANCE_RAD:
+            return ""
+        return (
             f"its arm stands {distance_rad:.3g} rad off q0_rad, "
             "which its peers take for its start: their references will jump"
         )
-        return warning if distance_rad > _START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
         """Receives the waiting measurements, and checks how long the arm has been silent.
@@ -196,9 +200,12 @@ class ExternalArm:
         while (message := self._ring.poll()) is not None:
             payload, _ = message
             self._accept(payload)
+
         passed_ns = 0
         if self._polled_ns is not None:
+            # Limited, because a site that was suspended cannot know what it has missed.
             passed_ns = min(now_ns - self._polled_ns, _MAX_POLL_GAP_NS)
+
         has_arrived = self.accepted > accepted_before
         self._silent_ns = 0 if has_arrived else self._silent_ns + passed_ns
         self._polled_ns = now_ns
@@ -263,6 +270,8 @@ class ExternalArm:
         if message.n <= self._n:
             self._dropped["old measurement"] += 1
             return
+
+        # The arm cannot have moved faster than its speed limits allow.
         now_ns = self._clock.monotonic_ns()
         elapsed_s = (now_ns - self._accepted_ns) * 1e-9
         if self._is_bound and not self._is_plausible(message.q, elapsed_s):
@@ -282,6 +291,9 @@ class ExternalArm:
 
     def _is_plausible(self, q: Sequence[float], elapsed_s: float) -> bool:
         """Returns True if each joint can have moved to its angle since the last measurement.
+
+        A larger movement would exceed the speed limits of the arm, so that the sensor or the
+        driver must be faulty.
 
         Args:
             q: Joint angles in rad.
@@ -385,10 +397,11 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns what the site must do because of the state of the dead-man switch.
+        """Returns what the arm must do because of its dead-man switch: stop, or move again.
 
-        While the switch is released, every call returns the order to stop, until the arm has
-        stopped for this reason or its site reports a fault.
+        A dead-man switch is a button that a person holds while the arm may move. While the
+        switch is released, every call returns the order to stop, until the arm has stopped for
+        this reason or its site reports a fault.
 
         Args:
             mode: Present mode of the site, for example stopped.
@@ -400,9 +413,12 @@ class DeadManSwitch:
         """
         was_released = self._was_released
         self._was_released = False
+
         if was_released or not self.held:
-            is_known = mode == Mode.STOPPED and reason in RELEASE_REASONS
-            return "" if is_known or mode == Mode.FAULT else "released"
+            is_stopped_already = mode == Mode.STOPPED and reason in RELEASE_REASONS
+            needs_no_order = is_stopped_already or mode == Mode.FAULT
+            return "" if needs_no_order else "released"
+
         is_stopped_by_switch = mode == Mode.STOPPED and reason == LifeReason.RELEASED
         return "held" if is_stopped_by_switch else ""
 
@@ -444,6 +460,7 @@ class DeadManSwitch:
             self._dropped["stranger"] += 1
             return
 
+        # Only a limited number of programs is stored, so that the memory is bounded.
         is_new_program = message.boot not in self._programs
         if is_new_program and len(self._programs) >= STARTS_KEPT:
             self._forget_program()

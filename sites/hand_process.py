@@ -110,18 +110,21 @@ class HandProcess(SiteClient):
         while len(views) > self._max_waiting:
             self.skipped += 1
             views.popleft()
-        due_ns = self._announced_ns + _ANNOUNCE_PERIOD_NS
+
+        now_ns = self._clock.monotonic_ns()
+        next_announcement_ns = self._announced_ns + _ANNOUNCE_PERIOD_NS
         if views:
             self._decide(views.popleft())
-        elif not self.answered and self._clock.monotonic_ns() > due_ns:
-            self._announced_ns = self._clock.monotonic_ns()
-            self._send(0, None)
+        elif not self.answered and now_ns > next_announcement_ns:
+            self._announced_ns = now_ns
+            self._send(0, None)  # a message without a decision announces this process
 
     def _decide(self, message: HandViewMessage) -> None:
-        """Calls the user's class with a view, and sends its decision to the site.
+        """Lets the user's class decide how to move the arm, and sends its decision to the site.
 
         Args:
-            message: The view, as received from the site.
+            message: The view, the present state of the arm and the others, as received from the
+                site.
 
         Raises:
             RunFailed: The class failed. The arm has been released.
@@ -141,16 +144,21 @@ class HandProcess(SiteClient):
             ) from error
         self._send(message.k, numbers)
 
-    def _send(self, k: int, goal: list[float] | None) -> None:
+    def _send(self, view_tick: int, goal: list[float] | None) -> None:
         """Sends the decision of the class to the site.
 
+        The message states to which view (state of the arm) the decision refers, so that the
+        site can apply it at the right time.
+
         Args:
-            k: Tick of the view.
+            view_tick: Tick of the view.
             goal: The target or force. None releases the arm.
         """
         goal_field = "force" if self._pushes else "target"
         fields = {goal_field: goal or [], "grip": goal is not None}
-        self._sender.send(HandMessage, source=self._code, n=k // self._ticks_per_view, **fields)
+        self._sender.send(
+            HandMessage, source=self._code, n=view_tick // self._ticks_per_view, **fields
+        )
 
 
 def _read_view(message: HandViewMessage) -> HandView:
@@ -240,6 +248,7 @@ def run_hand(
                     f"{name} did not send its state to the hand {hand_site.program} within "
                     f"{timeout_s:g} s"
                 )
+
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         say(
             f"{name}: its hand was asked {count_nouns(hand.answered, 'time')}, "

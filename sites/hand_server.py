@@ -49,7 +49,10 @@ def _read_messages(
     dropped: Counter[str],
     source: str | None = None,
 ) -> Iterator[HandMessage]:
-    """Yields the waiting messages of an operator, and counts those that are dropped.
+    """Yields the messages of an operator that have arrived, and counts those that are dropped.
+
+    A limited number is read in each tick of the control loop, so that many messages do not
+    delay it.
 
     Args:
         inbox: Queue of the messages.
@@ -58,15 +61,17 @@ def _read_messages(
         source: Only accepted sender. None accepts all senders.
     """
     for _ in range(MESSAGES_KEPT):
-        waiting = inbox.poll()
-        if waiting is None:
+        timed_payload = inbox.poll()
+        if timed_payload is None:
             return
-        _, payload = waiting
+        _, payload = timed_payload
+
         try:
             message = decode(payload, HandMessage)
         except WireError as error:
             dropped[f"hand: {error.reason}"] += 1
             continue
+
         if message.site == site and source in (None, message.source):
             yield message
         else:
@@ -115,11 +120,14 @@ class HandServer:
         self._names: dict[int, str] = {}  # names of the senders, by their boots
         self.news: list[tuple[int, str]] = []
 
-    def track(self, _site: Site, k: int) -> list[float]:
+    def track(self, _site: Site, tick: int) -> list[float]:
         """Reads the waiting messages of operators, and returns how to move the arm.
 
+        An operator is a person or a program that moves the arm by messages over the network.
+        The control loop calls this in every tick.
+
         Args:
-            k: Number of the tick, a period of the control loop.
+            tick: Number of the tick, a period of the control loop.
 
         Returns:
             The operator who moves the arm, and the target or force, as a list of numbers for
@@ -131,7 +139,7 @@ class HandServer:
         if not commands and not self._memory.target:
             return self._free_state
 
-        t_ns = tick_ns(k, self._rules.rate_hz)
+        t_ns = tick_ns(tick, self._rules.rate_hz)
         step = advance_hand(
             rules=self._rules,
             memory=self._memory,
@@ -145,11 +153,16 @@ class HandServer:
             self._dropped[reason] += 1
         for source, change in step.changes:
             name = self._names.get(source, f"hand {source:08x}")
-            self.news.append((k, f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s"))
+            self.news.append(
+                (tick, f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s")
+            )
         return step.vector
 
     def _parse_command(self, message: HandMessage) -> HandCommand | None:
-        """Checks a message of an operator, and converts it to a command.
+        """Checks a message of an operator who moves the arm, and converts it to a command.
+
+        The goal of the operator is either a target position or a force, as the scenario says. A
+        message without a grip releases the arm.
 
         Args:
             message: The message.
@@ -166,6 +179,7 @@ class HandServer:
             noun = "target"
             goal = message.target
             other_goal = message.force
+
         is_wrong_goal = bool(other_goal) or len(goal) != self._rules.size
         if message.grip and is_wrong_goal:
             size = count_nouns(self._rules.size, "number")
@@ -226,38 +240,45 @@ class RemoteHand(HandPlayer):
         self._asked_tick = -1  # tick of the newest view that was sent
         self._source = hand_site.source
 
-    def track(self, site: Site, k: int) -> list[float]:
+    def track(self, site: Site, tick: int) -> list[float]:
         """Reads the waiting decisions of the user's class, and returns how to move the arm.
+
+        The class runs in a process of its own. The control loop calls this in every tick.
 
         Args:
             site: Object that computes the ticks of the site.
-            k: Number of the tick, a period of the control loop.
+            tick: Number of the tick, a period of the control loop.
 
         Returns:
             The target or force on the arm, as a list of numbers for the computation of the
             tick. `HandInForce.read` describes the numbers.
         """
         for message in self._read_decisions():
-            self._decide(k, message)
-        return super().track(site, k)
+            self._decide(tick, message)
+        return super().track(site, tick)
 
-    def request_action(self, k: int, arrays: SiteArrays) -> None:
+    def request_action(self, tick: int, arrays: SiteArrays) -> None:
         """Sends the state of the arm to the user's process, to request its next decision.
 
+        Such a message is called a view. The reply is read by `track` in a later tick.
+
         Args:
-            k: Number of the present tick, a period of the control loop.
+            tick: Number of the present tick, a period of the control loop.
             arrays: State of the site in this tick, from which the message is composed.
         """
-        view = self.view(k, arrays)
+        view = self.view(tick, arrays)
         fields = _list_numbers(view)
         fields["peers"] = [PeerSeen(**_list_numbers(peer)) for peer in view.peers]
-        self._publish(encode(HandViewMessage(site=self._site, boot=self._boot, **fields)))
-        self._asked_tick = k
+        message = HandViewMessage(site=self._site, boot=self._boot, **fields)
+        self._publish(encode(message))
+        self._asked_tick = tick
 
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
         """Waits until the operator's process announces itself.
+
+        A session must not start before, because nobody could move the arm.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -288,14 +309,14 @@ class RemoteHand(HandPlayer):
         """
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
-    def _decide(self, k: int, message: HandMessage) -> None:
+    def _decide(self, present_tick: int, message: HandMessage) -> None:
         """Schedules a decision of the user's class, to take effect at its planned tick.
 
         A decision that arrives after this tick is counted as late, and takes effect at once.
         Decisions about views that were not sent, and all after a failure, are ignored.
 
         Args:
-            k: Present tick.
+            present_tick: Present tick.
             message: The decision. Its number n refers to the view of tick n * `period_ticks`.
                 Without a grip it releases the arm.
         """
@@ -307,16 +328,17 @@ class RemoteHand(HandPlayer):
         if self.failure or is_announcement or refers_to_future:
             return
 
-        is_late = view_tick + self.hand.delay_ticks < k
+        is_late = view_tick + self.hand.delay_ticks < present_tick
         if is_late:
             self._dropped["hand: late"] += 1
-        goal = None  # releases the arm
+
+        target_or_force = None  # releases the arm
         if message.grip:
-            goal = message.target or message.force  # one of them is empty
+            target_or_force = message.target or message.force  # one of them is empty
         try:
-            self.hand.accept_decision(view_tick, goal)
+            self.hand.accept_decision(view_tick, target_or_force)
         except ValueError as error:
-            self.fail(k, str(error))
+            self.fail(present_tick, str(error))
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:

@@ -98,21 +98,21 @@ class _Rehearsal(LoopStats):
         super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
 
-    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
+    def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord:
         """Computes one tick of the site without samples from other sites, to test its timing.
 
         A tick is one period of the control loop. The loop calls this method in place of
         `_LoopSite.step`.
 
         Args:
-            k: Number of the tick.
+            tick: Number of the tick.
             arrivals: Samples (states of other sites) that have arrived. Always empty in this
                 test.
 
         Returns:
             The record of the tick: what the site measured and computed.
         """
-        return self._site.step(TickInput(k, arrivals))
+        return self._site.step(TickInput(tick, arrivals))
 
     def run_housekeeping(self, *_: object) -> bool:
         """Does nothing, because this test of the control loop has no network.

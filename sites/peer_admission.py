@@ -101,10 +101,11 @@ class PeerAdmission:
         return t_ns - first_left_ns > patience_s * NS_PER_S
 
     def _admit_peer(self, event: Event, t_ns: int) -> None:
-        """Prepares this site for a peer that joins, or rejoins, the running session.
+        """Prepares this site for a peer (another site) that joins or rejoins the session.
 
-        From the tick that the event names, samples of the new process of the peer are accepted.
-        Samples of its previous process are not accepted any more.
+        A peer rejoins after its process was restarted. From the tick that the event names,
+        samples of the new process are accepted, and samples of its previous process are not
+        accepted any more.
 
         Args:
             event: Event with which the peer announced its join.
@@ -113,8 +114,10 @@ class PeerAdmission:
         parts = self._parts
         index = parts.site.peers.index(event.member)
         join_ns = tick_ns(event.ticks, parts.scenario.sites[event.member].rate_hz)
+
         has_same_clock = event.clock == parts.clock.identity()
         bound_ns = None if has_same_clock else event.bound_ns
+
         self._publish_last_heard(index, event, t_ns)
         notices = self._timing.admit(index, join_ns, event.epoch_mono_ns, bound_ns)
         publish_clocks(self._publisher, notices, t_ns)
@@ -160,10 +163,10 @@ class PeerAdmission:
             return
 
         is_ignored = False
-        for meter in self._timing.monitors:
+        for link_monitor in self._timing.monitors:
             # None means that the peer has never acknowledged a sample of this site.
-            has_never_acknowledged = meter.is_acknowledged(now_ns) is None
-            if meter.is_receiving(now_ns) and has_never_acknowledged:
+            has_never_acknowledged = link_monitor.is_acknowledged(now_ns) is None
+            if link_monitor.is_receiving(now_ns) and has_never_acknowledged:
                 is_ignored = True
         if is_ignored:
             self._rejoined_ns = t_ns

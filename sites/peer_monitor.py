@@ -106,6 +106,10 @@ class PeerMonitor:
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
         """Updates the list of members, and publishes an event for each that joins or leaves.
 
+        A member is a process of the session: a site (process that runs one arm) or a recorder.
+        The control loop calls this ten times a second, so that crashed processes are noticed
+        soon.
+
         Args:
             publisher: Publishes the events of this site.
             t_ns: Present time, in ns since the epoch (the common start of the session).
@@ -187,7 +191,7 @@ class PeerMonitor:
     def _read_peer_events(
         self, inbox: Inbox, publisher: EventPublisher, t_ns: int
     ) -> Iterator[Event]:
-        """Receives the events of one peer, and applies those that concern this site.
+        """Receives the events of one peer (another site), and applies those about this site.
 
         If the peer has admitted another start of this site, this process has been replaced and
         must end. If it has admitted several starts, the last one counts: the earlier ones died
@@ -207,7 +211,7 @@ class PeerMonitor:
             if event.kind == "coming" and self._admits:
                 yield event
             elif event.boot != self.boots.get(event.member):
-                continue
+                continue  # of a process that is not a member
             elif event.kind == "change":
                 self.changed = True
             elif event.kind in ("diverged", "failed"):
@@ -279,6 +283,9 @@ class PeerMonitor:
         t_ns: int,
     ) -> None:
         """Publishes that this site admits or refuses a new process of another site.
+
+        The other sites and the recorder learn the decision from this event, and the new process
+        from the other sites.
 
         Args:
             kind: Kind of the event: "admit" or "refused".

@@ -127,6 +127,9 @@ class ChannelBuffer:
     def read_chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
         """Returns as many consecutive stored messages as one reply can contain.
 
+        A recorder that has missed messages requests them again. It sends a further request for
+        those that do not fit into the reply.
+
         Args:
             first: Number of the first requested message. If it is no longer stored, the reply
                 starts with the oldest stored message.
@@ -137,6 +140,7 @@ class ChannelBuffer:
         """
         first = max(first, self.oldest)
         end = min(last + 1, self.next_number, first + BACKFILL_MESSAGES)
+
         payloads: list[bytes] = []
         size = 0
         for number in range(first, end):

@@ -251,6 +251,8 @@ class RunningSite:
     def should_stop(self) -> bool:
         """Reads the messages of the arm and its dead-man switch, and decides if the run ends.
 
+        The control loop calls this method at the beginning of each tick (period).
+
         Returns:
             True if the site failed, if a member ended the run for all, if the user stopped the
             session or this process, or if a peer has been away for too long.
@@ -259,14 +261,19 @@ class RunningSite:
         for device in (parts.arm, parts.switch):
             if device is not None:
                 device.poll()
-        is_ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
-        return bool(is_ended) or parts.interrupt.is_requested() or self._admission.has_given_up
+        return (
+            self._failure is not None
+            or parts.monitor.ended_by != ""
+            or parts.changes.stopped
+            or parts.interrupt.is_requested()
+            or self._admission.has_given_up
+        )
 
-    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
+    def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Executes one tick: reads the inputs, computes the torque, and moves a simulated arm.
 
         Args:
-            k: Number of the tick, a period of the control loop.
+            tick: Number of the tick, a period of the control loop.
             arrivals: Samples of the peers (their published states) that have arrived since the
                 previous tick.
 
@@ -276,21 +283,21 @@ class RunningSite:
         """
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
-        hand = () if parts.hand is None else parts.hand.track(parts.site, k)
+        hand = () if parts.hand is None else parts.hand.track(parts.site, tick)
 
         try:
             if parts.plant is not None:
                 measured = parts.plant.state
             inputs = TickInput(
-                k=k,
+                k=tick,
                 arrivals=arrivals,
-                commands=parts.pop_changes(k),
+                commands=parts.pop_changes(tick),
                 measured=measured,
                 hand=hand,
             )
             self._output = parts.step(inputs)
             if parts.plant is not None:
-                parts.plant.move(k, self._output.tau)
+                parts.plant.move(tick, self._output.tau)
         except CodeFailed as failed:
             self._failure = failed
             return None

@@ -65,6 +65,9 @@ class RunOutcome(NamedTuple):
 def _summarise_loop(ticks: int, parts: SiteParts) -> str:
     """Returns the sentence about the ticks and the dropped messages of a site at its end.
 
+    The user sees there whether the control loop was punctual and whether the network lost
+    messages. A tick is one period of the control loop.
+
     Args:
         ticks: Number of the last tick plus 1.
         parts: Parts of the site.
@@ -75,6 +78,7 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
         text += f", {stats.skipped} of them skipped"
     if not stats.dropped:
         return text
+
     scenario = parts.scenario
     skipping = [peer for peer in scenario.peers(parts.name) if peer in scenario.external]
     counts = []
@@ -83,6 +87,7 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
         # Samples carry no word about skipped ticks, so that a receiver sees only their gap.
         if reason == "missing" and skipping:
             counts[-1] += f" (lost, or ticks that {' or '.join(skipping)} skipped)"
+
     return f"{text}; dropped: {', '.join(counts)}"
 
 
@@ -112,6 +117,9 @@ class SiteEnd:
     def leave_session(self) -> int:
         """Publishes how the run ended, waits for the recorders, and tells the user the result.
 
+        The process of the arm stays until then, because the recorders may still request
+        messages that were lost on the network.
+
         Returns:
             Exit code of the process: 0, or 128 plus the number of the signal that ended the
             run.
@@ -130,6 +138,7 @@ class SiteEnd:
         monitor.watch(self._publisher, self._outcome.t_ns)
         if topics.RECORDER in monitor.boots or monitor.recorders:
             self._await_recorders()
+
         ticks = count_nouns(self._outcome.ticks, "tick")
         parts.say(_summarise_loop(self._outcome.ticks, parts))
 
@@ -168,10 +177,11 @@ class SiteEnd:
                 parts.say(hiccups)
 
         about, cause = self._find_cause()
-        meters = self._link_monitors
-        unheard = [meter.peer.name for meter in meters if meter.is_unacknowledged]
-        if unheard:
-            cause += f"; {', '.join(unheard)} did not hear it at the end"
+        unreached_peers = [
+            monitor.peer.name for monitor in self._link_monitors if monitor.is_unacknowledged
+        ]
+        if unreached_peers:
+            cause += f"; {', '.join(unreached_peers)} did not hear it at the end"
         text = f"{parts.name} made {count_nouns(self._outcome.ticks, 'tick')}{cause}"
         self._publish_end_event("end", text, about=about)
 
@@ -186,6 +196,9 @@ class SiteEnd:
     def _find_cause(self) -> tuple[str, str]:
         """Determines why the run ended before the last tick of the scenario.
 
+        The cause becomes part of the last event in the log, so that a reader of the log need
+        not guess.
+
         Returns:
             member: Name of the member that ended the run. Empty if the run was completed, or
                 was ended by a request to all sites.
@@ -194,15 +207,18 @@ class SiteEnd:
         """
         parts = self._parts
         monitor = parts.monitor
+
         if self._outcome.failure is not None:  # of this site
             return parts.name, f": {self._outcome.failure}"
         if monitor.ended_by:  # another member ended it, or has replaced this site
             return monitor.ended_member, f": {monitor.ended_by}"
         if parts.changes.stopped:  # users requested that all sites end at the same tick
             return "", ", as many as it was asked for"
+
         scenario_ticks = parts.scenario.ticks(parts.name)
         if self._outcome.ticks == scenario_ticks:
             return "", ""
+
         if parts.interrupt.is_requested():
             signal_name = signal.Signals(parts.interrupt.number).name
             return parts.name, f", ended by {signal_name}"
@@ -247,7 +263,8 @@ class SiteEnd:
             self._publisher.answer_queries()
             monitor.watch(self._publisher, self._outcome.t_ns)
 
-            is_gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > _QUERIED_NS
+            since_query_ns = clock.monotonic_ns() - queried_ns
+            is_gone = not monitor.recorders and since_query_ns > _QUERIED_NS
             # A recorder that has gone, but still lacks messages, may come back: then the limit
             # stays as it is.
             if is_gone and monitor.stored:

@@ -172,6 +172,9 @@ class PeerInbox:
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Removes the samples that have arrived, and returns those that pass all checks.
 
+        The control loop calls this at the beginning of each tick. A sample is the state that a
+        peer, another site, has published.
+
         Args:
             since_epoch_ns: Present time, in ns since the epoch (the common start of the
                 session).
@@ -394,7 +397,7 @@ class StateBlock:
         is_block_complete = (output.tick + 1) % self._ticks == self._turn
         return has_operator or is_block_complete
 
-    def send_samples(self, k: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
+    def send_samples(self, tick: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
         """Sends the waiting samples to the peers, unless they are held until a later tick.
 
         If the samples may be held (`holds_samples`), they are sent together in every wake tick.
@@ -402,12 +405,12 @@ class StateBlock:
         different `turn`, so that not all sites of a machine wake their peers at the same time.
 
         Args:
-            k: Number of the present tick (period of the control loop).
+            tick: Number of the present tick (period of the control loop).
             send: Function that sends the sample of a record. It returns the sending time and
                 the confirmations of received samples ("echoes") that the sample contained. Both
                 become part of the record.
         """
-        ticks_after_this_one = k + 1
+        ticks_after_this_one = tick + 1
         is_wake_tick = (ticks_after_this_one - self._turn) % self._ticks_per_wake == 0
         if not self.holds_samples or is_wake_tick:
             self._send_waiting_samples(send)
@@ -435,13 +438,15 @@ class StateBlock:
             send: Function that sends the sample of a record, see `send_samples`.
         """
         self._send_waiting_samples(send)
-        site = self._site
+        kernel_site = self._site
         records = self._records
         self._records = []
         if records:
-            self._send(
-                [encode_state(site.name, self._boot, site.peers, *record) for record in records]
-            )
+            payloads = [
+                encode_state(kernel_site.name, self._boot, kernel_site.peers, *record)
+                for record in records
+            ]
+            self._send(payloads)
 
 
 class _LoopSite(Protocol):
@@ -454,11 +459,11 @@ class _LoopSite(Protocol):
     def should_stop(self) -> bool:
         """Returns True if the present tick must not be executed, because the run is over."""
 
-    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
+    def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Executes one tick.
 
         Args:
-            k: Number of the tick.
+            tick: Number of the tick.
             arrivals: Samples of the peers that have arrived since the previous tick.
 
         Returns:
@@ -504,6 +509,8 @@ def _publish_sample(
     output: TickRecord,
 ) -> tuple[Any, ...]:
     """Publishes the sample of a tick to the peers.
+
+    A sample is the part of the result that the peers (other sites) need for their control laws.
 
     Args:
         name: Name of this site.
@@ -571,34 +578,34 @@ def run_loop(
     mode = Mode.RUN
     last = None
     has_slack_work = False
-    k = first
-    while k < ticks:
+    tick = first
+    while tick < ticks:
         clock.sleep_until(deadline_ns)
         if io.should_stop():
             break
 
         woke_ns = clock.monotonic_ns()
         skipped = 0
-        if not catches_up and k > first and woke_ns >= timing.deadline_ns(k + 1):
+        if not catches_up and tick > first and woke_ns >= timing.deadline_ns(tick + 1):
             # Continue with the last tick whose deadline has passed.
-            skipped = bisect_right(range(k, ticks), woke_ns, key=timing.deadline_ns) - 1
-            k += skipped
-            deadline_ns = timing.deadline_ns(k)
+            skipped = bisect_right(range(tick, ticks), woke_ns, key=timing.deadline_ns) - 1
+            tick += skipped
+            deadline_ns = timing.deadline_ns(tick)
         late_us = max(0, (woke_ns - deadline_ns) // 1000)
 
         # Compute the tick. The present time is the nominal time of the tick plus its lateness.
-        since_epoch_ns = k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns
+        since_epoch_ns = tick * NS_PER_S // site.rate_hz + woke_ns - deadline_ns
         arrivals = inbox.drain(since_epoch_ns)
-        output = io.step(k, arrivals)
+        output = io.step(tick, arrivals)
         if output is None:  # the law or the plant failed: this tick has no record
             break
         last = output
 
         # Publish. The statistics count records, which must therefore be sent before them.
         block_due = states.add(output, arrivals, late_us, busy_us)
-        states.send_samples(k, send)
+        states.send_samples(tick, send)
         stats.count_tick(late_us, busy_us, skipped)
-        stats_due = stats.is_due(k, skipped)
+        stats_due = stats.is_due(tick, skipped)
         if block_due or stats_due:
             states.flush(send)
         if stats_due:
@@ -611,8 +618,8 @@ def run_loop(
             mode = output.mode
             io.report_tick(output)
 
-        k += 1
-        deadline_ns = timing.deadline_ns(k)
+        tick += 1
+        deadline_ns = timing.deadline_ns(tick)
         if (block_due or has_slack_work) and deadline_ns - clock.monotonic_ns() > quarter_ns:
             has_slack_work = io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000

@@ -39,6 +39,8 @@ def publish_clocks(
 ) -> None:
     """Publishes events about the offsets and faults of the peers' clocks.
 
+    Recorders store these events, so that a reader of the log knows how well the clocks agreed.
+
     Args:
         publisher: Publishes the events of the site.
         notices: Fields of the events.
@@ -147,6 +149,8 @@ class SiteNews:
 
     def publish_news(self, output: TickRecord) -> None:
         """Publishes what has happened since the last call, and prints the status line when due.
+
+        The control loop calls this method ten times a second, in the time between two ticks.
 
         Args:
             output: Record of the newest tick.

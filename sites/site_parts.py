@@ -234,6 +234,8 @@ class SiteParts:
     def _watch_code(self, name: str, rate_hz: int) -> Callable[..., Any]:
         """Returns a function that calls a user's code and measures its computing time.
 
+        Slow code would delay the control loop. Therefore a watchdog limits its time.
+
         Args:
             name: Name of the code, as in "the plant myplant:MyPlant".
             rate_hz: How often the code is called, in 1/s.
@@ -336,7 +338,7 @@ class SiteParts:
 
         return store_and_publish
 
-    def pop_changes(self, k: int) -> list[CoreChange]:
+    def pop_changes(self, tick: int) -> list[CoreChange]:
         """Returns the changes of settings or mode that the site applies in the next tick.
 
         Some changes were requested by users. Others follow from an external arm, a robot or
@@ -345,29 +347,29 @@ class SiteParts:
         or is held again.
 
         Args:
-            k: Number of the tick.
+            tick: Number of the tick.
         """
-        changes = list(self.changes.pop_changes(k))
+        changes = list(self.changes.pop_changes(tick))
         if self.arm is None:
             return changes
 
         # The first tick has skipped none, also if it is the late first tick of a site that
         # joins a running session.
         is_first_tick = self._next_tick < 0
-        skipped = 0 if is_first_tick else k - self._next_tick
-        self._next_tick = k + 1
+        skipped = 0 if is_first_tick else tick - self._next_tick
+        self._next_tick = tick + 1  # the tick that follows if none is skipped
         if skipped:
-            self.buffer.skip(k - skipped, k)
-            changes.append(self._make_order_change(k, "overrun", skipped))
+            self.buffer.skip(tick - skipped, tick)
+            changes.append(self._make_order_change(tick, "overrun", skipped))
 
         mode = self.site.mode
         orders: list[SiteOrder] = [self.arm.pop_order(mode)]
         if self.switch is not None:
             orders.append(self.switch.pop_order(mode, self.site.life_reason))
-        changes += [self._make_order_change(k, order) for order in orders if order]
+        changes += [self._make_order_change(tick, order) for order in orders if order]
         return changes
 
-    def _make_order_change(self, k: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
+    def _make_order_change(self, tick: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
         """Returns the change with which an order of the site itself takes effect in a tick.
 
         Such orders follow from an external arm, for example "released" if its dead-man switch
@@ -375,7 +377,7 @@ class SiteParts:
         repeated.
 
         Args:
-            k: The tick.
+            tick: Number of the tick, a period of the control loop.
             order: The order.
             skipped: Number of skipped ticks, for the order "overrun".
         """
@@ -383,7 +385,7 @@ class SiteParts:
             scenario=self.scenario,
             site=self.name,
             order=order,
-            from_ns=tick_ns(k, self.site.rate_hz),
+            from_ns=tick_ns(tick, self.site.rate_hz),
             ticks=skipped,
         )
         return to_core_change(self.scenario, change)
@@ -468,17 +470,18 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
 
-    for k in range(WARM_UP_TICKS):
+    for tick in range(WARM_UP_TICKS):
         arrivals = []
-        if k > 0:
+        if tick > 0:
             for index, link in enumerate(setup.links):
                 speeds = (0.0,) * len(link.q0)
                 channel = (0.0,) * link.channel.received_size
-                arrivals.append(Arrival(index, k - 1, link.q0, speeds, ch=channel))
+                arrivals.append(Arrival(index, tick - 1, link.q0, speeds, ch=channel))
 
-        output = step(TickInput(k, arrivals, (), measured))
-        echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
-        sample = encode_sample(site=setup.name, boot=0, output=output, sent_ns=k, echo=echo)
+        output = step(TickInput(tick, arrivals, (), measured))
+        echo = [(arrival.peer, arrival.tick, tick) for arrival in arrivals]
+
+        sample = encode_sample(site=setup.name, boot=0, output=output, sent_ns=tick, echo=echo)
         decode(sample, PeerSample, layout=site.layout)
         encode_state(
             site=setup.name,
@@ -488,9 +491,9 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
             arrivals=arrivals,
             late_us=0,
             busy_us=0,
-            sent_ns=k,
+            sent_ns=tick,
             echo=echo,
         )
-        estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
+        estimator.add(OffsetLimit(tick, 1), OffsetLimit(tick, -1))
 
     estimator.estimate(WARM_UP_TICKS)

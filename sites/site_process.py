@@ -72,6 +72,7 @@ def run_site(
     if not scenario.sites_may_return:
         options.connection.require_keys_until(scenario.duration_s)
     share_threads()
+
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
 
@@ -83,6 +84,7 @@ def run_site(
         )
         if bus is None:
             return interrupt.exit_code
+
         with closing(bus), LinePrinter(say) as printer:
             with interrupt.raising():  # compilation may take minutes
                 parts = SiteParts(
@@ -94,6 +96,7 @@ def run_site(
                     interrupt=interrupt,
                     say=printer.put,
                 )
+
             if options.connection.listen:
                 endpoints = ", ".join(map(str, options.connection.listen))
                 parts.say(f"others connect to {endpoints}")
@@ -124,6 +127,7 @@ def join_and_run(parts: SiteParts) -> int:
             continue
         if not device.wait_for_first(stopped, give_up_ns, parts.say):
             return parts.interrupt.exit_code
+
     running = _join_session(parts, give_up_ns)
     if running is None:
         return parts.interrupt.exit_code
@@ -157,8 +161,11 @@ def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
         scenario.text,
         needs_recorder=options.needs_recorder,
     )
+
+    # A copy of each event is stored for recorders that miss it.
     store_event = parts.buffer.channels[topics.EVENT].store
     publisher = EventPublisher(parts.bus, options.session, info, store_event)
+
     joining = SessionJoin(
         bus=parts.bus,
         clock=parts.clock,
@@ -178,11 +185,13 @@ def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
             since_ns = parts.clock.monotonic_ns() - epoch.mono_ns
             options.connection.require_keys_until(scenario.duration_s - since_ns / NS_PER_S)
             return RunningSite(parts, publisher, pinger, epoch)
+
         if joining.announced_first_tick != first_tick:
             first_tick = joining.announced_first_tick
             # The first tick of a site that joins late. It is prepared before the epoch, because
             # the preparation takes 0.1 s for every hour that the session has been running.
             parts.site.start_at(first_tick)
+
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
             raise _describe_failed_join(parts, joining)
@@ -208,6 +217,7 @@ def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionErro
         reason = f"{', '.join(missing)} did not join"
     elif not reason:
         reason = "the other members joined, but no common start time (epoch) was agreed on"
+
     for member, problem in joining.membership.unreadable.items():
         reason += f"; the reply of {member} cannot be read: {problem}"
     waited_s = f"{options.join_timeout_s:g} s"

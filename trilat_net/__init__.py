@@ -159,24 +159,24 @@ def _is_added(name: str) -> bool:
     Args:
         name: The name.
     """
-    files = (f"{folder}/{name}{ending}" for folder in __path__ for ending in ("", ".py"))
-    if name.startswith("_") or any(map(_os.path.exists, files)):
+    folders_and_modules = [
+        f"{folder}/{name}{ending}" for folder in __path__ for ending in ("", ".py")
+    ]
+    is_module = any(map(_os.path.exists, folders_and_modules))
+    if name.startswith("_") or is_module:
         return False
+
     from .entry_points import FUNCTIONS, find_entries
 
     return name in find_entries(FUNCTIONS)
 
 
 def _import_name(name: str) -> _Any:
-    """Imports the object of a public name.
+    """Imports the public function or class of a name, for example `trilat_net.simulate`.
 
-    Args:
-        name: The name.
-
-    Returns:
-        The object. If a package that it needs is missing, a function that raises UsageError
-        when it is called. Raising the error here would be wrong, because programs look up names
-        without using them (`hasattr`, `dir`, completion in an editor).
+    If a package that it needs is missing, the result is a function that raises UsageError when
+    it is called. Raising the error here would be wrong, because programs look up names without
+    using them (`hasattr`, `dir`, completion in an editor).
     """
     from .errors import UsageError
 
@@ -195,11 +195,11 @@ def _import_name(name: str) -> _Any:
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:
-    """Returns a function that raises UsageError, in place of an unavailable object.
+    """Returns a function that only raises UsageError, in place of one that cannot be imported.
 
     Args:
-        name: Public name of the object.
-        problem: Text of the error, which names the package.
+        name: Public name of the function or class that cannot be imported.
+        problem: Text of the error, which names the missing package.
     """
     from .errors import UsageError
 

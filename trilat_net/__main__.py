@@ -28,6 +28,7 @@ def main() -> None:
 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
+            # Files and pipes get the same text on every system.
             if not stream.isatty():
                 stream.reconfigure(encoding="utf-8", newline="\n")
             stream.reconfigure(errors="backslashreplace")
@@ -45,22 +46,25 @@ def main() -> None:
 
 
 def _run() -> None:
-    """Runs the command of the command line.
+    """Runs the command that the command line names.
 
-    Two commands are handled before the others are loaded: `stop`, and the hidden command
-    `start-processes`, which starts the processes of a session by forking.
+    Two commands are handled before the others are loaded: `stop`, so that arms stop without
+    delay, and the hidden command `start-processes`, which starts the processes of a session by
+    forking.
     """
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
-            # ahead of other programs on a busy machine, if permitted
+            # Run ahead of other programs on a busy machine, if this is permitted.
             with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         from .net import stop_at_once
 
-        remaining_arguments = stop_at_once(sys.argv[2:])
-        if isinstance(remaining_arguments, int):
-            sys.exit(remaining_arguments)
-        sys.argv[2:] = remaining_arguments
+        # The result is an exit code, or arguments that the full command has to handle.
+        code_or_arguments = stop_at_once(sys.argv[2:])
+        if isinstance(code_or_arguments, int):
+            sys.exit(code_or_arguments)
+        sys.argv[2:] = code_or_arguments
+
     from .app.cli import main as run
 
     match sys.argv[1:]:

@@ -42,16 +42,20 @@ _PACKAGE_OF = {
 
 @cache
 def find_entries(group: str) -> dict[str, EntryPoint]:
-    """Returns the entry points of a group by their names, without importing their packages.
+    """Returns the commands, functions or viewers that installed packages add, by their names.
+
+    The packages are not imported. An entry with the name of something in a package of this
+    program, such as trilat-studies, counts only if it is from that package.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
     """
     entries: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
-        package = find_package(group, entry.name)
-        top = entry.module.partition(".")[0]
-        if not package or top == package.replace("-", "_"):
+        owner = find_package(group, entry.name)
+        package = entry.module.partition(".")[0]
+        is_permitted = not owner or package == owner.replace("-", "_")
+        if is_permitted:
             entries.setdefault(entry.name, entry)
     return entries
 
@@ -67,7 +71,7 @@ def find_package(group: str, name: str) -> str:
 
 
 def load_entry(group: str, name: str, use: str) -> Any:
-    """Imports the object of an entry point.
+    """Imports a command, function or viewer that an installed package adds to this program.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
@@ -88,7 +92,7 @@ def load_entry(group: str, name: str, use: str) -> Any:
             raise UsageError(f"{use} is in a package of its own: pip install {package}")
         return None
     if package:
-        return entry.load()
+        return entry.load()  # an error in a package of this program is a bug: do not hide it
     try:
         return entry.load()
     except Exception as error:

@@ -16,7 +16,7 @@ Invariant:
 import os
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -60,7 +60,8 @@ def _name_argument(match: re.Match[str]) -> str:
     if command:
         return str(command)
     name = _ARGUMENTS.get(option) or option.lstrip("-").replace("-", "_")
-    value = " True" if option in _SWITCHES else value
+    if option in _SWITCHES:
+        return f"{name}=True"
     return f"{name}={value.strip()}" if value else name
 
 
@@ -99,7 +100,8 @@ class ScenarioError(TrilatError):
     exit_code = 2
 
     def __init__(self, problem: str, *, path: str = "", source: str = "") -> None:
-        super().__init__(": ".join(part for part in (source, path, problem) if part))
+        known_parts = [part for part in (source, path, problem) if part]
+        super().__init__(": ".join(known_parts))
         self.problem = problem
         self.path = path
         self.source = source
@@ -340,40 +342,56 @@ def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = 
 
 
 def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
-    """Returns the valid word that is most similar to an unknown word, see `suggest_nearest`.
+    """Returns the valid word that is most similar to an unknown word, which a user misspelt.
 
-    Upper and lower case count as equal. A word that is equal but for its case has priority,
-    first among the valid words and then elsewhere.
+    The arguments are those of `suggest_nearest`. Upper and lower case count as equal. A word
+    that is equal but for its case has priority, first among the valid words and then elsewhere.
+    The result is empty if no word is similar.
     """
     if len(word) > MOST_LETTERS:
         return ""
     # Imported here, because `trilat stop` imports this module and needs no suggestions.
     from difflib import get_close_matches
 
-    choices: list[dict[str, str]] = []
-    for paths in (valid, elsewhere):
-        words: dict[str, str] = {}
-        for path in paths[:MOST_COMPARED]:
-            last = path.rpartition(".")[2] if paths is elsewhere else path
-            if len(last) <= MOST_LETTERS:
-                words.setdefault(last.casefold(), path)
-        # Users forget the unit at the end of a key: "delay" and "dely" mean "delay_ms".
-        for last, path in list(words.items()):
-            name, _, unit = last.rpartition("_")
-            if name and unit in _UNIT_ENDINGS:
-                words.setdefault(name, path)
-        choices.append(words)
+    valid_by_word = {path: path for path in valid[:MOST_COMPARED]}
+    elsewhere_by_word: dict[str, str] = {}
+    for path in elsewhere[:MOST_COMPARED]:
+        last_part = path.rpartition(".")[2]
+        elsewhere_by_word.setdefault(last_part, path)
+    choices = [_prepare_choices(valid_by_word), _prepare_choices(elsewhere_by_word)]
 
     sought = word.casefold()
-    for words in choices:
-        if sought in words:
-            return words[sought]
-    # Many words stand elsewhere, so that a faint similarity among them means nothing.
-    for words, cutoff in zip(choices, (0.5, 0.7), strict=True):
-        matches = get_close_matches(sought, list(words), n=1, cutoff=cutoff)
+    for choice in choices:
+        if sought in choice:
+            return choice[sought]
+
+    # Elsewhere there are many words, so that a faint similarity among them means nothing.
+    least_similarities = (0.5, 0.7)
+    for choice, least_similarity in zip(choices, least_similarities, strict=True):
+        matches = get_close_matches(sought, list(choice), n=1, cutoff=least_similarity)
         if matches:
-            return words[matches[0]]
+            return choice[matches[0]]
     return ""
+
+
+def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
+    """Returns suggestions by the words that users may have meant by a misspelt word.
+
+    The words are in lower case. Users forget the unit at the end of a key: "delay" and "dely"
+    mean "delay_ms". Therefore such a key also stands without its unit.
+
+    Args:
+        suggestions: For each valid word the text to suggest.
+    """
+    choices: dict[str, str] = {}
+    for word, suggestion in suggestions.items():
+        if len(word) <= MOST_LETTERS:
+            choices.setdefault(word.casefold(), suggestion)
+    for word, suggestion in list(choices.items()):
+        name, _, unit = word.rpartition("_")
+        if name and unit in _UNIT_ENDINGS:
+            choices.setdefault(name, suggestion)
+    return choices
 
 
 def join_words(words: Iterable[str]) -> str:
@@ -420,10 +438,12 @@ def describe_exception(error: BaseException) -> str:
     import traceback
 
     frames = traceback.extract_tb(error.__traceback__)
-    places = [frame for frame in frames if _is_users_file(frame.filename)]
-    if not places:
+    user_frames = [frame for frame in frames if _is_users_file(frame.filename)]
+    if not user_frames:
         return text
-    return f"{text} ({Path(places[-1].filename).name}, line {places[-1].lineno})"
+    innermost = user_frames[-1]
+    file_name = Path(innermost.filename).name
+    return f"{text} ({file_name}, line {innermost.lineno})"
 
 
 def _is_users_file(name: str) -> bool:

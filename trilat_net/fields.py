@@ -51,6 +51,7 @@ def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
         name = f"{package}.{file.name}"
         for value in vars(import_module(name)).values():
             is_subclass = isinstance(value, type) and issubclass(value, base)
+            # A class that the file only imports is found in its own file.
             if not is_subclass or value.__module__ != name:
                 continue
             tag = value.__struct_config__.tag
@@ -144,9 +145,9 @@ def reword_problem(problem: str) -> str:
 
 
 def _reword_types(quoted: re.Match[str]) -> str:
-    """Returns the types that an error of msgspec quotes in the terms of TOML.
+    """Replaces the names of types in an error of msgspec by those that authors of TOML know.
 
-    Example: "`float | null`" becomes "number". Null is left out, because TOML has no null.
+    Example: "`float | null`" becomes "a number". Null is left out, because TOML has no null.
 
     Args:
         quoted: Match of the quoted types, without their backquotes as group 1.

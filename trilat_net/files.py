@@ -137,10 +137,14 @@ def format_extra_install(extra: str) -> str:
         extra: Name of the extra, a group of optional packages, as in `trilat-net[extra]`.
     """
     clone = Path(__file__).resolve().parents[1]
-    if not all((clone / name).is_file() for name in ("Makefile", "pyproject.toml")):
+    is_clone = all((clone / name).is_file() for name in ("Makefile", "pyproject.toml"))
+    if not is_clone:
         return f"pip install 'trilat-net[{extra}]'"
-    if Path(sys.prefix).resolve() != clone / ".venv":
+
+    is_environment_of_clone = Path(sys.prefix).resolve() == clone / ".venv"
+    if not is_environment_of_clone:
         return shlex.join([sys.executable, "-m", "pip", "install", "-e", f"{clone}[{extra}]"])
+
     change_folder = [] if Path.cwd() == clone else ["-C", str(clone)]
     return shlex.join(["make", *change_folder, "extras", f"EXTRAS={extra}"])
 
@@ -194,12 +198,15 @@ def open_regular(path: Path, **options: Any) -> Any:
     def open_without_blocking(name: str, flags: int) -> int:
         return os.open(name, flags | no_block)
 
+    # The system would only say "Is a directory".
     if path.is_dir():
         problem = "the path is a folder, not a file"
         logs = sorted(path.glob("*.mcap"))
         if logs:
             problem += f"; name a file in it, for example {logs[0]}"
         raise IsADirectoryError(errno.EISDIR, problem, str(path))
+
+    # Check the open file and not the path, which may change in between.
     stream = open(path, mode, opener=open_without_blocking, **options)  # noqa: SIM115
     mode_bits = os.fstat(stream.fileno()).st_mode
     if not stat.S_ISREG(mode_bits):
@@ -258,9 +265,6 @@ def read_foreign_permissions(path: Path) -> int:
 def make_folder(folder: Path) -> Path:
     """Makes a folder and its parents unless they exist, and returns the folder.
 
-    Args:
-        folder: Path of the folder.
-
     Raises:
         UsageError: The folder cannot be made.
         LogRefused: The disk is full.
@@ -289,7 +293,8 @@ def refuse_link(path: Path) -> None:
     Raises:
         UsageError: The path is a symbolic link outside of `SYSTEM_FOLDERS`.
     """
-    if path.is_symlink() and path.parent.as_posix() not in SYSTEM_FOLDERS:
+    is_of_system = path.parent.as_posix() in SYSTEM_FOLDERS
+    if path.is_symlink() and not is_of_system:
         problem = "is a symbolic link, through which no output is written"
         advice = "remove the link, or choose another name"
         raise UsageError(f"{path}: {problem}; {advice}")
@@ -327,11 +332,12 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
     """
     if folder is None:
         return _make_next_folder(name)
+    must_be_empty = not force
     try:
-        occupied = not force and folder.exists() and any(folder.iterdir())
+        is_refused = must_be_empty and folder.exists() and any(folder.iterdir())
     except OSError as error:
         raise UsageError(f"{folder}: cannot be created or read: {error.strerror}") from None
-    if occupied:
+    if is_refused:
         advice = "" if force is None else ", or use --force"
         raise UsageError(f"{folder}: is not empty; choose another folder{advice}")
     return make_folder(folder)
@@ -347,7 +353,7 @@ def _make_next_folder(name: str) -> Path:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            continue
+            continue  # an earlier result has this number
         except OSError as error:
             raise describe_write_error(folder, error) from None
         return folder
@@ -375,7 +381,8 @@ def refuse_existing(
     """
     refuse_link(path)
     is_empty_folder = manifest and path.is_dir() and not any(path.iterdir())
-    if os.path.lexists(path) and not is_empty_folder:
+    is_taken = os.path.lexists(path) and not is_empty_folder
+    if is_taken:
         is_same_kind = (path / manifest).is_file() if manifest else path.is_file()
         if not is_same_kind:
             kind = "an exported folder" if manifest else "a file"
@@ -454,10 +461,12 @@ def write_whole(
     if not force:
         refuse_existing(path, force=False)
     try:
-        if path.exists() and not path.is_file():
+        is_device_or_pipe = path.exists() and not path.is_file()
+        if is_device_or_pipe:
             with path.open("wb") as stream:
                 _write_parts(stream, parts)
             return
+
         unfinished = path.with_name(f"{path.name}.unfinished")
         try:
             # A file of an earlier attempt may have other permissions.
@@ -503,9 +512,11 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
     refuse_existing(path, force=force, manifest=manifest)
     remedy = "nothing is left of it. Make room, or take another disk"
     try:
+        # In the same folder, because a rename works within a file system only.
         scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:
         raise describe_write_error(path, error, remedy) from None
+
     try:
         staged = scratch / path.name
         if manifest:
@@ -525,10 +536,10 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Returns the error of a failed write, for the caller to raise.
+    """Converts an error of the system in writing a file into one that tells users what to do.
 
     A full disk needs another remedy than a wrong path. Therefore the two cases have different
-    errors.
+    errors. The caller raises the result.
 
     Args:
         path: The file.

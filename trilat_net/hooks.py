@@ -67,18 +67,18 @@ def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], A
         modules: The names of the interface, separated by spaces, by the module that defines
             them. A name equal to that of its module is the module itself.
     """
-    homes = {
-        name: f"{package}.{module}"
-        for module, names in modules.items()
-        for name in names.split()
-    }
+    module_of_name = {}
+    for module_name, names in modules.items():
+        for name in names.split():
+            module_of_name[name] = f"{package}.{module_name}"
 
     def find_name(name: str) -> Any:
-        home = homes.get(name)
-        if home is None:
+        full_module_name = module_of_name.get(name)
+        if full_module_name is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(home)
-        return module if home.endswith(f".{name}") else getattr(module, name)
+        module = import_module(full_module_name)
+        is_module_itself = full_module_name.endswith(f".{name}")
+        return module if is_module_itself else getattr(module, name)
 
     return find_name
 

@@ -75,13 +75,12 @@ def request_real_time_scheduling() -> str:
     Returns:
         Description of the scheduling that was obtained, for example "SCHED_FIFO 50".
     """
+    calling_thread = 0  # stands for the calling thread in calls of the system
     try:
+        lower_priority = os.sched_param(FIFO_PRIORITY - 1)
         _change_threads(
-            lambda thread: os.sched_setscheduler(
-                thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1)
-            )
+            lambda thread: os.sched_setscheduler(thread, os.SCHED_FIFO, lower_priority)
         )
-        calling_thread = 0
         os.sched_setscheduler(calling_thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
         return f"SCHED_FIFO {FIFO_PRIORITY}"
     except (OSError, AttributeError):
@@ -112,11 +111,10 @@ def _change_threads(change: Callable[[int], None]) -> None:
 def raise_priority(nice: int) -> bool:
     """Raises the priority of all threads of this process except the main thread, if permitted.
 
-    The main thread is excluded because the processes that it starts would inherit the priority.
-    If it is the calling thread, its priority is raised too. Only Linux has a nice value for
-    each thread. On other systems, and without the privilege, nothing changes.
-
-    On a busy machine, these threads are then delayed less by other programs.
+    On a busy machine, these threads are then delayed less by other programs. The main thread is
+    excluded because the processes that it starts would inherit the priority. If it is the
+    calling thread, its priority is raised too. Only Linux has a priority (nice value) for each
+    thread. On other systems, and without the privilege, nothing changes.
 
     Args:
         nice: The nice value. Values below 0 are above the normal priority, and -20 is the
@@ -125,12 +123,13 @@ def raise_priority(nice: int) -> bool:
     Returns:
         True if the calling thread got the priority.
     """
-    tasks = Path("/proc/self/task")
-    if not (sys.platform.startswith("linux") and tasks.is_dir()):
+    threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
+    if not (sys.platform.startswith("linux") and threads_folder.is_dir()):
         return False
+
     calling_thread = threading.get_native_id()
     main_thread = os.getpid()  # on Linux the main thread has the number of the process
-    all_threads = [int(entry.name) for entry in tasks.iterdir()]
+    all_threads = [int(entry.name) for entry in threads_folder.iterdir()]
     others = [thread for thread in all_threads if thread not in (calling_thread, main_thread)]
     try:
         for thread in (calling_thread, *others):

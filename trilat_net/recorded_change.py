@@ -67,9 +67,10 @@ class RecordedChange(
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many ticks a site missed just before a record, because it was too late.
+    """Returns how many control periods (ticks) an arm missed just before a record.
 
-    A record lists the changes of its tick, among them those that report missed ticks.
+    An arm misses ticks if its control loop is too late. A record lists the changes of its tick,
+    among them those that report missed ticks.
 
     Args:
         texts: JSON texts of the changes in the record. Texts that cannot be read are ignored.

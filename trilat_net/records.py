@@ -11,7 +11,6 @@ Invariant:
 
 from collections.abc import Sequence
 from enum import IntEnum
-from itertools import accumulate
 from typing import NamedTuple
 
 NS_PER_S = 1_000_000_000
@@ -183,14 +182,20 @@ class Layout(NamedTuple):
     def lengths(self) -> dict[str, int]:
         """Returns the lengths of the vectors of a record by name, in their order.
 
-        A record is the result of one tick. Vectors that the site does not have are left out.
+        A record is the result of one control period. Vectors that the arm does not have are
+        left out.
         """
-        n = self.joints
-        m = self.shared
-        lengths = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
-        lengths["theta_hat"] = self.parameters
+        lengths = {
+            "q": self.joints,
+            "qd": self.joints,
+            "q_des": self.shared,
+            "qd_des": self.shared,
+            "tau": self.joints,
+            "tau_x": self.joints,
+            "theta_hat": self.parameters,
+        }
         if self.task:
-            lengths |= {"x": m, "xd": m, "wrench": m}
+            lengths |= {"x": self.shared, "xd": self.shared, "wrench": self.shared}
         optional = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
         lengths |= {name: count for name, count in optional.items() if count}
         return lengths
@@ -202,14 +207,14 @@ class Layout(NamedTuple):
             A slice for each vector, by name. Vectors that are inputs of the period are left
             out.
         """
-        lengths = self.lengths()
-        for name in ("hand", "bodies"):  # inputs of the tick
-            lengths.pop(name, None)
-        ends = accumulate(lengths.values())
-        return {
-            name: slice(end - length, end)
-            for (name, length), end in zip(lengths.items(), ends, strict=True)
-        }
+        columns = {}
+        first = 0
+        for name, length in self.lengths().items():
+            is_input = name in ("hand", "bodies")
+            if not is_input:
+                columns[name] = slice(first, first + length)
+                first += length
+        return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
         """Counts the values that the rule `glide` stores in the field `mem` of a record.
@@ -256,16 +261,17 @@ class Layout(NamedTuple):
         return slice(first, first + length)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the peers without which a site goes on, from its record.
+        """Returns the names of the lost arms without which this arm goes on, from its record.
 
         Args:
             mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
-            peers: Names of the site's peers, in scenario order.
+            peers: Names of the other arms (peers) that this arm follows, in scenario order.
         """
         end = self.count_life_memory(len(peers), degrades=True)
-        all_gone = mem[end - len(peers) : end]
+        # One number per peer: 0 if the peer is present.
+        states = mem[end - len(peers) : end]
         # A record of another rule has a shorter memory, and then no lost peers.
-        return [peer for peer, gone in zip(peers, all_gone, strict=False) if gone]
+        return [peer for peer, state in zip(peers, states, strict=False) if state]
 
     @property
     def floats(self) -> int:

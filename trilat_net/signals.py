@@ -153,7 +153,8 @@ def end_process_at_signals() -> Callable[[], None]:
     replaced = {}
     for number in ENDING_SIGNALS:
         handler = signal.getsignal(number)
-        if _may_interrupt(getattr(handler, "__self__", None)):
+        interrupt = getattr(handler, "__self__", None)  # handlers are methods of an `Interrupt`
+        if _may_interrupt(interrupt):
             replaced[number] = handler
 
     is_first_process = bool(replaced) and os.getpid() == 1
@@ -233,9 +234,12 @@ def hold_sigint() -> Iterator[None]:
     delay Ctrl-C in this process if another thread receives the signal, because Python runs the
     handler in the main thread anyway. Therefore the handler is replaced as well.
     """
-    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    # Windows has no signal masks, and only the main thread may change handlers.
+    if sys.platform == "win32" or not is_main_thread:
         yield
         return
+
     arrived: list[int] = []
     handler = signal.signal(signal.SIGINT, lambda number, _frame: arrived.append(number))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

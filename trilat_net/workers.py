@@ -85,12 +85,14 @@ def _exit_after(parent: int) -> None:
     """
     from multiprocessing import connection, parent_process
 
+    # On Windows the number of the parent does not change when the parent has ended. The
+    # sentinel, a handle of the parent, then becomes ready.
     sentinel = getattr(parent_process(), "sentinel", None)
-    # On Windows the number of the parent does not change when the parent has ended.
     if os.name == "nt" and sentinel is not None:
         connection.wait([sentinel])
         os._exit(1)
-    pause = threading.Event()
+    # On other systems, a process whose parent has ended gets another parent.
+    pause = threading.Event()  # never set: `wait` only pauses
     while os.getppid() == parent:
         pause.wait(_PARENT_POLL_S)
     os._exit(1)

@@ -1,12 +1,14 @@
 """A simulated run is recorded for its energies only if these may change the judgement."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from trilat_net.analysis import judge
 from trilat_net.execution.fused import FusedRun
-from trilat_net.scenario import load_scenario
+from trilat_net.log import Log
+from trilat_net.scenario import Scenario, load_scenario
 
 LOSSY = {"link.delay_ms": 50, "link.loss": 0.3, "duration_s": 4.0, "timeline": []}
 """Delays without exact roots, so that a run settles or is open."""
@@ -16,11 +18,19 @@ def count_recordings(
     monkeypatch: pytest.MonkeyPatch, name: str, settings: dict[str, Any]
 ) -> tuple[int, str]:
     """Returns how often a run was recorded to judge it, and the judgement."""
-    recorded = []
-    simulate = judge.simulate_scenario
-    monkeypatch.setattr(
-        judge, "simulate_scenario", lambda scenario: recorded.append(1) or simulate(scenario)
-    )
+    recorded: list[str] = []
+
+    def count(name: str) -> Callable[[Scenario], Log]:
+        simulate: Callable[[Scenario], Log] = getattr(judge, name)
+
+        def simulate_and_count(scenario: Scenario) -> Log:
+            recorded.append(name)
+            return simulate(scenario)
+
+        return simulate_and_count
+
+    for function in ("simulate_scenario", "simulate_columns"):
+        monkeypatch.setattr(judge, function, count(function))
     scenario = load_scenario(name, settings)
     run = FusedRun(scenario)
     run.advance_to(scenario.duration_s)

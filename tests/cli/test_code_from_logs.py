@@ -396,7 +396,7 @@ def test_files_changed_after_permission_do_not_run(log_folder: Path) -> None:
 def test_a_remembered_file_runs_for_its_hash(log_folder: Path) -> None:
     file = log_folder / "kept.py"
     file.write_text(LAW)
-    trilat("verify", "run.mcap", "--remember", cwd=log_folder).refuses("give --law FILE too")
+    trilat("verify", "run.mcap", "--remember", cwd=log_folder).refuses("give --law FILE, too")
     assert trilat("verify", "run.mcap", "--law", file, "--remember", cwd=log_folder).code == 0
     assert trilat("verify", "run.mcap", cwd=log_folder).code == 0
     file.write_text(f"{LAW}# a word\n")

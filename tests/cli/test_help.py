@@ -68,7 +68,7 @@ def test_commands_have_help_examples_and_explained_options(
 
 
 def test_the_main_help_names_first_steps() -> None:
-    assert "trilat demo paper" in print_help("--help")
+    assert "Start with: trilat live play" in print_help("--help")
 
 
 def test_the_main_help_has_six_panels() -> None:

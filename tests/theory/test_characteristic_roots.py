@@ -1,7 +1,4 @@
-"""Threads of the linear algebra library are restored, and no number changes.
-
-Roots against closed forms, and against the number of turns of det Delta, which misses no root.
-"""
+"""Roots against closed forms, and against the number of turns of det Delta, which misses no root."""
 
 import math
 
@@ -18,28 +15,7 @@ from trilat_net.analysis.theory.characteristic_roots import (
     chebyshev_interpolation,
     chebyshev_nodes,
     compute_delay_spectrum,
-    limit_blas_threads,
 )
-
-
-def test_the_number_of_threads_is_restored() -> None:
-    blas_functions = characteristic_roots._find_blas_functions()
-    if blas_functions is None:
-        pytest.skip("this NumPy has no OpenBLAS that can be asked")
-    get, _ = blas_functions
-    before = get()
-    with limit_blas_threads():
-        assert get() == 1
-    assert get() == before
-    with pytest.raises(ValueError, match="within"), limit_blas_threads():
-        raise ValueError("within")
-    assert get() == before
-
-
-def test_without_thread_control_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(characteristic_roots, "_find_blas_functions", lambda: None)
-    with limit_blas_threads():
-        assert np.linalg.eigvals(np.eye(2)).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("E", [None, np.array([1.0, 0.0])])

@@ -234,9 +234,9 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     """
     rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
-        part = log[site]
-        _, first_of_tick = np.unique(part.tick, return_index=True)
-        modes = part.mode[first_of_tick]
+        site_log = log[site]
+        _, first_of_tick = np.unique(site_log.tick, return_index=True)
+        modes = site_log.mode[first_of_tick]
         rows_by_site[site] = first_of_tick[modes != "diverged"]
 
     aligned = {}
@@ -252,17 +252,17 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     first_times_s = []
     last_times_s = []
     for site, rows in rows_by_site.items():
-        part = log[site]
-        first_times_s.append(part.tick[rows[0]] / part.rate_hz)
-        last_times_s.append(part.tick[rows[-1]] / part.rate_hz)
+        site_log = log[site]
+        first_times_s.append(site_log.tick[rows[0]] / site_log.rate_hz)
+        last_times_s.append(site_log.tick[rows[-1]] / site_log.rate_hz)
     end_s = min(last_times_s)
     if end_s <= max(first_times_s):
         return {}
     for site, rows in rows_by_site.items():
-        part = log[site]
-        end_tick = end_s * part.rate_hz
+        site_log = log[site]
+        end_tick = end_s * site_log.rate_hz
         last_tick = int(np.floor(end_tick + 1e-6))
-        records = _fill_tick_grid(log.scenario, part, rows, last_tick)
+        records = _fill_tick_grid(log.scenario, site_log, rows, last_tick)
         if len(records.known) < 2:
             return {}
         aligned[site] = records
@@ -289,7 +289,10 @@ def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
-    """Finds the records in one of the `RESTING_MODES`, or within `RESUMING_S` after one.
+    """Marks the records in which a site brings its arm to rest, or did so shortly before.
+
+    The torque of these records may differ from that of the control law. The site is in one of
+    the `RESTING_MODES`, or was so in the last `RESUMING_S`.
 
     Args:
         modes: Mode of each record.
@@ -307,26 +310,28 @@ def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
 
 def _fill_tick_grid(
     scenario: Scenario,
-    part: SiteLog,
+    site_log: SiteLog,
     rows: Ints,
     last: int | None = None,
 ) -> AlignedRecords:
-    """Returns a site's records on every tick. Missing records are interpolated.
+    """Returns a site's records with one row for every tick. Missing records are interpolated.
+
+    Values that cannot be interpolated, such as modes, are those of the last record before.
 
     Args:
         scenario: Scenario of the run.
-        part: The site's part of the log.
-        rows: Rows of the records to use, one per tick, by rising tick.
+        site_log: The site's part of the log.
+        rows: Rows of the records to use, one per tick, in ascending order of ticks.
         last: Last tick. By default that of the last record.
     """
     names = [*RECORD_COLUMNS]
-    if part.layout.task:
+    if site_log.layout.task:
         names += TASK_VECTORS
-    if part.layout.hand:
+    if site_log.layout.hand:
         names.append("hand")
-    part.prepare(*names)
+    site_log.prepare(*names)
 
-    tick = part.tick[rows]
+    tick = site_log.tick[rows]
     first = int(tick[0])
     end = int(tick[-1])
     if last is not None:
@@ -334,42 +339,42 @@ def _fill_tick_grid(
     grid = np.arange(first, end + 1)
     # index of the last record at or before each tick
     next_row = np.searchsorted(tick, grid, side="right")
-    previous = next_row - 1
-    known: Bools = tick[previous] == grid
+    previous_row = next_row - 1
+    has_record: Bools = tick[previous_row] == grid
 
-    spec = scenario.sites[part.name]
-    modes = part.mode[rows]
-    runs = modes == "run"
-    is_unlimited = find_unlimited_rows(spec.limits, part.qd_des[rows])
-    follows: Bools = (runs & is_unlimited)[previous]
+    spec = scenario.sites[site_log.name]
+    modes = site_log.mode[rows]
+    is_running = modes == "run"
+    is_unlimited = find_unlimited_rows(spec.limits, site_log.qd_des[rows])
+    follows: Bools = (is_running & is_unlimited)[previous_row]
     rests = _NO_ROWS
     if spec.on_stale.action == "glide":
-        resting = _find_resting_rows(modes, tick, part.rate_hz)
-        resting_in_grid = resting[previous]
+        resting = _find_resting_rows(modes, tick, site_log.rate_hz)
+        resting_in_grid = resting[previous_row]
         if resting_in_grid.any():
             rests = resting_in_grid
 
     columns = {}
     for name in names:
-        values = getattr(part, name)[rows]
-        if known.all():
+        values = getattr(site_log, name)[rows]
+        if has_record.all():
             columns[name] = values[: len(grid)]
         else:
             interpolated = [np.interp(grid, tick, column) for column in values.T]
             columns[name] = np.stack(interpolated, axis=1)
 
     used = {}
-    for peer in part.peers:
-        recorded = part.used[peer][rows]
-        used[peer] = recorded[previous]
+    for peer in site_log.peers:
+        recorded = site_log.used[peer][rows]
+        used[peer] = recorded[previous_row]
     return AlignedRecords(
-        site=part.name,
-        rate_hz=part.rate_hz,
+        site=site_log.name,
+        rate_hz=site_log.rate_hz,
         first=first,
-        known=known,
+        known=has_record,
         follows=follows,
         used=used,
-        axes=part.axes,
+        axes=site_log.axes,
         rests=rests,
         **columns,
     )
@@ -426,7 +431,6 @@ class PeerTrajectory:
             t_s: Times after the start of the session, shape (K,), in s.
         """
         records = self.records
-        h = records.h_s
         position = t_s * records.rate_hz - records.first
         nearest = np.round(position)
         is_at_tick = np.abs(position - nearest) < _TICK_TOLERANCE
@@ -436,8 +440,38 @@ class PeerTrajectory:
         known_period = np.clip(period, 0, last_period)
         row = known_period.astype(np.int64)
         fraction = np.clip(position - row, 0.0, 1.0)
-        x = fraction[:, np.newaxis]
 
+        q = records.shared[row]
+        qd = records.shared_rate[row]
+        squares = self._squares[row]
+        # If the sites have the same tick rate, nearly all times are ticks of this site.
+        between = np.flatnonzero(fraction)
+        if len(between):
+            interpolated = self._interpolate(row[between], fraction[between])
+            q[between], qd[between], squares[between] = interpolated
+
+        known_a = records.known[row] | (fraction == 1.0)
+        known_b = records.known[row + 1] | (fraction == 0.0)
+        # the arm rests before a session whose start is recorded
+        is_after_start = (position >= 0.0) | (records.first == 0)
+        known = known_a & known_b & is_after_start
+
+        is_before = position < 0.0
+        qd[is_before] = 0.0
+        squares[is_before] = 0.0
+        return _PeerMotion(q, qd, squares, known)
+
+    def _interpolate(self, row: Ints, fraction: Array) -> tuple[Array, Array, Array]:
+        """Returns the motion between two ticks: q, qd, and the integral of qd squared.
+
+        Args:
+            row: Row of the tick before each time, shape (K,).
+            fraction: Share of the tick period that has passed at each time, shape (K,).
+        """
+        records = self.records
+        h = records.h_s
+        x = fraction[:, np.newaxis]
+        # records a and b are the two ends of the period that contains each time
         qa = records.shared[row]
         qb = records.shared[row + 1].copy()
         va = records.shared_rate[row]
@@ -448,26 +482,18 @@ class PeerTrajectory:
             vectors_b = qb[:, POSITION:]
             qb[:, POSITION:] = choose_nearest_vectors(vectors_b, vectors_a)
 
+        # coefficients of the cubic Hermite polynomial in the fraction of the period
         quadratic = 3 * (qb - qa) - h * (2 * va + vb)
         cubic = 2 * (qa - qb) + h * (va + vb)
         q = qa + x * (h * va + x * (quadratic + x * cubic))
+        q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
         qd = va + x * (vb - va)
+
         squared_a = va**2
         squared_b = vb**2
         mean_square = squared_a + 0.5 * x * (squared_b - squared_a)
         squares = self._squares[row] + h * x * mean_square
-
-        known_a = records.known[row] | (fraction == 1.0)
-        known_b = records.known[row + 1] | (fraction == 0.0)
-        # the arm rests before a session whose start is recorded
-        is_after_start = (position >= 0.0) | (records.first == 0)
-        known = known_a & known_b & is_after_start
-
-        q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
-        is_before = position < 0.0
-        qd[is_before] = 0.0
-        squares[is_before] = 0.0
-        return _PeerMotion(q, qd, squares, known)
+        return q, qd, squares
 
 
 class DelayedPeer(NamedTuple):

@@ -82,17 +82,14 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
     """Solves the linear systems A y = b, separately for each of many records.
 
-    The records are counted by the last axes, while NumPy's solver expects them in the first
-    ones.
-
     Args:
-        A: Square matrices, shape (m, m, ...).
+        A: Square matrices, shape (m, m, ...). The axes "..." count the records.
         b: Right-hand sides, shape (m, ...).
 
     Returns:
         The solutions y, shape (m, ...).
     """
-    # numpy expects the matrices on the last two axes
+    # numpy's solver expects the matrices on the last two axes, and counts records by the first
     matrices = np.moveaxis(A, (0, 1), (-2, -1))
     vectors = np.moveaxis(b, 0, -1)
     right_sides = vectors[..., np.newaxis]
@@ -218,12 +215,9 @@ class PlacedArm:
             a: Reference accelerations of the joints, shape (2, ...), in rad/s^2.
         """
         columns = self.q.shape[1:]
-        ones = np.ones(columns)
-        torques = []
-        for unit_parameters in np.multiply.outer(np.eye(5), ones):
-            unit_torque = self.required_torque(unit_parameters, qd, v, a)
-            torques.append(unit_torque)
-        return np.stack(torques, axis=1)
+        # one further axis, for the arms of which one parameter is 1
+        unit_parameters = np.multiply.outer(np.eye(5), np.ones(columns))
+        return self.required_torque(unit_parameters, qd, v, a)
 
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns zeros, shape (2, ...), because this arm has no friction in its joints.
@@ -537,9 +531,12 @@ def _put_torques(
     a: Array,
     torque: Array,
 ) -> None:
-    """Writes M a + C(q, qd) v + G + armature a + friction(v) of every row, shape (K, n).
+    """Writes the joint torques that a motion requires in each of K poses into `torque`.
 
-    theta has the shape (K, 10 n), or (1, 10 n) for all rows.
+    The torque is M a + C(q, qd) v + G + armature a + friction(v), with the inertia matrix M,
+    the Coriolis matrix C, the gravity torque G and the inertia of the drives (armature). Joint
+    arrays have the shape (K, n). theta has the shape (K, 10 n), or (1, 10 n) if all poses share
+    it.
     """
     last = theta.shape[0] - 1
     for k in range(q.shape[0]):
@@ -571,7 +568,11 @@ def _put_gradients(
     a: Array,
     gradient: Array,
 ) -> None:
-    """Writes Y'r of every row, r = qd - v, shape (K, 10 n)."""
+    """Writes Y'r of each of K poses into `gradient`, shape (K, 10 n).
+
+    Y'r is the direction in which the adaptive law changes the parameter estimates, with the
+    regressor Y and the velocity error r = qd - v. The motion has the shape (K, n).
+    """
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
         propagate_motion(
@@ -595,11 +596,11 @@ def _put_end_effectors(
     J: Array,
     energy: Array,
 ) -> None:
-    """Writes the end effector's position and Jacobian, and the potential energy, of every row.
+    """Writes the end effector's position and Jacobian, and the potential energy, in K poses.
 
-    The potential energy of a link is -g'(m p + R mc), with its mass m and its first moment mc,
-    and its position p and orientation R in the base's frame. The arrays that are written have
-    the shapes (K, 3), (K, 6, n) and (K,).
+    The results go into `position`, shape (K, 3), `J`, shape (K, 6, n), and `energy`, shape
+    (K,). The potential energy of a link is -g'(m p + R mc), with its mass m and its first
+    moment mc, and its position p and orientation R in the base's frame.
     """
     n = chain.shape[0]
     g = three(gravity)
@@ -609,23 +610,23 @@ def _put_end_effectors(
         position[k, 0] = x
         position[k, 1] = y
         position[k, 2] = z
-        p_x = 0.0
-        p_y = 0.0
-        p_z = 0.0
+        link_x = 0.0
+        link_y = 0.0
+        link_z = 0.0
         energy[k] = 0.0
         for i in range(n):
             row: Row = chain[i]
             step = three(row.p)
             if i > 0:
                 step = rotate(chain[i - 1].R_base, step)
-            p_x = p_x + step[0]
-            p_y = p_y + step[1]
-            p_z = p_z + step[2]
+            link_x = link_x + step[0]
+            link_y = link_y + step[1]
+            link_z = link_z + step[2]
             first = LINK_PARAMETERS * i
             mass = theta[first]
             moment = (theta[first + 1], theta[first + 2], theta[first + 3])
             moment_in_base = rotate(row.R_base, moment)
-            mass_term = mass * dot(g, (p_x, p_y, p_z))
+            mass_term = mass * dot(g, (link_x, link_y, link_z))
             moment_term = dot(g, moment_in_base)
             energy[k] -= mass_term + moment_term
             for j in range(3):
@@ -672,16 +673,16 @@ class ChainArmRows(NamedTuple):
 
     @property
     def _rows(self) -> RowArray:
-        """The joints as the rows that the functions of the simulation kernel read."""
+        """The joints in the memory layout that the functions of the simulation kernel read."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:
-        """Returns an attribute of all joints, shape (n,)."""
+        """Returns one attribute of every joint, such as "viscous", as an array (n,)."""
         values = [getattr(joint, name) for joint in self.chain.joints]
         return np.array(values)
 
     def _replace_in_joints(self, **values: Any) -> "ChainArmRows":
-        """Returns the same chain with some values of every joint replaced."""
+        """Returns a copy of the chain with some attributes of every joint replaced."""
         joints = [joint._replace(**values) for joint in self.chain.joints]
         chain = self.chain._replace(joints=tuple(joints))
         return self._replace(chain=chain)
@@ -819,11 +820,12 @@ class ChainArmRows(NamedTuple):
         )
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Returns position and Jacobian of the end effector, and the potential energy.
+        """Computes the end effector's position and Jacobian, and the potential energy.
 
         Returns:
             Position of the end effector, shape (K, 3), in m.
-            Its Jacobian, velocity above angular velocity, shape (K, 6, n).
+            Its Jacobian, with three rows for the velocity and three for the angular velocity,
+            shape (K, 6, n).
             Potential energy, shape (K,), in J.
         """
         poses, joints = q.shape
@@ -924,16 +926,17 @@ class ChainArmRows(NamedTuple):
             Derivative, shape (K, 3, n).
         """
         _, J, _ = self._place(q)
-        per_joint = J.transpose(0, 2, 1)
-        linear = per_joint[:, :, :3]
-        axis = per_joint[:, :, 3:]
+        columns = J.transpose(0, 2, 1)
+        linear = columns[:, :, :3]
+        axis = columns[:, :, 3:]
         joint_speed = qd[:, :, np.newaxis]
         velocity = joint_speed * linear
-        turn = joint_speed * axis
-        turn_up_to = np.cumsum(turn, axis=1)
+        angular_velocity = joint_speed * axis
+        rotation_up_to = np.cumsum(angular_velocity, axis=1)
+        # motion that joint i shares with all joints before it, and that of the joints after it
         velocity_up_to = np.cumsum(velocity, axis=1)
         velocity_after = velocity.sum(axis=1, keepdims=True) - velocity_up_to
-        turning = np.cross(turn_up_to, linear)
+        turning = np.cross(rotation_up_to, linear)
         moving = np.cross(axis, velocity_after)
         rate: Array = turning + moving
         return rate.transpose(0, 2, 1)
@@ -958,9 +961,9 @@ class ChainArmRows(NamedTuple):
         if range_j <= _NO_WEIGHT_J:
             return math.inf
         energy_j = self._find_pose_energy(q)
-        share = (energy_j - lowest_j) / range_j
-        # a pendulum's share of its potential energy is (1 - cos(angle)) / 2
-        cosine = 1.0 - 2.0 * share
+        energy_fraction = (energy_j - lowest_j) / range_j
+        # for a pendulum this fraction is (1 - cos(angle)) / 2
+        cosine = 1.0 - 2.0 * energy_fraction
         # rounding errors may exceed the range of a cosine
         valid_cosine = min(max(cosine, -1.0), 1.0)
         return math.acos(valid_cosine)
@@ -971,10 +974,11 @@ class ChainArmRows(NamedTuple):
         return float(energy[0])
 
     def _find_extreme_energy(self, q: Array, sign: float) -> float:
-        """Returns the least (sign 1) or the largest (sign -1) potential energy, in J.
+        """Returns the least (sign 1) or largest (sign -1) potential energy of the arm, in J.
 
-        Coordinate descent over the revolute joints is used: as a function of one joint's angle
-        the energy is a + b cos q + c sin q, which its values at three angles determine.
+        The search is a coordinate descent over the revolute joints. As a function of one
+        joint's angle q, the energy is mean + b cos q + c sin q, so that its values at three
+        angles determine the extreme.
         """
         q = q.copy()
         is_prismatic = self._column("prismatic").astype(bool)
@@ -984,10 +988,12 @@ class ChainArmRows(NamedTuple):
             poses[:, joint] = (0.0, 0.5 * np.pi, np.pi)
             energies = self.potential_energy(poses)
             at_0, at_90, at_180 = energies.tolist()
+
+            # The energy is a sinusoid of each joint's angle, so three angles determine it.
             mean = 0.5 * (at_0 + at_180)
-            b = at_0 - mean
-            c = at_90 - mean
-            q[joint] = math.atan2(-sign * c, -sign * b)
+            cosine_part = at_0 - mean
+            sine_part = at_90 - mean
+            q[joint] = math.atan2(-sign * sine_part, -sign * cosine_part)
         return self._find_pose_energy(q)
 
 
@@ -1039,9 +1045,9 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
 
 
 def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
-    """Returns the positions of base, joints and end effector of a chain, in m.
+    """Returns the positions of base, joints and end effector of a chain, for drawing, in m.
 
-    Their shape is (K, n + 2, 3).
+    Their shape is (K, n + 2, 3) for K poses of n joints.
     """
     joints = build_chain(chain.joints)
     tip_m = np.array(chain.tip_m)
@@ -1053,9 +1059,9 @@ def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
         pose[-1] = place_end_effector(joints, tip_m)
         position = np.zeros(3)
         orientation = np.eye(3)
-        for n, joint in enumerate(joints, 1):
+        for point, joint in enumerate(joints, 1):
             position = position + orientation @ joint.p
-            pose[n] = position
+            pose[point] = position
             orientation = joint.R_base.copy()
     return points
 
@@ -1124,62 +1130,68 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
     """
     random = np.random.default_rng(1)
     n = len(arm.chain.joints)
-    count = len(arm.theta)
+    parameters = len(arm.theta)
     q = random.uniform(-np.pi, np.pi, (states, n))
-    qd, a = random.normal(size=(2, states, n))
-    # a regressor's columns are the torques of unit parameters
-    state = np.repeat(np.arange(states), count)
-    unit_parameters = np.tile(np.eye(count), (states, 1))
+    qd, qdd = random.normal(size=(2, states, n))
+    # column p of a regressor is the torque of a chain whose only nonzero parameter is p, 1
+    state_of_row = np.repeat(np.arange(states), parameters)
+    unit_parameters = np.tile(np.eye(parameters), (states, 1))
     links = arm.without_drives()
     torque = links.law_torque(
         theta_hat=unit_parameters,
-        q=q[state],
-        qd=qd[state],
-        v=qd[state],
-        a=a[state],
+        q=q[state_of_row],
+        qd=qd[state_of_row],
+        v=qd[state_of_row],
+        a=qdd[state_of_row],
     )
 
-    columns = torque.reshape(states, count, n)
+    columns = torque.reshape(states, parameters, n)
     regressors = columns.transpose(0, 2, 1)
-    return regressors.reshape(-1, count)
+    return regressors.reshape(-1, parameters)
 
 
 @lru_cache(maxsize=64)
 def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
     """Returns the base parameters of a chain by a QR decomposition (Gautier 1991).
 
+    A column of the stacked regressors that depends on the columns before it belongs to a
+    parameter that torques do not determine by itself.
+
     Args:
         chain: The chain.
-        learnt: True for each parameter that is learnt.
+        learnt: True for each parameter that the control law learns.
     """
     arm = ChainArmRows(np.zeros(len(learnt)), chain)
+    # random motions excite every combination that has an effect on the torques
     regressors = stack_regressors(arm, 4 * LINK_PARAMETERS)
-    W = regressors[:, list(learnt)]
-    indices = np.flatnonzero(learnt)
-    norm = float(np.linalg.norm(W))
-    root_of_columns = np.sqrt(W.shape[1])
-    least_size = DEPENDENT_SHARE * norm / root_of_columns
+    learnt_columns = regressors[:, list(learnt)]
+    learnt_indices = np.flatnonzero(learnt)
 
-    Q = np.zeros((len(W), 0))
-    kept = []
-    for p, column in enumerate(W.T):
+    matrix_norm = float(np.linalg.norm(learnt_columns))
+    root_of_columns = np.sqrt(learnt_columns.shape[1])
+    least_norm = DEPENDENT_SHARE * matrix_norm / root_of_columns
+
+    basis = np.zeros((len(learnt_columns), 0))
+    independent = []
+    for column_index, column in enumerate(learnt_columns.T):
         # Gram-Schmidt, twice: the first pass leaves rounding errors of the size of the column
-        rest = column - Q @ (Q.T @ column)
-        rest -= Q @ (Q.T @ rest)
-        size = float(np.linalg.norm(rest))
-        if size > least_size:
-            Q = np.column_stack([Q, rest / size])
-            kept.append(p)
+        remainder = column - basis @ (basis.T @ column)
+        remainder -= basis @ (basis.T @ remainder)
+        remainder_norm = float(np.linalg.norm(remainder))
+        if remainder_norm > least_norm:
+            basis = np.column_stack([basis, remainder / remainder_norm])
+            independent.append(column_index)
 
-    independent = W[:, kept]
-    factors = np.linalg.lstsq(independent, W, rcond=None)[0]
+    independent_columns = learnt_columns[:, independent]
+    factors = np.linalg.lstsq(independent_columns, learnt_columns, rcond=None)[0]
     contributes = np.abs(factors) > DEPENDENT_SHARE
-    kept_indices = indices[kept]
-    base_count = len(kept)
+
+    parameter_indices = learnt_indices[independent]
+    base_count = len(independent)
     combination = np.zeros((base_count, len(learnt)))
-    combination[:, indices] = np.where(contributes, factors, 0.0)
-    combination[:, kept_indices] = np.eye(base_count)
-    return _BaseParameters(kept_indices, combination)
+    combination[:, learnt_indices] = np.where(contributes, factors, 0.0)
+    combination[:, parameter_indices] = np.eye(base_count)
+    return _BaseParameters(parameter_indices, combination)
 
 
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParameters:

@@ -34,13 +34,19 @@ _US_PER_S = 1_000_000
 
 
 def _find_cycle(link: LinkBase) -> Fraction | None:
-    """Returns the period of a link's delay, in s. None if its delay is constant or ends."""
+    """Returns the period of a link's delay, in s. None if its delay is constant or random.
+
+    The period is a fraction of whole numbers, so that common multiples of periods are exact.
+
+    Args:
+        link: Delay model of the link.
+    """
     model = link.to_core_model()
-    points = link.points
-    if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
+    table = link.points
+    if table is not None and model.kind == DelayKind.TRACE and len(table) > 1:
         # the last point lasts as long as the point before it
-        last_us = int(points[-1, 0])
-        end_us = 2 * last_us - int(points[-2, 0])
+        last_us = int(table[-1, 0])
+        end_us = 2 * last_us - int(table[-2, 0])
         return Fraction(end_us, _US_PER_S)
     if model.kind == DelayKind.SINE:
         return Fraction(round(model.extra), _US_PER_S)
@@ -186,8 +192,8 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     """
     end_ns = round(scenario.duration_s * 1e9)
     link: LinkBase = scenario.links[name]
-    for from_ns, later in scheduled_links(scenario.timeline, name):
-        link = later if from_ns <= end_ns else link
+    for from_ns, later_link in scheduled_links(scenario.timeline, name):
+        link = later_link if from_ns <= end_ns else link
     return link
 
 
@@ -221,8 +227,8 @@ def find_burst_interval_s(scenario: Scenario) -> float | None:
         link = find_final_link(scenario, name)
         if link.loss_burst <= 1.0 or not 0.0 < link.loss < link.loss_bad:
             continue
-        leave = 1.0 - (1.0 - 1.0 / link.loss_burst) / link.loss_bad
-        samples_per_burst = 1.0 / leave
+        leave_probability = 1.0 - (1.0 - 1.0 / link.loss_burst) / link.loss_bad
+        samples_per_burst = 1.0 / leave_probability
         samples_between = samples_per_burst * link.loss_bad / link.loss
         sender = name.partition("->")[0]
         intervals_s.append(samples_between / scenario.sites[sender].rate_hz)

@@ -76,18 +76,19 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """
     start, ramps = list_ramps(log, site)
     h_s = 1.0 / log.scenario.sites[site].rate_hz
-    planned = evaluate_ramps(start, ramps, t_s, h_s)
-    present = ~find_lost_peers(log, site, t_s)
-    if present.all():
-        return planned
+    history = evaluate_ramps(start, ramps, t_s, h_s)
+    is_present = ~find_lost_peers(log, site, t_s)
+    if is_present.all():
+        return history
 
-    alpha = planned.alpha * present
-    rate = planned.rate * present
-    before = planned.before * present[:-1]
+    # the factors of the remaining peers are divided by their sum
+    alpha = history.alpha * is_present
+    rate = history.rate * is_present
+    before = history.before * is_present[:-1]
     total = alpha.sum(axis=1, keepdims=True)
     total_rate = rate.sum(axis=1, keepdims=True)
     total_before = before.sum(axis=1, keepdims=True)
-    # quotient rule
+    # derivative of alpha / total by the quotient rule
     numerator = rate * total - alpha * total_rate
     return DominanceHistory(
         alpha=alpha / total,
@@ -176,9 +177,11 @@ def find_program(log: Log) -> str:
         Name of the user. Empty if no program moved an arm.
     """
     users = find_users(log.scenario)[1]
-    with_policy = [user for user in users if _is_held_by_policy(log, user)]
-    with_program = [user for user in users if has_program_hand(log.scenario, user)]
-    return ["", *with_policy, *with_program][-1]
+    held_by_policy = [user for user in users if _is_held_by_policy(log, user)]
+    moved_by_program = [user for user in users if has_program_hand(log.scenario, user)]
+    # the last candidate wins, and without any the name is empty
+    candidates = ["", *held_by_policy, *moved_by_program]
+    return candidates[-1]
 
 
 def list_program_sites(log: Log) -> list[str]:
@@ -208,8 +211,11 @@ def has_program_hand(scenario: Scenario, site: str) -> bool:
 
 def _is_held_by_policy(log: Log, site: str) -> bool:
     """Returns True if the events of a log say that a policy took hold of the arm of a site."""
-    begin = f"{site}: {POLICY} {TAKEN} "
-    return any(event.kind == "hand" and event.text.startswith(begin) for event in log.events)
+    text_start = f"{site}: {POLICY} {TAKEN} "
+    for event in log.events:
+        if event.kind == "hand" and event.text.startswith(text_start):
+            return True
+    return False
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
@@ -262,18 +268,18 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     Returns:
         True while the peer is lost, shape (K, P), with a column for each of the P peers.
     """
-    part = log[site]
-    peer_count = len(part.peers)
+    site_log = log[site]
+    peer_count = len(site_log.peers)
     times = len(t_s)
     lost = np.zeros((times, peer_count), dtype=bool)
-    if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
+    if not log.scenario.sites[site].on_stale.rule.degrades or not len(site_log):
         return lost
 
-    first = part.layout.count_life_memory(peer_count)
-    is_lost = part.memory(first, peer_count) != 0.0
+    first = site_log.layout.count_life_memory(peer_count)
+    is_lost = site_log.memory(first, peer_count) != 0.0
     # the newest record at each time
     latest_s = t_s + RAMP_TIME_TOLERANCE_S
-    rows_after = np.searchsorted(part.t_s, latest_s, side="right")
+    rows_after = np.searchsorted(site_log.t_s, latest_s, side="right")
     rows = rows_after - 1
     recorded = rows >= 0
     lost[recorded] = is_lost[rows[recorded]]
@@ -312,19 +318,19 @@ def list_losses(log: Log) -> list[PeerLoss]:
     """
     losses = []
     for site in log.sites:
-        part = log[site]
-        is_lost = find_lost_peers(log, site, part.t_s)
+        site_log = log[site]
+        is_lost = find_lost_peers(log, site, site_log.t_s)
         lost = is_lost.astype(int)
-        times_s = part.t_s
-        if len(part):
-            end_s = part.t_s[-1] + 1.0 / part.rate_hz
-            times_s = np.append(part.t_s, end_s)
+        times_s = site_log.t_s
+        if len(site_log):
+            end_s = site_log.t_s[-1] + 1.0 / site_log.rate_hz
+            times_s = np.append(site_log.t_s, end_s)
 
-        for j, peer in enumerate(part.peers):
-            # a loss begins where an edge is positive, and ends where it is negative
-            edges = np.diff(lost[:, j], prepend=0, append=0)
-            start_rows = np.flatnonzero(edges > 0)
-            end_rows = np.flatnonzero(edges < 0)
+        for j, peer in enumerate(site_log.peers):
+            # +1 where a loss begins, and -1 where it ends
+            changes = np.diff(lost[:, j], prepend=0, append=0)
+            start_rows = np.flatnonzero(changes > 0)
+            end_rows = np.flatnonzero(changes < 0)
             starts_s = times_s[start_rows].tolist()
             ends_s = times_s[end_rows].tolist()
             for from_s, to_s in zip(starts_s, ends_s, strict=True):
@@ -378,9 +384,8 @@ def drop_finished_ramps(
     # the last ramp that has started may still be in progress
     finished = sorted_ramps[: started - 1]
     remaining = sorted_ramps[started - 1 :]
-    last_start_s = remaining[0].start_ns * 1e-9
-    turn_s = np.array([last_start_s])
-    history = evaluate_ramps(start, finished, turn_s, 0.0)
+    last_start = np.array([remaining[0].start_ns * 1e-9])
+    history = evaluate_ramps(start, finished, last_start, 0.0)
     return history.alpha[0], remaining
 
 
@@ -392,7 +397,9 @@ def evaluate_ramps(
 ) -> DominanceHistory:
     """Computes dominance factors over time from their start values and their changes.
 
-    A change is a ramp: the factors move linearly to their new values, as in the simulation.
+    The factors are the weights with which a site follows its peers. A change is a ramp: the
+    factors move linearly to their new values, as in the simulation. A ramp that begins while
+    another one is in progress starts from the values reached at that time.
 
     Args:
         start: Factors at the start of the session, shape (P,).
@@ -403,35 +410,35 @@ def evaluate_ramps(
     alpha = np.tile(start, (len(t_s), 1))
     rate = np.zeros((len(t_s), len(start)))
     # the ramp in progress: its factors at start and end, and its times
-    before = start
-    after = start
+    from_factors = start
+    to_factors = start
     start_s = 0.0
     end_s = 0.0
     sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
     for ramp in sorted_ramps:
         next_start_s = ramp.start_ns * 1e-9
-        share = 1.0
+        finished_share = 1.0
         if next_start_s < end_s:
             elapsed_s = next_start_s - start_s
-            share = elapsed_s / (end_s - start_s)
-        interpolated = before + (after - before) * share
+            finished_share = elapsed_s / (end_s - start_s)
+        interpolated = from_factors + (to_factors - from_factors) * finished_share
         # exact factors at the end of a finished ramp, which interpolation would round
-        before = after if share == 1.0 else interpolated
-        after = np.array(ramp.alpha)
+        from_factors = to_factors if finished_share == 1.0 else interpolated
+        to_factors = np.array(ramp.alpha)
         start_s = next_start_s
         end_s = ramp.end_ns * 1e-9
 
         has_started = t_s >= start_s - RAMP_TIME_TOLERANCE_S
         has_not_ended = t_s < end_s - RAMP_TIME_TOLERANCE_S
-        is_climbing = has_started & has_not_ended
-        alpha[has_started] = after
+        is_in_ramp = has_started & has_not_ended
+        alpha[has_started] = to_factors
         rate[has_started] = 0.0
-        if is_climbing.any():
+        if is_in_ramp.any():
             length_s = (ramp.end_ns - ramp.start_ns) * 1e-9
-            slope = (after - before) / length_s
-            since_start_s = t_s[is_climbing, np.newaxis] - start_s
-            alpha[is_climbing] = before + slope * since_start_s
-            rate[is_climbing] = slope
+            slope = (to_factors - from_factors) / length_s
+            since_start_s = t_s[is_in_ramp, np.newaxis] - start_s
+            alpha[is_in_ramp] = from_factors + slope * since_start_s
+            rate[is_in_ramp] = slope
 
     alpha_left = alpha[:-1]
     rate_left = rate[:-1]
@@ -494,14 +501,14 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
     Returns:
         Indices of the sites of each group.
     """
-    reach = find_reach(alpha)
+    reachable = find_reach(alpha)
     groups = []
     for site in range(len(alpha)):
-        is_mutual = reach[site] & reach[:, site]
+        is_mutual = reachable[site] & reachable[:, site]
         group = tuple(np.flatnonzero(is_mutual).tolist())
         # the first site of a group stands for the group
         is_first = group[0] == site
-        is_closed = reach[site].sum() == len(group)
+        is_closed = reachable[site].sum() == len(group)
         if is_first and is_closed:
             groups.append(group)
     return tuple(groups)

@@ -103,6 +103,7 @@ class FileInventory:
         self._messages: defaultdict[str, _Messages] = defaultdict(
             lambda: _Messages(array("Q"), array("Q"), array("Q"))
         )
+
         files = [path for path in paths if path.is_file()]
         total_bytes = sum(path.stat().st_size for path in files)
         bytes_before = 0
@@ -114,7 +115,12 @@ class FileInventory:
             bytes_before += path.stat().st_size
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
-        """Adds the channels, the message numbers and the facts of a file."""
+        """Adds the channels, the message numbers and the facts of a file, such as damage.
+
+        Args:
+            path: The file.
+            reader: Reader of the file, from which no message has been read yet.
+        """
         for topic, payload, log_ns, _, sequence in reader.messages():
             messages = self._messages[topic]
             messages.log_ns.append(log_ns)
@@ -176,7 +182,11 @@ class FileInventory:
         return channels
 
     def _describe_channel(self, topic: str) -> JsonObject:
-        """Returns the facts of a channel, without its gaps."""
+        """Returns number, size, times and encoding of the messages of a channel.
+
+        Args:
+            topic: Topic of the channel.
+        """
         unknown = ChannelInfo(
             topic=topic,
             encoding="",
@@ -325,7 +335,9 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
         Returns:
             The function. It is None if the caller of `info` wants no reports.
         """
-        return progress and (lambda done, total: progress(number * total + done, 2 * total))
+        if progress is None:
+            return None
+        return lambda done, total: progress(number * total + done, 2 * total)
 
     inventory = FileInventory(paths, report_pass(0))
     facts: JsonObject = {
@@ -353,7 +365,11 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
 
 def _describe_log(log: Log) -> JsonObject:
-    """Returns the facts of a log of this program: of its session, its sites and its links."""
+    """Returns the facts of a log of this program: of its session, its sites and its links.
+
+    Args:
+        log: The log.
+    """
     links = {}
     for site in log.sites:
         for peer in log[site].peers:
@@ -438,20 +454,20 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
     Returns:
         The facts as plain values, ready for JSON.
     """
-    part = log[site]
+    site_log = log[site]
     spec = log.scenario.sites[site]
     is_timed = log.driver == "live"
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
-        "records": len(part),
+        "records": len(site_log),
         "made_ticks": _count_executed_ticks(log, site),
         "expected_ticks": log.scenario.ticks(site),
         "missing": log.missing(site),
-        "late_us": _compute_percentiles(part.late_us) if is_timed else None,
-        "busy_us": _compute_percentiles(part.busy_us) if is_timed else None,
-        "overruns": _count_overruns(part) if is_timed else None,
-        "skipped": part.skipped,
+        "late_us": _compute_percentiles(site_log.late_us) if is_timed else None,
+        "busy_us": _compute_percentiles(site_log.busy_us) if is_timed else None,
+        "overruns": _count_overruns(site_log) if is_timed else None,
+        "skipped": site_log.skipped,
     }
 
 
@@ -470,7 +486,7 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
     Returns:
         The facts as plain values, ready for JSON.
     """
-    clock = summarise_clock(log, peer, site)
+    clock_summary = summarise_clock(log, peer, site)
     one_way_us = np.zeros(0, dtype=np.int64)  # not measured in virtual time
     version = _parse_number(log.session.get("schema_version", "")) or 0
     if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
@@ -478,6 +494,7 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
         is_from_peer = arrivals[:, 0] == log[site].peers.index(peer)
         one_way_us = arrivals[is_from_peer, 2]
 
+    # the last report of the site contains the counts since its start
     counts: JsonObject = dict.fromkeys(
         ("accepted", "lost", "late", "superseded", "duplicate", "refused")
     )
@@ -487,8 +504,8 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
         "age_ms": _compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
         "one_way_ms": _compute_percentiles(one_way_us, unit=1e3),
-        "clock_offset_us": None if clock is None else clock.offset_us,
-        "clock_bound_us": None if clock is None else clock.bound_us,
+        "clock_offset_us": None if clock_summary is None else clock_summary.offset_us,
+        "clock_bound_us": None if clock_summary is None else clock_summary.bound_us,
         **counts,
     }
 
@@ -512,11 +529,11 @@ def _compute_percentiles(
     Returns:
         The percentiles, by name. None if there are no numbers.
     """
-    array = np.asarray(values)
-    if not array.size:
+    numbers = np.asarray(values)
+    if not numbers.size:
         return None
     percentages = list(shares.values())
-    percentiles = np.percentile(array, percentages) / unit
+    percentiles = np.percentile(numbers, percentages) / unit
     return dict(zip(shares, percentiles.tolist(), strict=True))
 
 
@@ -539,14 +556,10 @@ def _count_executed_ticks(log: Log, site: str) -> int | None:
     return ticks
 
 
-def _count_overruns(part: SiteLog) -> int:
-    """Counts the ticks that started late, by more than a whole tick period.
-
-    Args:
-        part: Log of the site.
-    """
-    period_us = 1e6 / part.rate_hz
-    is_overrun = part.late_us >= period_us
+def _count_overruns(site_log: SiteLog) -> int:
+    """Counts the ticks of a site that started more than a whole tick period late."""
+    period_us = 1e6 / site_log.rate_hz
+    is_overrun = site_log.late_us >= period_us
     return int(np.count_nonzero(is_overrun))
 
 
@@ -621,29 +634,29 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
-    """Returns the numbers of a site for `summary.json`.
+    """Returns the numbers of a site for `summary.json`, such as its largest errors and torques.
 
     Args:
         log: The log of the run.
         site: Name of the site.
         twin: Log of the same run without operators, or None.
     """
-    part = log[site]
+    site_log = log[site]
     spec = log.scenario.sites[site]
     at_end = np.zeros(0, dtype=bool)
-    if len(part):
-        at_end = part.t_s > part.t_s[-1] - END_WINDOW_S
-    displacement = part.q[:0]
+    if len(site_log):
+        at_end = site_log.t_s > site_log.t_s[-1] - END_WINDOW_S
+    displacement = site_log.q[:0]
     if twin is not None:
         displacement = operator_displacement(log, twin, site)[2]
 
     executed = _count_executed_ticks(log, site)
     expected = log.scenario.ticks(site)
     ticks = expected if executed is None else executed
-    late_us = _compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
-    busy_us = _compute_percentiles(part.busy_us)
+    late_us = _compute_percentiles(site_log.late_us, _LATENESS_PERCENTILES)
+    busy_us = _compute_percentiles(site_log.busy_us)
     tau_limit_nm = spec.limits.tau_limit_nm
-    at_limit = np.abs(part.tau) >= tau_limit_nm
+    at_limit = np.abs(site_log.tau) >= tau_limit_nm
 
     moved_max_rad = None
     moved_end_rad = None
@@ -655,36 +668,32 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
-        "records": len(part),
+        "records": len(site_log),
         "expected_ticks": expected,
         "made_ticks": executed,
-        "missing": max(0, ticks - log.absent_ticks(site) - len(part)),
-        "diverged_at_s": part.diverged_s,
-        "modes": [interval._asdict() for interval in find_mode_intervals(part)],
-        "q_end_rad": part.q[-1].tolist() if len(part) else None,
-        "max_error_rad": _largest_magnitude(part.e),
-        "max_error_end_rad": _largest_magnitude(part.e[at_end]),
-        "settle_s": settling_time_s(part),
-        "peak_tau_nm": _largest_magnitude(part.tau),
+        "missing": max(0, ticks - log.absent_ticks(site) - len(site_log)),
+        "diverged_at_s": site_log.diverged_s,
+        "modes": [interval._asdict() for interval in find_mode_intervals(site_log)],
+        "q_end_rad": site_log.q[-1].tolist() if len(site_log) else None,
+        "max_error_rad": _largest_magnitude(site_log.e),
+        "max_error_end_rad": _largest_magnitude(site_log.e[at_end]),
+        "settle_s": settling_time_s(site_log),
+        "peak_tau_nm": _largest_magnitude(site_log.tau),
         "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
         "late_us": late_us or dict.fromkeys(_LATENESS_PERCENTILES),
         "busy_us": busy_us or dict.fromkeys(PERCENTILES),
-        "overruns": _count_overruns(part),
-        "skipped": part.skipped,
+        "overruns": _count_overruns(site_log),
+        "skipped": site_log.skipped,
         "hands_moved_max_rad": moved_max_rad,
         "hands_moved_end_rad": moved_end_rad,
     }
 
 
 def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
-    """Returns the numbers of a link for `summary.json`.
-
-    Args:
-        log: The log of the run.
-        link: Summary of the link.
-    """
+    """Returns the numbers of a link for `summary.json`, such as its delays and losses."""
     counts = link.counts
     clock = summarise_clock(log, link.peer, link.site)
+
     stated = []
     for model in link.stated:
         moments = model.link.moments()
@@ -722,5 +731,5 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
 
 def _largest_magnitude(values: ArrayLike) -> float | None:
     """Returns the largest absolute value. None without values."""
-    array = np.abs(np.asarray(values))
-    return float(array.max()) if array.size else None
+    magnitudes = np.abs(np.asarray(values))
+    return float(magnitudes.max()) if magnitudes.size else None

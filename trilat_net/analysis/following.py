@@ -306,7 +306,7 @@ Following = JointFollowing | TaskFollowing
 
 
 def _transpose(matrices: Array) -> Array:
-    """Returns the transposes of the matrices of all rows, shape (K, b, a) of (K, a, b)."""
+    """Returns the transpose of the matrix of every row, with shape (K, b, a) from (K, a, b)."""
     return matrices.transpose(0, 2, 1)
 
 
@@ -333,27 +333,28 @@ def build_following(
 
     end_effector = arm.place_end_effector(q, qd)
     axes = np.array(task.axes)[:, np.newaxis]
-    scale = axes * task.scale
-    J = scale * end_effector.J
-    Jd = scale * arm.jacobian_rate(q, qd)
+    axis_scale = axes * task.scale
+    J = axis_scale * end_effector.J
+    Jd = axis_scale * arm.jacobian_rate(q, qd)
     # ones on the diagonal of the axes that are not followed keep A regular
     free_axes = np.diag(1.0 - axes[:, 0])
     A = J @ _transpose(J) + free_axes
-    eigenvalues, basis = np.linalg.eigh(A)
-    bounded = np.maximum(eigenvalues, _LEAST_EIGENVALUE)
-    scaled_basis = basis / bounded[:, np.newaxis]
-    inverse = scaled_basis @ _transpose(basis)
+    eigenvalues, eigenvectors = np.linalg.eigh(A)
+    bounded_eigenvalues = np.maximum(eigenvalues, _LEAST_EIGENVALUE)
+    scaled_eigenvectors = eigenvectors / bounded_eigenvalues[:, np.newaxis]
+    inverse = scaled_eigenvectors @ _transpose(eigenvectors)
 
     # 1 / trace(A^-1) is a smooth lower bound of the least eigenvalue of A
-    trace = np.trace(axes * inverse, axis1=1, axis2=2)
-    least_eigenvalue = 1.0 / trace
+    inverse_trace = np.trace(axes * inverse, axis1=1, axis2=2)
+    least_eigenvalue = 1.0 / inverse_trace
 
+    # derivative of that bound: d(A^-1)/dt = -A^-1 (dA/dt) A^-1
     damping = np.maximum(task.singular_value**2 - least_eigenvalue, 0.0)
     half_A_rate = J @ _transpose(Jd)
     A_rate = half_A_rate + _transpose(half_A_rate)
     inverse_rate = inverse @ A_rate @ inverse
-    trace_rate = -np.trace(inverse_rate, axis1=1, axis2=2)
-    bound_rate = trace_rate / trace**2
+    inverse_trace_rate = -np.trace(inverse_rate, axis1=1, axis2=2)
+    bound_rate = inverse_trace_rate / inverse_trace**2
     damping_rate = np.where(damping > 0.0, bound_rate, 0.0)
     if damping.any():
         damping_matrix = damping[:, np.newaxis, np.newaxis] * np.eye(len(axes))

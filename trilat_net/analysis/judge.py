@@ -17,9 +17,10 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..execution import FusedRun, simulate_scenario
+from ..execution import FusedRun, simulate_columns, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
+from .blas_threads import limit_blas_threads
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import find_missing_functionals
 from .certificate.stability_certificate import Certificate, certify
@@ -53,9 +54,9 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
     if any(change.dominance for change in scenario.timeline):
         return []
     links = {name: find_final_link(scenario, name) for name in scenario.links}
-    final = msgspec.structs.replace(scenario, links=links, timeline=())
+    final_scenario = msgspec.structs.replace(scenario, links=links, timeline=())
     proofs = []
-    for _, law, situation in list_law_situations(final):
+    for _, law, situation in list_law_situations(final_scenario):
         condition = law.condition(situation)
         if condition is None or not condition.proves_decay:
             return []
@@ -63,6 +64,7 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
     return list(dict.fromkeys(proofs))
 
 
+@limit_blas_threads()
 def certify_run(
     log: Log,
     *,
@@ -87,12 +89,15 @@ def certify_run(
         LogError: A record cannot be read, or names a change that does not exist.
     """
     certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
+
     growth = None
     if twins != 0:
         growth = TwinGrowth.of_log(log, certificate.end, twins, own_laws=own_laws)
+
     final_scenario = resolve_final_scenario(log)
     roots = find_log_roots(log, own_laws=own_laws)
     conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
+
     return replace(
         certificate,
         roots=roots,
@@ -127,6 +132,7 @@ class _VirtualJudgement(NamedTuple):
     decision: StabilityDecision
 
 
+@limit_blas_threads()
 def judge_virtual_run(
     scenario: Scenario, run: FusedRun, end: RunEnd | None = None
 ) -> _VirtualJudgement:
@@ -142,32 +148,42 @@ def judge_virtual_run(
         run: The run in the fused loop.
         end: How the motion ends. None to find it from the run.
     """
-    ended = scenario
+    # the run may have been longer or shorter than its scenario states
+    executed_scenario = scenario
     if run.diverged_s is None:
-        ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
+        executed_scenario = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     if end is None:
         trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-        end = trace.classify_end(ended)
+        end = trace.classify_end(executed_scenario)
     findings = RunFindings(
         end=end,
-        roots=find_run_roots(ended, run),
-        proofs=list_law_proofs(ended),
+        roots=find_run_roots(executed_scenario, run),
+        proofs=list_law_proofs(executed_scenario),
     )
     twins = None
     if not is_decided_by_roots(findings):
-        twins = TwinGrowth.of_scenario(ended, end, run.ran_s)
+        twins = TwinGrowth.of_scenario(executed_scenario, end, run.ran_s)
         findings = findings._replace(twins=twins)
     decision = decide_stability(findings)
+    # only energies, which need the records of the run, may change a weak decision
     is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)
-    ticks = sum(site.rate_hz for site in ended.sites.values()) * ended.duration_s
-    if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(ended):
-        recorded = certify(simulate_scenario(ended), own_laws=True)
+    ticks = (
+        sum(site.rate_hz for site in executed_scenario.sites.values())
+        * executed_scenario.duration_s
+    )
+    if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(executed_scenario):
+        # Only a written log contains the memories from which laws compute declared energies.
+        if find_energy_laws(executed_scenario, own_laws=True):
+            log: Log = simulate_scenario(executed_scenario)
+        else:
+            log = simulate_columns(executed_scenario)
+        certificate_of_log = certify(log, own_laws=True)
         certificate = replace(
-            recorded,
+            certificate_of_log,
             roots=findings.roots,
             twins=twins,
             law_proofs=tuple(findings.proofs),
-            has_lasting_delays=has_lasting_delays(ended),
+            has_lasting_delays=has_lasting_delays(executed_scenario),
         )
         decision = certificate.decision
     assert findings.roots is not None

@@ -110,21 +110,21 @@ def predict_delivery(
         LogError: A recorded change is not valid.
     """
     links = log.scenario.setup(site).links
-    setup = next(link for link in links if link.peer == peer)
+    link_setup = next(link for link in links if link.peer == peer)
     peer_index = log[site].peers.index(peer)
     commands = [command for batch in log.commands(site).values() for command in batch]
-    ordered_models = [
+    commanded_models = [
         command.model
         for command in commands
         if command.peer == peer_index and command.model is not None
     ]
-    schedule = LinkSchedule(setup, ordered_models)
+    schedule = LinkSchedule(link_setup, commanded_models)
     models = schedule.models
     due_ns = schedule.draw(count)
 
     # The same link without duplicates, reordering and play-out buffer. It is computed only if
     # it differs.
-    delay_alone = LinkSchedule(setup, ordered_models)
+    delay_alone = LinkSchedule(link_setup, commanded_models)
     delay_alone.models["duplicate"] = 0.0
     delay_alone.models["in_order"] = 0
     delay_alone.models["playout_us"] = 0
@@ -132,7 +132,7 @@ def predict_delivery(
     if not np.array_equal(delay_alone.models, models):
         drawn_ns = delay_alone.draw(count)
 
-    stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
+    stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // link_setup.rate_hz
     model_index = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
     return _PredictedDelivery(
         stamp_ns=stamp_ns,
@@ -184,18 +184,18 @@ def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     Returns:
         The arrived samples in the order of their arrival, by name of the sending site.
     """
-    part = log[site]
-    counts, entries = part.arrivals
-    all_ticks = np.repeat(part.tick, counts)
+    site_log = log[site]
+    counts, entries = site_log.arrivals
+    all_ticks = np.repeat(site_log.tick, counts)
     arrivals = {}
-    for index, peer in enumerate(part.peers):
+    for index, peer in enumerate(site_log.peers):
         is_from_peer = entries[:, 0] == index
         tick = all_ticks[is_from_peer]
         sample = entries[is_from_peer, 1]
         delay_us = entries[is_from_peer, 2]
 
         # a link accepts no stamp before the epoch, and none further ahead than the limit
-        latest_ns = tick * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
+        latest_ns = tick * NS_PER_S // site_log.rate_hz + AHEAD_LIMIT_NS
         peer_rate_hz = log.scenario.sites[peer].rate_hz
         # compared in ticks, because a stamp in ns might overflow
         latest_sample = ((latest_ns + 1) * peer_rate_hz - 1) // NS_PER_S
@@ -210,7 +210,7 @@ def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     return arrivals
 
 
-def _count_sent(log: Log, peer: str, newest: int) -> int:
+def _count_sent(log: Log, peer: str, newest_sample: int) -> int:
     """Returns the number of samples that a peer has sent, as far as the log shows.
 
     A sample is the state that a site publishes in one tick of its control loop.
@@ -218,15 +218,15 @@ def _count_sent(log: Log, peer: str, newest: int) -> int:
     Args:
         log: The log of the run.
         peer: Name of the peer.
-        newest: Number of the newest sample of the peer that arrived at any site. -1 if no
-            sample arrived.
+        newest_sample: Number of the newest sample of the peer that arrived at any site. -1 if
+            no sample arrived.
     """
-    part = log[peer]
+    site_log = log[peer]
     end_ticks = [
         event.ticks for event in log.events if event.kind == "end" and event.member == peer
     ]
-    recorded_ticks = int(part.tick[-1]) + 1 if len(part) else 0
-    return min(max(newest + 1, recorded_ticks, *end_ticks), log.scenario.ticks(peer))
+    recorded_ticks = int(site_log.tick[-1]) + 1 if len(site_log) else 0
+    return min(max(newest_sample + 1, recorded_ticks, *end_ticks), log.scenario.ticks(peer))
 
 
 def _mark_judged_samples(
@@ -251,28 +251,29 @@ def _mark_judged_samples(
     Returns:
         True for each judged sample, shape (M,).
     """
-    part = log[site]
-    count = len(stamp_ns)
-    if not len(part):
-        return np.zeros(count, dtype=np.bool_)
+    site_log = log[site]
+    samples = len(stamp_ns)
+    if not len(site_log):
+        return np.zeros(samples, dtype=np.bool_)
 
-    earliest_tick = first_ticks(stamp_ns + 1, part.rate_hz)
+    earliest_tick = first_ticks(stamp_ns + 1, site_log.rate_hz)
     slowest_ticks = int((arrivals.tick - earliest_tick[arrivals.sample]).max(initial=0))
     newest = int(arrivals.sample.max(initial=-1))
-    last_tick = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
-    is_older_than_newest = np.arange(count) <= newest
-    judged: Bools = is_older_than_newest | (earliest_tick + slowest_ticks <= last_tick)
+    last_tick = min(int(site_log.tick[-1]), log.scenario.ticks(site) - 1)
+    is_older_than_newest = np.arange(samples) <= newest
+    is_judged: Bools = is_older_than_newest | (earliest_tick + slowest_ticks <= last_tick)
 
+    # a sample is not judged if a record is missing in the ticks in which it may have arrived
     is_missing = np.ones(last_tick + 1, dtype=np.bool_)
-    is_missing[part.tick[part.tick <= last_tick]] = False
+    is_missing[site_log.tick[site_log.tick <= last_tick]] = False
     missing_ticks = np.flatnonzero(is_missing)
     if len(missing_ticks):
-        never = np.iinfo(np.int64).max
-        following = np.searchsorted(missing_ticks, earliest_tick)
-        next_missing_tick = np.append(missing_ticks, never)[following]
-        judged &= next_missing_tick - earliest_tick > slowest_ticks
-    judged[arrivals.sample] = True
-    return judged
+        never_tick = np.iinfo(np.int64).max
+        next_index = np.searchsorted(missing_ticks, earliest_tick)
+        next_missing_tick = np.append(missing_ticks, never_tick)[next_index]
+        is_judged &= next_missing_tick - earliest_tick > slowest_ticks
+    is_judged[arrivals.sample] = True
+    return is_judged
 
 
 MOST_AGE_BINS = 50
@@ -541,11 +542,11 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
     Returns:
         The ages. Ticks before the first state came into use are left out.
     """
-    part = log[site]
-    used = part.used[peer]
+    site_log = log[site]
+    used = site_log.used[peer]
     has_sample = used >= 0
     stamp_ns = used[has_sample] * NS_PER_S // log.scenario.sites[peer].rate_hz
-    return part.tick[has_sample] * NS_PER_S // part.rate_hz - stamp_ns
+    return site_log.tick[has_sample] * NS_PER_S // site_log.rate_hz - stamp_ns
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
@@ -557,15 +558,15 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
     Returns:
         The statistics. None if there are no numbers.
     """
-    array = np.asarray(values, dtype=np.float64)
-    if not array.size:
+    numbers = np.asarray(values, dtype=np.float64)
+    if not numbers.size:
         return None
-    shares = (50.0, 95.0, 99.0, 0.0, 100.0)
-    percentiles = np.percentile(array, shares)
+    percentages = (50.0, 95.0, 99.0, 0.0, 100.0)  # the last two are the extremes
+    percentiles = np.percentile(numbers, percentages)
     p50, p95, p99, low, high = percentiles.tolist()
     return ValueStatistics(
-        mean=float(array.mean()),
-        deviation=float(array.std()),
+        mean=float(numbers.mean()),
+        deviation=float(numbers.std()),
         p50=p50,
         p95=p95,
         p99=p99,
@@ -589,13 +590,13 @@ def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
         return None
     youngest_ns = int(age_ns.min())
     oldest_ns = int(age_ns.max())
-    widths_ns = [step * 10**power for power in range(4, 15) for step in (1, 2, 5)]
-    width_ns = next(
-        width
-        for width in widths_ns
-        if oldest_ns // width - youngest_ns // width < MOST_AGE_BINS
-    )
-    first_bin = youngest_ns // width_ns
+    possible_widths_ns = [step * 10**power for power in range(4, 15) for step in (1, 2, 5)]
+    # the narrowest bins that suffice
+    for width_ns in possible_widths_ns:
+        first_bin = youngest_ns // width_ns
+        last_bin = oldest_ns // width_ns
+        if last_bin - first_bin < MOST_AGE_BINS:
+            break
     ticks = np.bincount(age_ns // width_ns - first_bin).tolist()
     return _AgeHistogram(first_bin * width_ns / 1e6, width_ns / 1e6, ticks)
 
@@ -618,8 +619,8 @@ def _summarise_link(
         sent: Number of samples that the peer sent.
         arrivals: Arrivals over the link.
     """
-    part = log[site]
-    used = part.used[peer]
+    site_log = log[site]
+    used = site_log.used[peer]
     delivery = predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
 
@@ -640,29 +641,29 @@ def _summarise_link(
 
     # ticks without a new sample, and the longest silence
     ticks_without_new = None
-    is_successive = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
+    is_successive = (np.diff(site_log.tick) == 1) & (used[:-1] >= 0)
     if is_successive.any():
         ticks_without_new = float(np.mean(np.diff(used)[is_successive] == 0))
     first_use_s = None
     silence_ms = None
     if (used >= 0).any():
-        first_use_s = float(part.t_s[np.flatnonzero(used >= 0)[0]])
-        new_ticks = part.tick[np.flatnonzero(np.diff(used, prepend=-1))]
-        edges = np.append(new_ticks, part.tick[-1] + 1)
-        silence_ms = float(np.diff(edges * NS_PER_S // part.rate_hz).max()) / 1e6
+        first_use_s = float(site_log.t_s[np.flatnonzero(used >= 0)[0]])
+        new_ticks = site_log.tick[np.flatnonzero(np.diff(used, prepend=-1))]
+        switch_ticks = np.append(new_ticks, site_log.tick[-1] + 1)
+        silence_ms = float(np.diff(switch_ticks * NS_PER_S // site_log.rate_hz).max()) / 1e6
 
     counts = None
     one_way_us = None
-    if len(part):
+    if len(site_log):
         counts = _count_samples(
-            part=part,
+            site_log=site_log,
             used=used,
             delivery=delivery,
             arrivals=arrivals,
             sent=int(np.count_nonzero(is_sent)),
             judged=judged,
         )
-        if log.driver == "live" and part.record(0).v >= ONE_WAY_SCHEMA_VERSION:
+        if log.driver == "live" and site_log.record(0).v >= ONE_WAY_SCHEMA_VERSION:
             one_way_us = compute_statistics(arrivals.delay_us)
     return LinkSummary(
         peer=peer,
@@ -682,7 +683,7 @@ def _summarise_link(
 
 
 def _count_samples(
-    part: SiteLog,
+    site_log: SiteLog,
     used: Ints,
     delivery: _PredictedDelivery,
     arrivals: _Arrivals,
@@ -692,7 +693,7 @@ def _count_samples(
     """Counts the samples of a link by what happened to them, see `SampleCounts`.
 
     Args:
-        part: Log of the receiver.
+        site_log: Log of the receiver.
         used: Number of the sample in use at every record, shape (K,).
         delivery: Predicted delivery of all samples.
         arrivals: Arrivals over the link.
@@ -700,16 +701,16 @@ def _count_samples(
         judged: Number of samples of which it is known whether they arrived.
     """
     first = arrivals.first
-    release_tick = delivery.release(part.rate_hz)[first.sample]
+    release_tick = delivery.release(site_log.rate_hz)[first.sample]
     is_lost = delivery.lost[first.sample]
     is_injected = ~delivery.measured[first.sample]
     is_late = ~is_lost & is_injected & (first.tick > release_tick)
     # A sample is superseded if a newer one is in use at the tick in which it could come into
     # use: the receiver always uses the newest sample.
     use_tick = np.maximum(release_tick, first.tick)
-    row = np.minimum(np.searchsorted(part.tick, use_tick), len(part) - 1)
-    is_recorded = part.tick[row] == use_tick
-    is_superseded = ~is_lost & is_recorded & (used[row] != first.sample)
+    use_row = np.minimum(np.searchsorted(site_log.tick, use_tick), len(site_log) - 1)
+    is_recorded = site_log.tick[use_row] == use_tick
+    is_superseded = ~is_lost & is_recorded & (used[use_row] != first.sample)
 
     return SampleCounts(
         sent=sent,
@@ -754,8 +755,8 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
     distributions = []
     for site in log.sites:
         for peer, arrivals in _read_arrivals(log, site).items():
-            newest = int(arrivals.sample.max(initial=-1))
-            sent_count = _count_sent(log, peer, newest)
+            newest_sample = int(arrivals.sample.max(initial=-1))
+            sent_count = _count_sent(log, peer, newest_sample)
             delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
             # A link without a model has only measured delays, and only in a live session.
             if not len(delay_ms) and log.driver == "live":

@@ -229,7 +229,7 @@ class RunEnd(NamedTuple):
 
     @property
     def _behaviour_text(self) -> str:
-        """A sentence on the behaviour, with its numbers."""
+        """A sentence for the user on how the run ends, with the numbers that show it."""
         behaviour = self.behaviour
         if self.diverged_at_s is not None:
             unnamed = f"a joint passed its qd_limit_rad_s at {self.diverged_at_s:.4g} s"
@@ -280,8 +280,8 @@ class RunEnd(NamedTuple):
             return end._replace(divergence=log.describe_divergence())
         if end.behaviour is not EndBehaviour.BOUNDED:
             return end
-        parts = [log[site] for site in log.sites]
-        return end._replace(frequency_hz=_find_frequency_hz(parts))
+        site_logs = [log[site] for site in log.sites]
+        return end._replace(frequency_hz=_find_frequency_hz(site_logs))
 
 
 class RunTrace(NamedTuple):
@@ -447,17 +447,17 @@ def trace_log(log: Log) -> RunTrace:
     tau_x = []
     push_times_s = []
     for site in log.sites:
-        part = log[site]
+        site_log = log[site]
         site_buckets = reduce_to_buckets(
-            bucket=part.tick * BUCKETS_PER_S // part.rate_hz,
-            e=part.e,
-            qd=part.qd,
-            q=part.q,
+            bucket=site_log.tick * BUCKETS_PER_S // site_log.rate_hz,
+            e=site_log.e,
+            qd=site_log.qd,
+            q=site_log.q,
             into=NO_BUCKETS,
         )
         buckets.append(site_buckets)
-        tau_x.append(part.tau_x[-1] if len(part) else np.zeros(1))
-        push_times_s.append(_find_unscripted_push_s(log, part))
+        tau_x.append(site_log.tau_x[-1] if len(site_log) else np.zeros(1))
+        push_times_s.append(_find_unscripted_push_s(log, site_log))
 
     change_times_s = [change.at_s for change in list_effective_commands(log)]
     return RunTrace(
@@ -469,26 +469,29 @@ def trace_log(log: Log) -> RunTrace:
     )
 
 
-def _find_unscripted_push_s(log: Log, part: SiteLog) -> float:
+def _find_unscripted_push_s(log: Log, site_log: SiteLog) -> float:
     """Returns the last time at which an operator outside the scenario pushed a site, in s.
 
-    Operators act outside the scenario if they move an arm that is not simulated, or act live.
+    The motion after this time is not caused by that operator. Such operators move an arm that
+    is not simulated, or act live. The result is 0 if none of them pushed.
 
-    Returns:
-        The time. 0 if no such operator pushed.
+    Args:
+        log: Log of the run.
+        site_log: The part of the log with the records of the site.
     """
-    pushed = np.zeros(len(part), dtype=np.bool_)
-    if part.name in log.scenario.external:
-        pushed |= part.tau_x.any(axis=1)
-    if len(part) and part.layout.hand:
-        pushed |= part.hand[:, 0] > 0.0
-    return float(part.t_s[pushed].max(initial=0.0))
+    is_pushed = np.zeros(len(site_log), dtype=np.bool_)
+    if site_log.name in log.scenario.external:
+        is_pushed |= site_log.tau_x.any(axis=1)
+    if len(site_log) and site_log.layout.hand:
+        is_pushed |= site_log.hand[:, 0] > 0.0
+    return float(site_log.t_s[is_pushed].max(initial=0.0))
 
 
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
-    """Returns |e|, |qd| and q of each site in every interval, shape (K, 3, n) each.
+    """Returns |e|, |qd| and q of each site in every 50 ms interval, shape (K, 3, n) each.
 
-    Spare columns of `RunTrace.buckets` are removed.
+    `RunTrace.buckets` stores these side by side in one row, and may have columns for more
+    joints than the site has. These columns are removed.
     """
     sites = []
     for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
@@ -502,10 +505,11 @@ def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
 
 
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
-    """Chooses the part of a run of which the second half is judged.
+    """Chooses the part of a run whose second half is judged.
 
-    Normally this is the whole run. An action in the second half shortens the part, so that its
-    second half begins after the action, if enough time follows the action.
+    Normally this is the whole run. An action in its second half moves the start of the part to
+    a later time, such that the judged half begins after the action. If too little time follows
+    the action, the whole run is judged nevertheless.
 
     Args:
         t_s: Times of the run, in s.
@@ -575,14 +579,14 @@ def _find_worst_joint(
     # Some behaviours depend on the other joints of coupled sites.
     end_s = float(t_s[-1]) if len(t_s) else 0.0
     joint_counts = [site.shape[2] for site in sites]
-    owners = np.repeat(np.arange(len(sites)), joint_counts)
+    site_of_joint = np.repeat(np.arange(len(sites)), joint_counts)
     for group in find_coupled_sites(scenario):
-        for n in _find_fed_joints(ends, owners, group):
+        for n in _find_fed_joints(ends, site_of_joint, group):
             ends[n] = ends[n]._replace(behaviour=EndBehaviour.UNDECIDED)
         coasting = _find_coasting_joints(
             scenario=scenario,
             joints=ends,
-            owners=owners,
+            site_of_joint=site_of_joint,
             group=group,
             end_s=end_s,
         )
@@ -611,7 +615,7 @@ def _judge_joint(
     motion: Array,
     t_s: Array,
 ) -> EndBehaviour:
-    """Returns the behaviour of a joint, by itself.
+    """Returns the behaviour of a single joint at the end of the run, without regard to others.
 
     Args:
         scenario: Scenario of the run.
@@ -632,44 +636,46 @@ def _judge_joint(
         speed=speed,
         end_error_rad=end.end_error_rad,
         end_speed_rad_s=end.end_speed_rad_s,
-        still=is_still,
-        rests=rests,
+        is_still=is_still,
+        is_resting=rests,
     )
     return _refine_by_motion(
         behaviour,
         q=motion[:, 2],
         speed=motion[:, 1],
         t_s=t_s,
-        still=is_still,
+        is_still=is_still,
     )
 
 
-def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
-    """Finds the steady joints that may receive energy from a faster joint of the coupled sites.
+def _find_fed_joints(
+    joints: Sequence[RunEnd], site_of_joint: Ints, group: Sequence[int]
+) -> list[int]:
+    """Finds joints with a steady motion that a faster, decaying joint may keep in motion.
 
-    Modes that decay at several frequencies beat. Therefore a joint may be steady for a while
-    although all modes decay.
+    Modes that decay at several frequencies exchange energy (they beat). A joint may therefore
+    be steady for a while although all modes decay, and must not count as a lasting oscillation.
 
     Args:
-        joints: Ends of all joints.
-        owners: Index of each joint's site.
-        group: Indices of the coupled sites.
+        joints: Trends at the end of all joints.
+        site_of_joint: Index of each joint's site.
+        group: Indices of sites that follow each other.
 
     Returns:
-        Indices of these joints. They are slower than some joint whose speed falls.
+        Indices of these joints. Each is slower than some joint of the group whose speed falls.
     """
-    members = np.flatnonzero(np.isin(owners, group)).tolist()
-    falling = [joints[n] for n in members if joints[n].speed.trend in _FALLING]
-    falling_speeds = [joint.end_speed_rad_s for joint in falling]
-    fastest = max(falling_speeds, default=0.0)
-    bounded = [n for n in members if joints[n].behaviour is EndBehaviour.BOUNDED]
-    return [n for n in bounded if joints[n].end_speed_rad_s < fastest]
+    joints_of_group = np.flatnonzero(np.isin(site_of_joint, group)).tolist()
+    decaying = [joints[n] for n in joints_of_group if joints[n].speed.trend in _FALLING]
+    decaying_speeds = [joint.end_speed_rad_s for joint in decaying]
+    fastest = max(decaying_speeds, default=0.0)
+    steady = [n for n in joints_of_group if joints[n].behaviour is EndBehaviour.BOUNDED]
+    return [n for n in steady if joints[n].end_speed_rad_s < fastest]
 
 
 def _find_coasting_joints(
     scenario: Scenario,
     joints: Sequence[RunEnd],
-    owners: Ints,
+    site_of_joint: Ints,
     group: Sequence[int],
     end_s: float,
 ) -> list[int]:
@@ -682,20 +688,21 @@ def _find_coasting_joints(
     Args:
         scenario: Scenario of the run.
         joints: Ends of all joints.
-        owners: Index of each joint's site.
+        site_of_joint: Index of each joint's site.
         group: Indices of the coupled sites.
         end_s: End of the run, in s.
 
     Returns:
         Indices of these joints. Empty if something brakes the sites.
     """
-    specs = [scenario.sites[scenario.names[site]] for site in group]
+    site_specs = [scenario.sites[scenario.names[site]] for site in group]
     free_laws = []
-    for spec in specs:
+    for spec in site_specs:
         actors = [source.actor for source in (*spec.hands, *spec.environment)]
         if not any(actor.start_s <= end_s < actor.end_s for actor in actors):
             free_laws.append(spec.control)
 
+    # without damping, a law that takes energy from the links only brakes nothing
     brakeless = []
     all_have_springs = True
     for law in free_laws:
@@ -704,11 +711,11 @@ def _find_coasting_joints(
             brakeless.append(law)
         has_spring = any(getattr(law, "K", (1.0,)))  # laws without a gain K have springs
         all_have_springs &= has_spring
-    if len(brakeless) != len(specs) and all_have_springs:
+    if len(brakeless) != len(site_specs) and all_have_springs:
         return []
 
     coasting = []
-    for n in np.flatnonzero(np.isin(owners, group)).tolist():
+    for n in np.flatnonzero(np.isin(site_of_joint, group)).tolist():
         drifts = joints[n].behaviour is EndBehaviour.DRIFTS
         grows = joints[n].speed.trend is EnvelopeTrend.GROWS
         if drifts and not grows:
@@ -722,8 +729,8 @@ def _classify_joint(
     end_error_rad: float,
     end_speed_rad_s: float,
     *,
-    still: bool,
-    rests: bool,
+    is_still: bool,
+    is_resting: bool,
 ) -> EndBehaviour:
     """Returns the behaviour of a joint according to the trends of its |e| and |qd|.
 
@@ -738,16 +745,16 @@ def _classify_joint(
         speed: Trend of |qd|.
         end_error_rad: Largest |e| of the last second.
         end_speed_rad_s: Largest |qd| of the last second.
-        still: True if the speed decays, or is at the floor of its rounding errors.
-        rests: True if the joint is slow, and its speed falls, even if only slightly. The speed
-            of an arm that is not simulated need not fall.
+        is_still: True if the speed decays, or is at the floor of its rounding errors.
+        is_resting: True if the joint is slow, and its speed falls, even if only slightly. The
+            speed of an arm that is not simulated need not fall.
     """
     if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
     if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
 
-    if not rests and not still:
+    if not is_resting and not is_still:
         if end_speed_rad_s <= SETTLED_SPEED_RAD_S:
             return EndBehaviour.UNDECIDED
         if speed.trend is EnvelopeTrend.HARDLY:
@@ -758,9 +765,9 @@ def _classify_joint(
 
     is_small = end_error_rad <= SETTLED_ERROR_RAD
     if error.calm and (is_small or error.trend is EnvelopeTrend.STEADY):
-        return EndBehaviour.CONVERGED if rests else EndBehaviour.DECAYS
+        return EndBehaviour.CONVERGED if is_resting else EndBehaviour.DECAYS
     if error.trend is EnvelopeTrend.DECAYS:
-        return EndBehaviour.CONVERGED if rests and is_small else EndBehaviour.DECAYS
+        return EndBehaviour.CONVERGED if is_resting and is_small else EndBehaviour.DECAYS
     if error.trend is EnvelopeTrend.HARDLY:
         return EndBehaviour.HARDLY
     return EndBehaviour.UNDECIDED
@@ -772,7 +779,7 @@ def _refine_by_motion(
     speed: Array,
     t_s: Array,
     *,
-    still: bool,
+    is_still: bool,
 ) -> EndBehaviour:
     """Refines the behaviour of a joint by the direction of its motion.
 
@@ -787,39 +794,41 @@ def _refine_by_motion(
         q: Joint angle, shape (K,), in rad.
         speed: Largest |qd| since the time before, shape (K,), in rad/s.
         t_s: Times, shape (K,), in s.
-        still: True if the speed decays, or is at the floor of its rounding errors.
+        is_still: True if the speed decays, or is at the floor of its rounding errors.
     """
-    may_rest = behaviour is EndBehaviour.CONVERGED and not still
+    may_rest = behaviour is EndBehaviour.CONVERGED and not is_still
     may_move = behaviour in _MAY_DRIFT or may_rest
     if not may_move or len(t_s) < BUCKETS_PER_S:
         return behaviour
 
     middle_s = 0.5 * (t_s[0] + t_s[-1])
-    half = int(np.searchsorted(t_s, middle_s))
-    quarters = np.linspace(half, len(t_s) - 1, 5).round().astype(int)
+    half_row = int(np.searchsorted(t_s, middle_s))
+    # rows of the five ends of the four quarters of the judged half
+    quarters = np.linspace(half_row, len(t_s) - 1, 5).round().astype(int)
     steps = np.diff(q[quarters])
-    way = steps.sum()
-    total = abs(float(way))
-    steps_along_way = steps * np.sign(way)
-    least_step = float(steps_along_way.min())
-    is_one_way = least_step >= 0.125 * total
-    half_s = t_s[-1] - t_s[half]
-    largest_speed = speed[half:].max()
-    is_direct = total >= 0.5 * half_s * largest_speed
+    travel = steps.sum()
+    distance = abs(float(travel))
+    steps_along_travel = steps * np.sign(travel)
+    least_step = float(steps_along_travel.min())
+    is_one_way = least_step >= 0.125 * distance
+    # a joint that swings on its way has a mean speed far below its largest speed
+    half_s = t_s[-1] - t_s[half_row]
+    largest_speed = speed[half_row:].max()
+    is_fast_enough = distance >= 0.5 * half_s * largest_speed
 
-    if is_one_way and is_direct:
-        if total >= DRIFT_RAD:
+    if is_one_way and is_fast_enough:
+        if distance >= DRIFT_RAD:
             return EndBehaviour.DRIFTS
-        if total >= SETTLED_ERROR_RAD and behaviour is EndBehaviour.CONVERGED:
+        if distance >= SETTLED_ERROR_RAD and behaviour is EndBehaviour.CONVERGED:
             return EndBehaviour.UNDECIDED
     if behaviour is not EndBehaviour.BOUNDED:
         return behaviour
-    swings = _count_sign_changes(q[half:]) >= MIN_SIGN_CHANGES
-    return behaviour if swings else EndBehaviour.UNDECIDED
+    oscillates = _count_sign_changes(q[half_row:]) >= MIN_SIGN_CHANGES
+    return behaviour if oscillates else EndBehaviour.UNDECIDED
 
 
 def _count_sign_changes(values: Array) -> int:
-    """Returns how often values cross their mean."""
+    """Returns how often a signal crosses its mean. An oscillation does so twice per period."""
     signs = np.sign(values - values.mean())
     nonzero_signs = signs[signs != 0.0]
     changes = np.diff(nonzero_signs)
@@ -845,10 +854,11 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
         site = scenario.names.index(change.dominance)
         for peer, share in change.to.items():
             total_shares[site, scenario.names.index(peer)] += share
-    reach = find_reach(total_shares + total_shares.T)
+    # a share in either direction couples two sites
+    reachable = find_reach(total_shares + total_shares.T)
     groups: list[list[int]] = []
-    for reached in reach:
-        group = np.flatnonzero(reached).tolist()
+    for reachable_from_site in reachable:
+        group = np.flatnonzero(reachable_from_site).tolist()
         if group not in groups:
             groups.append(group)
     return groups
@@ -876,37 +886,38 @@ def _find_disagreement(
         if len(group) < 2 or _compares_sites_by_error(scenario, names):
             continue
         q = np.array([columns[n][:, 2] for n in group])
-        distance = np.ptp(q, axis=0)
-        joint = int(distance[-1].argmax())
-        end_distance = distance[-1, joint]
-        envelope = distance.max(axis=1, keepdims=True)
-        (fit,) = fit_envelopes(t_s, envelope)
-        is_approaching = fit.trend is EnvelopeTrend.DECAYS
+        spread = np.ptp(q, axis=0)
+        joint = int(spread[-1].argmax())
+        end_spread = spread[-1, joint]
+        envelope = spread.max(axis=1, keepdims=True)
+        (distance_fit,) = fit_envelopes(t_s, envelope)
+        is_approaching = distance_fit.trend is EnvelopeTrend.DECAYS
 
         # A torque at the end holds the sites apart if the errors are large enough, or if the
         # sites that it holds are nearly as far apart as all sites.
         largest_torque = max(np.abs(trace.tau_x[n]).max() for n in group)
         largest_error = max(columns[n][-1, 0].max() for n in group)
-        is_held = largest_torque > FORCE_NM and largest_error > HELD_SHARE * end_distance
+        is_held = largest_torque > FORCE_NM and largest_error > HELD_SHARE * end_spread
         end_q = q[:, -1, joint]
         holds = _find_held_sites(scenario, trace, joint, float(t_s[-1]))
         held_q = end_q[holds[group]]
         if len(held_q):
-            is_held |= bool(end_distance - np.ptp(held_q) < AGREEMENT_RAD)
+            is_held |= bool(end_spread - np.ptp(held_q) < AGREEMENT_RAD)
 
-        if end_distance > AGREEMENT_RAD and not (is_approaching or is_held):
+        if end_spread > AGREEMENT_RAD and not (is_approaching or is_held):
             lowest = names[int(np.argmin(end_q))]
             highest = names[int(np.argmax(end_q))]
             yield (
-                f"{lowest} and {highest} stand {end_distance:.3g} rad apart, "
+                f"{lowest} and {highest} stand {end_spread:.3g} rad apart, "
                 "and nothing holds them there"
             )
 
 
 def _compares_sites_by_error(scenario: Scenario, sites: Iterable[str]) -> bool:
-    """Returns True if |e| itself shows whether some sites agree.
+    """Returns True if the error |e| itself shows whether sites agree.
 
-    Otherwise their joint angles must be compared.
+    This holds for laws that compare positions, and for arms that follow end effectors. For
+    other sites the joint angles must be compared.
     """
     for site in sites:
         compares_positions = scenario.sites[site].control.compares_positions
@@ -970,20 +981,19 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
         yield f"{', '.join(hanging)} {verb}: the arms fell"
         return
 
-    # For each site, the largest distance of a joint from the range of the start poses of all
-    # arms with as many joints.
+    # largest distance of a joint of each site from the start poses of all arms of its size
     distances = []
     for end in ends:
         similar = np.array([q for q in starts if len(q) == len(end)])
         below = similar.min(axis=0) - end
         above = end - similar.max(axis=0)
         distances.append(float(np.maximum(below, above).max()))
-    n = int(np.argmax(distances))
+    worst = int(np.argmax(distances))
     has_operator = any(spec.hands for spec in scenario.sites.values())
-    if distances[n] > THROWN_RAD and not (scenario.external or has_operator):
+    if distances[worst] > THROWN_RAD and not (scenario.external or has_operator):
         yield (
-            f"{scenario.names[n]} ends {distances[n]:.3g} rad away from every start pose, "
-            "and nobody pushed"
+            f"{scenario.names[worst]} ends {distances[worst]:.3g} rad away from every start "
+            "pose, and nobody pushed"
         )
 
 
@@ -1029,19 +1039,20 @@ def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:
         arm = build_arm_rows(scenario, site)
         start = np.array([spec.q0_rad])
         at_start = arm.place_end_effector(start, 0.0 * start)
-        for hand in spec.hands:
-            source = hand.actor
-            if source.kind in LIVE_KINDS:
+        for operator in spec.hands:
+            actor = operator.actor
+            if actor.kind in LIVE_KINDS:
                 continue
-            source_J = np.eye(len(source.a)) if source.a else at_start.J[0]
-            script = compute_operator_script(source, t_s, source_J)
-            steps = np.abs(np.diff(script, axis=0))
-            is_change = steps.max(axis=1, initial=0.0) > 0.0
+            # an action on joints has the identity in place of the end effector's Jacobian
+            source_J = np.eye(len(actor.a)) if actor.a else at_start.J[0]
+            planned_action = compute_operator_script(actor, t_s, source_J)
+            action_steps = np.abs(np.diff(planned_action, axis=0))
+            is_change = action_steps.max(axis=1, initial=0.0) > 0.0
             last_change_s = float(t_s[1:][is_change].max(initial=0.0))
             last_s = max(last_s, last_change_s)
-            for edge_s in (source.start_s, source.end_s):
-                if edge_s < span_s:
-                    last_s = max(last_s, edge_s)
+            for limit_s in (actor.start_s, actor.end_s):
+                if limit_s < span_s:
+                    last_s = max(last_s, limit_s)
     return last_s
 
 
@@ -1067,27 +1078,30 @@ def _find_last_change(scenario: Scenario, span_s: float) -> float:
     return max(change_times_s)
 
 
-def _find_frequency_hz(parts: list[SiteLog]) -> float | None:
+def _find_frequency_hz(site_logs: list[SiteLog]) -> float | None:
     """Estimates the frequency of an oscillation from the changes of sign of the fastest joint.
 
     Args:
-        parts: Logs of all sites. The second half of each is used.
+        site_logs: Logs of all sites. The second half of each is used.
 
     Returns:
         The frequency in Hz. None if the joint changes its sign too rarely.
     """
 
-    def find_speeds(part: SiteLog) -> Array:
-        second_half = part.qd[len(part) // 2 :]
+    def find_speeds(site_log: SiteLog) -> Array:
+        """Returns the largest speed of each joint in the second half of the log, in rad/s."""
+        second_half = site_log.qd[len(site_log) // 2 :]
         speeds: Array = np.abs(second_half).max(axis=0)
         return speeds
 
-    part = max(parts, key=lambda part: float(find_speeds(part).max()))
-    fastest = int(find_speeds(part).argmax())
-    middle = len(part) // 2
-    crossings = _count_sign_changes(part.qd[middle:, fastest])
+    fastest = max(site_logs, key=lambda site_log: float(find_speeds(site_log).max()))
+    fastest_joint = int(find_speeds(fastest).argmax())
+    middle = len(fastest) // 2
+    crossings = _count_sign_changes(fastest.qd[middle:, fastest_joint])
     if crossings < MIN_SIGN_CHANGES:
         return None
-    ticks = float(part.tick[-1] - part.tick[middle])
-    span_s = ticks / part.rate_hz
+
+    # an oscillation crosses its mean twice per period
+    ticks = float(fastest.tick[-1] - fastest.tick[middle])
+    span_s = ticks / fastest.rate_hz
     return 0.5 * crossings / span_s

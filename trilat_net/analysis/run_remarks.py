@@ -72,18 +72,25 @@ def _describe_programs(log: Log) -> str:
 
 
 def _describe_torque_limits(log: Log) -> str:
-    """Returns how long each site was at its torque limit. Empty if none was."""
-    times = {}
+    """Returns a clause on how long each site was at its torque limit. Empty if none was.
+
+    At its limit a drive does not apply the torque that the control law demands.
+
+    Args:
+        log: The log of the run.
+    """
+    durations = {}
     for site in log.sites:
-        part = log[site]
+        site_log = log[site]
         limit_nm = log.scenario.sites[site].limits.tau_limit_nm
-        at_limit = np.any(np.abs(part.tau) >= limit_nm, axis=1)
+        at_limit = np.any(np.abs(site_log.tau) >= limit_nm, axis=1)
         if at_limit.any():
-            times[site] = f"{np.count_nonzero(at_limit) / part.rate_hz:.3g} s"
-    if not times:
+            durations[site] = f"{np.count_nonzero(at_limit) / site_log.rate_hz:.3g} s"
+
+    if not durations:
         return ""
-    verb = "was at its" if len(times) == 1 else "were at their"
-    return f"{join_words(times)} {verb} torque limit for {join_words(times.values())}"
+    verb = "was at its" if len(durations) == 1 else "were at their"
+    return f"{join_words(durations)} {verb} torque limit for {join_words(durations.values())}"
 
 
 def _describe_large_pushes(log: Log) -> str:
@@ -106,11 +113,14 @@ def _describe_large_pushes(log: Log) -> str:
 
 
 def _describe_late_ticks(log: Log) -> str:
-    """Returns how many ticks of each site began late by a period or more. Empty if none did."""
+    """Returns a clause on the ticks of each site that began late by a period or more.
+
+    Empty if all ticks began in time.
+    """
     counts = {}
     for site in log.sites:
-        part = log[site]
-        late = int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
+        site_log = log[site]
+        late = int(np.count_nonzero(site_log.late_us >= 1e6 / site_log.rate_hz))
         if late:
             counts[site] = f"{count_nouns(late, 'tick')} of {site}"
     if not counts:
@@ -130,25 +140,29 @@ def _describe_ages(log: Log) -> str:
     """
     changed = {change.link for change in log.scenario.timeline}
     changed |= {change.link for change in list_effective_commands(log)}
+    # by link: relative difference of the ages, mean age in use, and stated mean delay
     differences = {}
     for name, link in log.scenario.links.items():
         stated_ms, deviation_ms = link.moments()
         is_jittered = link.random and deviation_ms > 0.0 and stated_ms > 0.0
         if name in changed or link.measured or not is_jittered:
             continue
+
         peer, site = name.split("->")
         ages_ns = sample_ages_ns(log, peer, site)
         if len(ages_ns):
             age_ms = 1e-6 * float(ages_ns.mean())
             differences[name] = (age_ms / stated_ms - 1.0, age_ms, stated_ms)
+
     if not differences:
         return ""
-    name, (share, age_ms, stated_ms) = max(
+    name, (difference, age_ms, stated_ms) = max(
         differences.items(), key=lambda item: abs(item[1][0])
     )
-    if abs(share) <= LARGE_AGE_SHARE:
+    if abs(difference) <= LARGE_AGE_SHARE:
         return ""
-    cause = "losses and waiting count" if share > 0.0 else "the newest sample counts"
+
+    cause = "losses and waiting count" if difference > 0.0 else "the newest sample counts"
     return (
         f"the samples in use on {name} were {age_ms:.4g} ms old on average, with a stated mean "
         f"delay of {stated_ms:.4g} ms, because {cause}"

@@ -145,29 +145,32 @@ class RunView:
         return subjects[kind]
 
 
-def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
-    """Returns a site's run in the coordinates that sites share.
+def _view_shared(scenario: Scenario, site_run: SiteRun) -> SiteRun:
+    """Returns a site's motion and torques in the coordinates that sites exchange.
 
-    The plan of an operator is turned into forces with the Jacobian of the first pose, so that a
-    constant plan stays constant.
+    For sites that exchange poses of their end effectors, joint torques become forces. The plan
+    of an operator is converted with the Jacobian of the first pose, so that a constant plan
+    stays constant.
     """
-    records = run.records
-    torque = run.torque
+    records = site_run.records
+    torque = site_run.torque
     arm = build_arm_rows(scenario, records.site)
     axes = np.array(records.axes)
     following = build_following(arm, records.q, records.qd, axes)
     if isinstance(following, JointFollowing):
-        return run
-    script = torque.script
-    if script is not None:
+        return site_run
+
+    plan = torque.script
+    if plan is not None:
         force_by_torque = following.inverse[0] @ following.J[0]
-        script = script @ force_by_torque.T
+        plan = plan @ force_by_torque.T
+
     forces = torque._replace(
         operator_now=following.project_torque(torque.operator_now),
         operator_held=following.project_torque(torque.operator_held),
         environment_now=following.project_torque(torque.environment_now),
         environment_held=following.project_torque(torque.environment_held),
-        script=script,
+        script=plan,
     )
 
     x = records.x
@@ -176,9 +179,10 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
         position = x[:, :POSITION]
         rotation_vectors = compute_continuous_vectors(x[:, POSITION:])
         x = np.hstack([position, rotation_vectors])
+
     shared_records = records._replace(
         q=axes * x,
         qd=axes * records.xd,
         tau_x=axes * records.wrench,
     )
-    return SiteRun(shared_records, forces, run.dominance)
+    return SiteRun(shared_records, forces, site_run.dominance)

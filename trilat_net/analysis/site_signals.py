@@ -52,13 +52,13 @@ def follows_in_task_space(log: Log) -> bool:
     return any(arm.shares_pose for arm in arms)
 
 
-def external_torques(part: SiteLog) -> Array:
+def external_torques(site_log: SiteLog) -> Array:
     """Returns the torque of operator and environment ON the arm, shape (K, n), in N m.
 
     The records contain tau_x, which Eq. (8) subtracts and which therefore has the opposite
     sign.
     """
-    return 0.0 - part.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
+    return 0.0 - site_log.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
 
 
 class JointError(NamedTuple):
@@ -77,44 +77,44 @@ class JointError(NamedTuple):
     t_s: float
 
     @classmethod
-    def find_largest(cls, part: SiteLog, from_s: float = -math.inf) -> "JointError | None":
+    def find_largest(cls, site_log: SiteLog, from_s: float = -math.inf) -> "JointError | None":
         """Finds the largest error |e| of a site, the first one if it occurs repeatedly.
 
         Args:
-            part: Log of the site.
+            site_log: Log of the site.
             from_s: Time after which records count, in s.
 
         Returns:
             The error. None if no record has a finite error.
         """
-        first = int(np.searchsorted(part.t_s, from_s, side="right"))
-        errors = np.abs(joint_errors(part)[first:])
+        first = int(np.searchsorted(site_log.t_s, from_s, side="right"))
+        errors = np.abs(joint_errors(site_log)[first:])
         if not np.isfinite(errors).any():
             return None
         row, column = np.unravel_index(int(np.nanargmax(errors)), errors.shape)
-        kind = "axis" if part.layout.task else "joint"
+        kind = "axis" if site_log.layout.task else "joint"
         return JointError(
             value=float(errors[row, column]),
-            site=part.name,
-            joint=f"{part.name} {kind} {column + 1}",
-            t_s=float(part.t_s[first + row]),
+            site=site_log.name,
+            joint=f"{site_log.name} {kind} {column + 1}",
+            t_s=float(site_log.t_s[first + row]),
         )
 
     @classmethod
-    def find_in_last_second(cls, part: SiteLog) -> "JointError | None":
+    def find_in_last_second(cls, site_log: SiteLog) -> "JointError | None":
         """Finds the largest error |e| of a site in the last second of its records.
 
         The last second, rather than the last record, does not miss an oscillation.
 
         Args:
-            part: Log of the site.
+            site_log: Log of the site.
 
         Returns:
             The error. None if no record of that second has a finite error.
         """
-        if not len(part):
+        if not len(site_log):
             return None
-        return JointError.find_largest(part, from_s=float(part.t_s[-1]) - END_WINDOW_S)
+        return JointError.find_largest(site_log, from_s=float(site_log.t_s[-1]) - END_WINDOW_S)
 
 
 def find_last_error(log: Log) -> JointError | None:
@@ -147,24 +147,24 @@ def largest_magnitude(values: Array) -> Array:
     return largest
 
 
-def largest_remaining_error(part: SiteLog) -> Array:
+def largest_remaining_error(site_log: SiteLog) -> Array:
     """Returns for each record the largest error of any joint from there to the end.
 
     The arm has settled where this value falls below a bound.
 
     Args:
-        part: Log of the site.
+        site_log: Log of the site.
 
     Returns:
         Largest error, shape (K,). It never rises.
     """
-    largest = largest_magnitude(joint_errors(part))
+    largest = largest_magnitude(joint_errors(site_log))
     reversed_largest = largest[::-1]
     from_the_end = np.maximum.accumulate(reversed_largest)
     return from_the_end[::-1]
 
 
-def settling_time_s(part: SiteLog) -> float | None:
+def settling_time_s(site_log: SiteLog) -> float | None:
     """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
 
     From this time on, the arm stays close to its reference for the rest of the run.
@@ -173,16 +173,16 @@ def settling_time_s(part: SiteLog) -> float | None:
         The time. 0 if no error ever exceeded the bound. None if the last record has an error
             that exceeds it, or if there are no records.
     """
-    if not len(part):
+    if not len(site_log):
         return None
-    is_above = largest_remaining_error(part) > SETTLED_ERROR_RAD
+    is_above = largest_remaining_error(site_log) > SETTLED_ERROR_RAD
     rows_above = np.flatnonzero(is_above)
     if not len(rows_above):
         return 0.0
     last_row = rows_above[-1]
-    if last_row == len(part) - 1:
+    if last_row == len(site_log) - 1:
         return None
-    return float(part.t_s[last_row])
+    return float(site_log.t_s[last_row])
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
@@ -217,11 +217,11 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
         Their times, shape (K,), in s.
         q of the log minus q of the twin, shape (K, n), in rad.
     """
-    part = log[site]
+    site_log = log[site]
     twin_part = twin[site]
     common_tick, rows, twin_rows = np.intersect1d(
-        part.tick, twin_part.tick, assume_unique=True, return_indices=True
+        site_log.tick, twin_part.tick, assume_unique=True, return_indices=True
     )
-    q = joint_angles(part)[rows]
+    q = joint_angles(site_log)[rows]
     twin_q = joint_angles(twin_part)[twin_rows]
-    return common_tick, part.t_s[rows], q - twin_q
+    return common_tick, site_log.t_s[rows], q - twin_q

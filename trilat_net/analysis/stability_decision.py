@@ -139,11 +139,13 @@ class LoopRoots(NamedTuple):
         is_stable = self.is_numerical and self.verdict == "stable"
         if rate_per_s is None or not is_stable or not is_lasting:
             return math.inf
+
         misfits = []
         for fit in (end.error, end.speed):
             if fit.trend is EnvelopeTrend.GROWS:
                 return math.inf
             misfits.append(_measure_rate_misfit(fit.rate_per_s, rate_per_s))
+
         judged_s = 0.5 * (end.lasts_s - end.counts_from_s)
         halvings = -rate_per_s * judged_s / math.log(DOUBLES)
         return min(halvings, max(misfits))
@@ -220,26 +222,26 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
     if decision is not None:
         return decision
 
-    end = run.end
+    run_end = run.end
     refutation = _find_refutation(run)
     if refutation:
-        stability = Stability.OPEN if end.operator_acts else Stability.NOT_STABLE
+        stability = Stability.OPEN if run_end.operator_acts else Stability.NOT_STABLE
         return StabilityDecision(stability, refutation, reasons)
 
     proofs = run.all_proofs
     if proofs and not reasons and _agrees_with_proof(run):
         return StabilityDecision(Stability.STABLE, "; ".join(proofs))
-    looks_unstable = end.stability is Stability.NOT_STABLE
+    looks_unstable = run_end.stability is Stability.NOT_STABLE
     if looks_unstable and not run.has_stable_roots and not _is_end_excused(run):
         # The frequency of an oscillation is known only if all records are.
-        end_text = end._replace(frequency_hz=None).text
+        end_text = run_end._replace(frequency_hz=None).text
         return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end_text}")
     if not reasons and _has_settled(run):
         return StabilityDecision(Stability.SETTLED, _describe_pushes(run))
     if reasons:
         return StabilityDecision(Stability.OPEN, "", reasons)
     needed_s = _estimate_needed_s(run)
-    if run.all_proofs and needed_s is not None and needed_s > end.lasts_s:
+    if run.all_proofs and needed_s is not None and needed_s > run_end.lasts_s:
         reason = "the run is too short to tell; try one of twice its length"
         if needed_s <= _LONGEST_ADVISED_S:
             reason = f"the run is too short to tell; a run of {needed_s:.3g} s would"
@@ -259,7 +261,14 @@ def is_decided_by_roots(run: RunFindings) -> bool:
 
 
 def _list_reasons(run: RunFindings) -> tuple[str, ...]:
-    """Returns the sentences that prevent a stable or settled run, in the order of the text."""
+    """Lists the sentences that prevent the judgement stable or settled, in order.
+
+    They come from the end of the run, from missing records, from the runs with small pushes,
+    from doubts about the analyses, and from roots that show growth.
+
+    Args:
+        run: What the analyses found about the run.
+    """
     reasons = [*run.end.reasons]
     reasons += [f"no record of {site}" for site in run.end.missing_sites]
     twins = run.twins
@@ -350,31 +359,37 @@ def _agrees_with_proof(run: RunFindings) -> bool:
 
 
 def _confirms_slowest_root(run: RunFindings) -> bool:
-    """Returns True if the slowest push decays as slowly as the slowest root predicts."""
+    """Returns True if the slowest push decays at the rate that the slowest root predicts.
+
+    A push that shows no clear trend then agrees with a proof by roots: it merely decays slowly.
+    """
     roots = run.roots
     worst = None if run.twins is None else run.twins.worst
     if worst is None or roots is None or not roots.is_proof or roots.rate_per_s is None:
         return False
-    return (
-        worst.rate_per_s < 0.0
-        and _measure_rate_misfit(worst.rate_per_s, roots.rate_per_s) <= 1.0
-    )
+    if not worst.rate_per_s < 0.0:
+        return False
+    return _measure_rate_misfit(worst.rate_per_s, roots.rate_per_s) <= 1.0
 
 
 def _measure_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
-    """Returns the difference of a measured rate and a root as a share of the tolerance."""
+    """Returns the difference of a measured rate and a root, divided by its tolerance."""
     tolerance_per_s = RATE_AGREEMENT_SHARE * abs(root_per_s) + RATE_AGREEMENT_PER_S
     return abs(measured_per_s - root_per_s) / tolerance_per_s
 
 
 def _is_end_excused(run: RunFindings) -> bool:
-    """Returns True if slow roots or the pushes contradict a run whose end looks not stable.
+    """Returns True if pushes or roots show that an end that looks not stable is no evidence.
 
-    Stable numerical roots do if the end may be their decay. Pushes do if all of them die away,
-    or if the run seems to grow although no push grows and the energy function V did not rise.
-    They also do if the judged part of the run is shorter than the period of its delays, so that
-    it may show a beat, or if no push grows clearly and the judged part has few bursts of lost
-    samples, so that it may show the last of them.
+    The cases are:
+
+    - Stable roots by numerical derivatives: the end may be their slow decay.
+    - All pushes die away.
+    - The judged part of the run is shorter than the period of its delays, so that it may show a
+      beat.
+    - No push grows clearly, and the judged part has few bursts of lost samples, so that it may
+      show the effect of the last burst.
+    - The run seems to grow, but no push grows and the energy function V did not rise.
     """
     if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
         return True
@@ -390,7 +405,14 @@ def _is_end_excused(run: RunFindings) -> bool:
 
 
 def _has_settled(run: RunFindings) -> bool:
-    """Returns True if a run became slow, or was decaying, and every push died away."""
+    """Returns True if a run became slow, or was decaying, and every push died away.
+
+    This judgement is weaker than stable: it rests on the recorded motion and on runs with small
+    pushes, but on no proof.
+
+    Args:
+        run: What the analyses found about the run.
+    """
     end = run.end
     twins = run.twins
     if twins is None or not twins.pushes or twins.trend is not EnvelopeTrend.DECAYS:
@@ -404,7 +426,10 @@ def _has_settled(run: RunFindings) -> bool:
 
 
 def _describe_pushes(run: RunFindings) -> str:
-    """Returns the basis of a settled run: the number of pushes, and why nothing proves more."""
+    """Returns the basis of a settled run: the number of pushes, and why nothing proves more.
+
+    For example "8 pushes over 12 s, all of which died away; its roots are not exact".
+    """
     assert run.twins is not None
     pushes = len({growth.push.name for growth in run.twins.pushes})
     duration_s = run.twins.to_s
@@ -423,7 +448,14 @@ def _describe_pushes(run: RunFindings) -> str:
 
 
 def _explain_open(run: RunFindings) -> str:
-    """Returns why a run is open although nothing contradicts a stable run."""
+    """Returns why a run is open although nothing contradicts a stable run.
+
+    Several reasons may apply. The first that applies is stated, from proofs that disagree with
+    the run to an end of the run that does not settle the question.
+
+    Args:
+        run: What the analyses found about the run.
+    """
     if run.all_proofs:
         return "the end of the run does not agree with its proof"
     if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
@@ -432,10 +464,12 @@ def _explain_open(run: RunFindings) -> str:
             f"too slow to be told from a lasting {lasting} in the judged part; its numerical "
             f"roots decay at {run.roots.rate_per_s:.3g} /s"
         )
+
     if run.twins is None:
         return "no proof exists, and no run with small pushes was made"
     if not run.twins.pushes:
         return f"no proof exists, and no pushes were judged: {run.twins.why}"
+
     if run.end.stability is Stability.SETTLED:
         return run.twins.text
     if run.twins.judged_bursts < LEAST_BURSTS:

@@ -53,9 +53,11 @@ def list_effective_commands(log: Log) -> list[Change]:
         for texts in log.changes(site).values():
             commands += [msgspec.json.decode(text, type=Change) for text in texts]
 
+    # links and factors hold the values in force while the changes are replayed in order
     links: dict[str, LinkBase] = dict(scenario.links)
-    shares = dict(scenario.dominance)
-    effective = []
+    factors = dict(scenario.dominance)
+    effective_commands = []
+
     planned = [(change, False) for change in scenario.timeline]
     requested = [(change, True) for change in commands]
     changes = sorted([*planned, *requested], key=lambda entry: entry[0].at_s)
@@ -65,11 +67,11 @@ def list_effective_commands(log: Log) -> list[Change]:
             has_effect = links[change.link] != change.after
             links[change.link] = change.after
         elif change.dominance:
-            has_effect = shares[change.dominance] != change.to
-            shares[change.dominance] = change.to
+            has_effect = factors[change.dominance] != change.to
+            factors[change.dominance] = change.to
         if is_command and has_effect:
-            effective.append(change)
-    return effective
+            effective_commands.append(change)
+    return effective_commands
 
 
 class _AppliedChange(NamedTuple):
@@ -167,7 +169,7 @@ def list_changes(log: Log) -> list[_AppliedChange]:
     Raises:
         LogError: A record names a change that is not valid.
     """
-    applied = [
+    applied_changes = [
         _AppliedChange(change, find_owner(change), None, describe_change(change))
         for change in log.scenario.timeline
     ]
@@ -186,10 +188,10 @@ def list_changes(log: Log) -> list[_AppliedChange]:
                     sentence = describe_change(change)
                 else:
                     sentence = describe_event(event.kind, event.text, event.command)
-                applied.append(_AppliedChange(change, site, tick, sentence))
+                applied_changes.append(_AppliedChange(change, site, tick, sentence))
     end_s = recorded_end_s(log)
     visible_entries = []
-    for entry in applied:
+    for entry in applied_changes:
         is_short_skip = 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
         if entry.change.at_s < end_s and not is_short_skip:
             visible_entries.append(entry)
@@ -224,29 +226,29 @@ def recorded_end_s(log: Log) -> float:
     Args:
         log: The log of the run.
     """
-    parts = [log[site] for site in log.sites]
-    recorded = [part for part in parts if len(part)]
-    ends_s = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in recorded]
+    site_logs = [log[site] for site in log.sites]
+    recorded_logs = [site_log for site_log in site_logs if len(site_log)]
+    ends_s = [float(site_log.t_s[-1]) + 1.0 / site_log.rate_hz for site_log in recorded_logs]
     return max(ends_s, default=log.scenario.duration_s)
 
 
-def find_mode_intervals(part: SiteLog) -> list[_ModeInterval]:
+def find_mode_intervals(site_log: SiteLog) -> list[_ModeInterval]:
     """Finds the times in which an arm did not follow the other arms, in order.
 
     In these times the site, the process that runs the arm, held its position, slowed down to a
     stop, or moved back to the motion that it should follow.
 
     Args:
-        part: The site's part of the log.
+        site_log: The site's part of the log.
 
     Returns:
         The intervals. Empty if the arm followed the others all the time.
     """
-    modes: list[str] = part.mode.tolist()
-    if all(MODES[mode].follows for mode in modes):
+    modes: list[str] = site_log.mode.tolist()
+    if all(MODES[mode].follows for mode in set(modes)):
         return []
 
-    times_s = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
+    times_s = np.append(site_log.t_s, site_log.t_s[-1] + 1.0 / site_log.rate_hz).tolist()
     intervals = []
     first = 0
     for mode, records in groupby(modes):
@@ -299,13 +301,13 @@ def list_alarms(log: Log) -> list[_RaisedAlarm]:
         for entry in list_changes(log)
     }
 
-    raised = []
+    alarms_raised = []
     for site in log.sites:
         if log.scenario.sites[site].on_stale.action != "glide":
             continue
-        part = log[site]
-        for mode, from_s, to_s in find_mode_intervals(part):
-            state = part.states[int(np.searchsorted(part.t_s, from_s))]
+        site_log = log[site]
+        for mode, from_s, to_s in find_mode_intervals(site_log):
+            state = site_log.states[int(np.searchsorted(site_log.t_s, from_s))]
             alarm = LifeAlarm.find(
                 session=log.scenario.name,
                 site=site,
@@ -317,5 +319,7 @@ def list_alarms(log: Log) -> list[_RaisedAlarm]:
                 continue
             requester = requesters.get((site, state.tick), "")
             reason = f"ordered by {requester}" if requester else alarm.reason
-            raised.append(_RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s))
-    return sorted(raised, key=lambda alarm: alarm.from_s)
+            alarms_raised.append(
+                _RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s)
+            )
+    return sorted(alarms_raised, key=lambda alarm: alarm.from_s)

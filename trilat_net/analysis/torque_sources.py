@@ -114,12 +114,14 @@ def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Arra
         progress_rate = 1.0 / span_s
     start = np.array(source.a)
     distance = np.array(source.b) - start
-    x = progress[:, np.newaxis]
-    # minimum jerk: 10 x^3 - 15 x^4 + 6 x^5, and its derivative 30 x^2 (1 - x)^2
-    share = x**3 * (10.0 + x * (6.0 * x - 15.0))
-    share_by_x = 30.0 * x**2 * (1.0 - x) ** 2
-    position = start + share * distance
-    velocity = share_by_x * progress_rate * distance
+    progress_column = progress[:, np.newaxis]
+    # minimum jerk with progress x: 10 x^3 - 15 x^4 + 6 x^5, and its derivative 30 x^2 (1 - x)^2
+    path_fraction = progress_column**3 * (
+        10.0 + progress_column * (6.0 * progress_column - 15.0)
+    )
+    path_slope = 30.0 * progress_column**2 * (1.0 - progress_column) ** 2
+    position = start + path_fraction * distance
+    velocity = path_slope * progress_rate * distance
     return position, velocity
 
 
@@ -232,10 +234,11 @@ def compute_live_torque(
     Returns:
         Torque on the arm, shape (K, n), in N m.
     """
-    size = (hand.shape[1] - 3) // 2
-    share = hand[:, 0]
-    target = hand[:, 3 : 3 + size]
-    target_rate = hand[:, 3 + size :]
+    # after three values come target and target velocity, with as many coordinates each
+    coordinates = (hand.shape[1] - 3) // 2
+    grip = hand[:, 0]
+    target = hand[:, 3 : 3 + coordinates]
+    target_rate = hand[:, 3 + coordinates :]
     acts_on_joints = source.kind is TorqueKind.LIVE_JOINT
     position = q if acts_on_joints else end_effector.position
     speed = qd if acts_on_joints else end_effector.speed
@@ -247,12 +250,12 @@ def compute_live_torque(
         damper = np.array(source.B) * (target_rate - speed)
         pull = spring + damper
 
-    # a larger pull is scaled down to the hand's limit
-    norm = np.linalg.norm(pull, axis=1)
-    limited_share = source.limit / np.maximum(norm, source.limit)
-    is_limited = norm > source.limit
-    scale = share * np.where(is_limited, limited_share, 1.0)
-    effort: Array = scale[:, np.newaxis] * pull
+    # a larger pull is scaled down to the operator's limit
+    pull_size = np.linalg.norm(pull, axis=1)
+    reduction = source.limit / np.maximum(pull_size, source.limit)
+    is_limited = pull_size > source.limit
+    factor = grip * np.where(is_limited, reduction, 1.0)
+    effort: Array = factor[:, np.newaxis] * pull
     if acts_on_joints:
         return effort
     return _map_to_joints(end_effector.J, effort)
@@ -369,8 +372,8 @@ class TorqueSplit(NamedTuple):
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
     """Returns the plan of an operator as a torque that does not depend on the arm's motion.
 
-    It changes if and only if the operator moves. Its definition depends on the kind of the
-    operator:
+    Metrics use the plan to tell when the operator acts: it changes if and only if the operator
+    moves. Its definition depends on the kind of the operator:
 
     - Scripted torque (pulse, recorded, chirp, multisine): the torque itself.
     - Spring: K times the displacement of its target plus B times the target's speed. If the
@@ -386,19 +389,20 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
         The plan, shape (K, n), in N m.
     """
     if source.kind in SCRIPTED_KINDS:
-        intent = _evaluate_scripted_torque(source, t_s)
+        planned_torque = _evaluate_scripted_torque(source, t_s)
     elif source.kind in OWN_KINDS:
         acts_at_tip = source.kind is TorqueKind.OWN_TIP
         coordinates, joints = J.shape
         origin = np.zeros((len(t_s), coordinates if acts_at_tip else joints))
         effort = source.model.effort(t_s, origin, origin)
-        intent = effort @ J if acts_at_tip else effort
+        planned_torque = effort @ J if acts_at_tip else effort
     else:
         origin = np.zeros((len(t_s), len(source.a)))
         effort = _compute_spring_effort(source, t_s, origin, origin)
-        intent = effort @ J if source.kind is TorqueKind.TASK_HAND else effort
+        planned_torque = effort @ J if source.kind is TorqueKind.TASK_HAND else effort
+
     is_active = _is_active(source, t_s)
-    return np.where(is_active[:, np.newaxis], intent, 0.0)
+    return np.where(is_active[:, np.newaxis], planned_torque, 0.0)
 
 
 def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
@@ -423,22 +427,23 @@ def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
 
     if source.kind is TorqueKind.PULSE:
         span_s = source.end_s - source.start_s
-        x = np.clip(since_start_s / span_s, 0.0, 1.0)
-        wave = np.sin(np.pi * x) ** 2
+        phase = np.clip(since_start_s / span_s, 0.0, 1.0)
+        waveform = np.sin(np.pi * phase) ** 2
     elif source.kind is TorqueKind.CHIRP:
         span_s = source.move_end_s - source.move_start_s
         first_hz, last_hz = source.b
-        x = np.mod(since_start_s, span_s)
-        turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
-        wave = np.sin(2.0 * np.pi * turns)
+        # the frequency rises linearly, and starts again at the end of the sweep
+        sweep_s = np.mod(since_start_s, span_s)
+        turns = first_hz * sweep_s + (last_hz - first_hz) * sweep_s**2 / (2.0 * span_s)
+        waveform = np.sin(2.0 * np.pi * turns)
     else:
         assert source.table is not None
         frequencies_hz = source.table[:, 0]
         phases = source.table[:, 1]
         turns = np.outer(since_start_s, frequencies_hz) + phases
-        wave = np.sin(2.0 * np.pi * turns).sum(axis=1)
+        waveform = np.sin(2.0 * np.pi * turns).sum(axis=1)
 
-    torque: Array = wave[:, np.newaxis] * np.array(source.a)
+    torque: Array = waveform[:, np.newaxis] * np.array(source.a)
     return torque
 
 
@@ -460,11 +465,11 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     t_s = records.nominal_s
     spec = scenario.sites[records.site]
     expected = np.zeros_like(records.q)
-    script = np.zeros_like(records.q)
-    for hand in spec.hands:
-        source = hand.actor
+    plan = np.zeros_like(records.q)
+    for operator in spec.hands:
+        source = operator.actor
         if source.kind in LIVE_KINDS:
-            # the intention of a live hand is its torque on an arm that rests in the first pose
+            # the plan of a live operator is its torque on an arm that rests in the first pose
             first_q = np.broadcast_to(records.q[0], records.q.shape)
             at_rest = 0.0 * first_q
             arm = build_arm_rows(scenario, records.site)
@@ -475,13 +480,13 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
                 qd=at_rest,
                 end_effector=arm.place_end_effector(first_q, at_rest),
             )
-            script = script + live_torque
+            plan = plan + live_torque
             continue
 
-        source_script = compute_operator_script(source, t_s, split.end_effector.J[0])
-        script = script + source_script
+        planned_torque = compute_operator_script(source, t_s, split.end_effector.J[0])
+        plan = plan + planned_torque
         if source.kind in SCRIPTED_KINDS:
-            expected = expected + source_script
+            expected = expected + planned_torque
         elif not source.sampled:
             torque = compute_source_torque(
                 source=source,
@@ -492,11 +497,11 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
             )
             expected = expected + torque
 
-    size = 1.0 + np.abs(records.tau_x)
+    torque_scale = 1.0 + np.abs(records.tau_x)
     difference = np.abs(split.operator_now - expected)
-    matches = difference <= SCRIPT_TORQUE_TOLERANCE * size
+    matches = difference <= SCRIPT_TORQUE_TOLERANCE * torque_scale
     if matches[records.known].all():
-        split = split._replace(script=script)
+        split = split._replace(script=plan)
     if not spec.hands:
         without_rounding = np.where(matches, 0.0, split.operator_now)
         split = split._replace(operator_now=without_rounding)
@@ -563,14 +568,15 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
         end_effector = arm.place_end_effector(records.q, records.qd)
         for wall in list_sampled_walls(spec):
             force = wall_force(wall, records.nominal_s, end_effector)
-            touched = force > 0.0
-            if not touched.any():
+            is_touched = force > 0.0
+            if not is_touched.any():
                 continue
 
             generated_j = _find_generated_energy(wall, records, end_effector, force)
+            # K h / 2 + B, see `WallEnergy`
             spring_share = 0.5 * wall.K[0] * records.h_s
-            contact_J = end_effector.J[touched]
-            contact_s = records.nominal_s[touched]
+            contact_J = end_effector.J[is_touched]
+            contact_s = records.nominal_s[is_touched]
             energy = WallEnergy(
                 site=site,
                 generated_j=generated_j,
@@ -587,7 +593,10 @@ def _find_generated_energy(
     end_effector: EndEffectorRows,
     force: Array,
 ) -> float:
-    """Returns the largest rise of a wall's work plus its spring's energy, in J.
+    """Returns the energy that a wall generated: the largest rise of its work and stored energy.
+
+    A passive wall never gives more energy than it received, so that the sum of its work and of
+    its spring's energy never rises. The result is in J.
 
     Args:
         wall: The wall.
@@ -604,9 +613,9 @@ def _find_generated_energy(
     generated = work + np.diff(stored)
 
     known_part = np.where(records.known_periods, generated, 0.0)
-    supplied = np.concatenate([[0.0], np.cumsum(known_part)])
-    least_so_far = np.minimum.accumulate(supplied)
-    return float((supplied - least_so_far).max())
+    supplied_until = np.concatenate([[0.0], np.cumsum(known_part)])
+    least_so_far = np.minimum.accumulate(supplied_until)
+    return float((supplied_until - least_so_far).max())
 
 
 def _find_arm_damping(
@@ -626,21 +635,21 @@ def _find_arm_damping(
         J: Jacobian of the rows in contact, shape (K, m, n).
         t_s: Times of the rows in contact, shape (K,), in s.
     """
-    viscous = []
+    damping_gains = []
     for source in spec.environment:
         actor = source.actor
         is_damper = actor.kind is TorqueKind.VISCOUS and not actor.sampled
         acts_in_all_rows = actor.start_s <= t_s[0] and actor.end_s > t_s[-1]
         if is_damper and acts_in_all_rows:
-            viscous.append(actor.B)
-    D = np.zeros(J.shape[2])
-    for B in viscous:
-        D = D + np.array(B)
+            damping_gains.append(actor.B)
+    joint_damping = np.zeros(J.shape[2])
+    for B in damping_gains:
+        joint_damping = joint_damping + np.array(B)
 
     lever_arms = np.einsum("kij,i->kj", J, np.array(wall.b))
     squared_arms = lever_arms**2
     with np.errstate(divide="ignore", invalid="ignore"):
         # mobility n'J D^-1 J'n, in which joints that do not move along the normal do not count
-        terms = np.where(squared_arms > 0.0, squared_arms / D, 0.0)
+        terms = np.where(squared_arms > 0.0, squared_arms / joint_damping, 0.0)
         damping = 1.0 / terms.sum(axis=1)
         return float(damping.min())

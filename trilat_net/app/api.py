@@ -66,7 +66,8 @@ def simulate(
     Raises:
         ScenarioError: The scenario or an override is not valid.
     """
-    log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+    resolved = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
+    log = simulate_scenario(resolved)
     log.warn_of_failures()
     return log
 
@@ -102,9 +103,9 @@ def export(
 
     exporter = Exporter(to, Path(out), force=force, settings=settings)
     all_logs = [log] if isinstance(log, str | Path | Log) else log
-    opened = [entry for entry in all_logs if isinstance(entry, Log)]
+    open_already = [entry for entry in all_logs if isinstance(entry, Log)]
     paths = [entry for entry in all_logs if not isinstance(entry, Log)]
-    exporter.export(*opened, *open_logs(*paths))
+    exporter.export(*open_already, *open_logs(*paths))
     return Path(out)
 
 
@@ -175,9 +176,9 @@ def certify(
     """
     from ..analysis import certify_run
 
-    opened = _open(log)
-    opened.require_records()
-    return certify_run(opened, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
+    log_of_run = _open(log)
+    log_of_run.require_records()
+    return certify_run(log_of_run, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 
 
 def metrics(log: AnyLog) -> LogMetrics:
@@ -198,9 +199,9 @@ def metrics(log: AnyLog) -> LogMetrics:
     Raises:
         LogError: The log cannot be read, or no site has a record in it.
     """
-    opened = _open(log)
-    opened.require_records()
-    return compute_log_metrics(opened)
+    log_of_run = _open(log)
+    log_of_run.require_records()
+    return compute_log_metrics(log_of_run)
 
 
 def choose_report_folder(log: Path) -> Path:
@@ -237,15 +238,15 @@ def report(
     """
     from ..presentation import conclude
 
-    opened = _open(log)
-    opened.require_records()
-    first = Path(opened.sources[0])
-    if not first.is_file():
+    open_log_of_run = _open(log)
+    open_log_of_run.require_records()
+    first_file = Path(open_log_of_run.sources[0])
+    if not first_file.is_file():
         raise UsageError(
             "a report needs a log in a file: save the log first, as in log.save('run.mcap')"
         )
-    folder = choose_report_folder(first) if out is None else Path(out)
-    return conclude(opened, make_results_folder(folder, "", force=force), png=png)
+    folder = choose_report_folder(first_file) if out is None else Path(out)
+    return conclude(open_log_of_run, make_results_folder(folder, "", force=force), png=png)
 
 
 def linear(
@@ -294,6 +295,7 @@ def linear(
         raise UsageError(
             f"a pose must consist of angles in rad, as in (0.1, 0.3), but is {pose!r}"
         ) from None
+
     source: Scenario | Log = load_scenario(scenario, set)
     if isinstance(scenario, Log) and not set:
         source = scenario
@@ -350,6 +352,7 @@ def view(
             raise UsageError("viewer cannot be combined with full, save, foxglove or rviz")
         find_viewer(viewer)(paths)
         return
+
     if foxglove or rviz:
         if full or save is not None:
             raise UsageError("foxglove and rviz cannot be combined with full or save")
@@ -358,7 +361,7 @@ def view(
         if rviz:
             print(write_rviz_config(paths[0]))
         return
-    viewer_options = ViewerOptions(
-        full=full, web=False, save=None if save is None else Path(save)
-    )
+
+    save_path = None if save is None else Path(save)
+    viewer_options = ViewerOptions(full=full, web=False, save=save_path)
     open_rerun(paths, lambda: open_log(*paths), viewer_options, print)

@@ -121,34 +121,38 @@ class SessionProcess:
             self._starter.signal(self, number)
 
     def problem(self) -> str | None:
-        """Describes how the process failed.
+        """Returns a sentence about how the process failed, for the user.
 
         Returns:
             A sentence with the exit code or signal, and the last line that the process printed.
             None if the process has not failed: it is running, it ended with code 0, or it was
             ended by a signal of this process.
         """
-        code = self.code
+        exit_code = self.code
         if self._signalled and self.pid is None:
             # The signal has interrupted the start of the process, which may then end with any
             # exit code.
             return None
 
-        if code in (0, None):
+        if exit_code in (0, None):
             return None
-        if self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT):
+        interrupted_codes = (128 + signal.SIGINT, -signal.SIGINT)
+        if self._signalled and exit_code in interrupted_codes:
             # The process was already ending, and had removed its signal handler.
             return None
-        if code is not None and code < 0:
-            return f"{self.name} was killed by {signal.Signals(-code).name}"
+        if exit_code is not None and exit_code < 0:
+            return f"{self.name} was killed by {signal.Signals(-exit_code).name}"
 
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last_line = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
-        return f"{self.name} ended with code {code}: {last_line}"
+        return f"{self.name} ended with code {exit_code}: {last_line}"
 
 
 def create_file(path: Path) -> BinaryIO:
     """Creates a file for writing without a buffer. An earlier file of that name is deleted.
+
+    The output of each process of a session goes to such a file, where the user finds its
+    errors.
 
     Args:
         path: Path of the file.
@@ -194,6 +198,9 @@ class ProcessStarter:
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
         """Requests the start of a command of `trilat` as a child process.
 
+        The starter is a process that has imported all modules already, so that its copies start
+        quickly.
+
         Args:
             name: Name of the process, which no other process of the session has.
             arguments: The command and its arguments, without `trilat`.
@@ -209,7 +216,7 @@ class ProcessStarter:
         return process
 
     def signal(self, process: SessionProcess, number: int) -> None:
-        """Sends a signal to a process.
+        """Sends a signal to a process of the session, for example to end it.
 
         If the process has not been started yet, it will not be started at all.
 
@@ -231,6 +238,8 @@ class ProcessStarter:
     ) -> None:
         """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
 
+        The starter is the process that starts the processes of the session as its copies.
+
         Args:
             name: Name of the process.
             arguments: The command and its arguments. Empty for a signal.
@@ -241,7 +250,7 @@ class ProcessStarter:
             self._pipe.send((name, arguments, number, output))
 
     def poll(self) -> None:
-        """Receives news from the starter, the process that starts the processes of the session.
+        """Receives from the starter process which processes have started or ended.
 
         Each process object is updated with its process number or its exit code. If the starter
         itself has failed, its processes are told to end. They then count as ended with the exit
@@ -253,6 +262,7 @@ class ProcessStarter:
                 self._processes[name].pid = pid
                 self._processes[name].code = code
         except (EOFError, OSError):
+            # The pipe is closed, because the starter has failed.
             code = self._starter.wait()
             for process in self._processes.values():
                 if process.code is not None:
@@ -393,7 +403,8 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
         say: Function that tells the user that the code is being compiled.
         interrupt: Handler of the signals.
     """
-    # One site of each kind of arm suffices.
+    # The code depends only on the numbers of joints and links, so that one site of each kind
+    # of arm suffices.
     sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
     has_chains = any(arm.chain is not None for arm in scenario.arms.values())
     # The cached code may be for chains with another number of joints.
@@ -435,23 +446,41 @@ def _start(
     starter = reserved.enter_context(closing(ProcessStarter(scenario_file, output)))
 
     session = scenario.name
-    common = ["--scenario", str(scenario_file), "--session", session]
-    connect = [["--connect", endpoint] for endpoint in endpoints]
-    patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
+    session_arguments = ["--scenario", str(scenario_file), "--session", session]
+    connect_arguments = [["--connect", endpoint] for endpoint in endpoints]
+    timeout_arguments = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
+
     processes = []
     # Each site connects to the sites before it, so that every two sites are connected once.
     for index, name in enumerate(scenario.names):
-        arguments = ["site", name, *common, "--listen", endpoints[index]]
-        arguments += [*chain(*connect[:index]), "--needs-recorder", *patience]
+        arguments = ["site", name, *session_arguments, "--listen", endpoints[index]]
+        arguments += [
+            *chain(*connect_arguments[:index]),
+            "--needs-recorder",
+            *timeout_arguments,
+        ]
         processes.append(starter.start(name, arguments))
     for index, name in enumerate(scenario.names):
         if _needs_hand_process(scenario, name):
-            arguments = ["hand", name, *common, *connect[index], *patience]
+            arguments = [
+                "hand",
+                name,
+                *session_arguments,
+                *connect_arguments[index],
+                *timeout_arguments,
+            ]
             processes.append(starter.start(f"hand-{name}", arguments))
 
-    record = ["record", "--session", session, *chain(*connect), "-o", str(log)]
-    record += [*patience, "--force"]
-    start_recorder = partial(starter.start, topics.RECORDER, record)
+    record_arguments = [
+        "record",
+        "--session",
+        session,
+        *chain(*connect_arguments),
+        "-o",
+        str(log),
+    ]
+    record_arguments += [*timeout_arguments, "--force"]
+    start_recorder = partial(starter.start, topics.RECORDER, record_arguments)
     return starter, processes, start_recorder
 
 
@@ -499,7 +528,7 @@ def _end_all(
         interrupt: Handler of the signals of this process.
         say: Function that prints a line for the user.
     """
-    announce = partial(
+    explain_wait = partial(
         say,
         "the sites keep their last records until the recorder has them; "
         "Ctrl-C a second time ends it at once",
@@ -509,7 +538,7 @@ def _end_all(
         group=sites,
         clock=clock,
         ends_now=interrupt.is_repeated,
-        announce=announce,
+        announce=explain_wait,
     )
     sites_ended_ns = clock.monotonic_ns()
 
@@ -552,11 +581,11 @@ def _end_group(
     for process in group:
         process.end(signal.SIGINT)
 
-    begun_ns = clock.monotonic_ns()
+    started_ns = clock.monotonic_ns()
     is_announced = False
     is_repeated = False
     while any(process.code is None for process in group):
-        waited_ns = clock.monotonic_ns() - begun_ns
+        waited_ns = clock.monotonic_ns() - started_ns
         if ends_now() and not is_repeated:
             is_repeated = True
             for process in group:
@@ -575,9 +604,9 @@ def _end_group(
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
     """Runs the starter process, which creates the processes of a session as copies of itself.
 
-    It does so on request, until the requesting process is gone. As with `os.fork`, the function
-    returns in every process: in each copy, which then runs its command, and finally in the
-    starter.
+    A copy has all modules imported and all code compiled, so that it starts quickly. As with
+    `os.fork`, the function returns in every process: in each copy, which then runs its command,
+    and finally in the starter, after the requesting process has disappeared.
 
     Args:
         number: File descriptor of the pipe to the requesting process.
@@ -586,8 +615,10 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     Returns:
         In a copy, the command and arguments that the copy has to run. In the starter, None.
     """
+    # Until all modules are imported, the signal simply ends this process.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     scenario = load_scenario(scenario_file)
+
     # A user's own code is imported only in the process that runs it.
     if not list_imported_code([scenario]):
         # One site of each kind of arm suffices.
@@ -651,7 +682,10 @@ class _StarterProcess:
                 os.kill(self._running[name], signal_number)
 
     def _fork(self, name: str) -> bool:
-        """Copies this process.
+        """Creates a copy of this process, which becomes a process of the session.
+
+        A copy starts faster than a new Python interpreter, because all modules are imported
+        already.
 
         Args:
             name: Name of the copy.
@@ -660,7 +694,8 @@ class _StarterProcess:
             True in the copy, False in the starter.
         """
         pid = os.fork()
-        if pid:
+        is_starter = pid != 0
+        if is_starter:
             self._running[name] = pid
             self._report(name, pid, None)
             return False
@@ -746,13 +781,14 @@ def run(
         RunFailed: A process failed, or the run was interrupted. The message says whether there
             is a log.
     """
-    loaded = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
-    folder = make_results_folder(None if out is None else Path(out), loaded.name, force=force)
-    result = run_demo(loaded, folder, Console(quiet=quiet))
+    loaded_scenario = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
+    chosen_folder = None if out is None else Path(out)
+    folder = make_results_folder(chosen_folder, loaded_scenario.name, force=force)
+    result = run_demo(loaded_scenario, folder, Console(quiet=quiet))
     problems = ["interrupted"] if result.interrupted else result.problems
     if problems:
-        kept = f"; {result.log} holds what there was" if result.log.exists() else ""
-        raise RunFailed("; ".join(problems) + kept)
+        log_note = f"; {result.log} holds what there was" if result.log.exists() else ""
+        raise RunFailed("; ".join(problems) + log_note)
     log = open_log(result.log)
     log.warn_of_failures()
     return log

@@ -100,7 +100,9 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Performs all checks, and yields each finding as soon as it is known.
+    """Performs all checks of this machine, and yields each result as soon as it is known.
+
+    Some checks take seconds, so that the user sees progress.
 
     Args:
         connection: Endpoints at which this machine would listen, or to which it would connect.
@@ -119,8 +121,8 @@ def examine_machine(
     yield from examine_links(connection, keys, member_keys, insecure=insecure)
     yield from examine_clock(clock)
     if session is not None:
-        safe = connection.secure(member_keys, insecure=insecure)
-        yield from _examine_offsets(safe, clock, session)
+        secured_connection = connection.secure(member_keys, insecure=insecure)
+        yield from _examine_offsets(secured_connection, clock, session)
     yield examine_system()
     yield from examine_rights()
     yield examine_rate()
@@ -151,21 +153,28 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
         return None
 
     names = ", ".join(member_keys.members)
-    text = f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+    description = (
+        f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+    )
     if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
-        yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
+        yield DoctorFinding(
+            "keys", "warn", f"{description}: soon; renew them with trilat keys renew"
+        )
     else:
-        yield DoctorFinding("keys", "ok", text)
+        yield DoctorFinding("keys", "ok", description)
 
     if read_foreign_permissions(folder):
         yield DoctorFinding(
             "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
         )
 
+    # With the key of the authority, anybody could create keys for further members.
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
-        text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
-        yield DoctorFinding("keys", "warn", text)
+        description = (
+            f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
+        )
+        yield DoctorFinding("keys", "warn", description)
     return member_keys
 
 
@@ -190,19 +199,19 @@ def examine_links(
         all.
     """
     try:
-        safe = connection.secure(member_keys, insecure=insecure)
+        secured = connection.secure(member_keys, insecure=insecure)
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
 
-    for endpoint in find_endpoint_addresses(safe.reach(safe.listen)):
+    for endpoint in find_endpoint_addresses(secured.reach(secured.listen)):
         address = _split_address(endpoint)
         if address is None:
             yield _describe_untried(endpoint)
         else:
             yield _examine_listening(endpoint, address)
 
-    for endpoint in find_endpoint_addresses(safe.reach(safe.connect or ())):
+    for endpoint in find_endpoint_addresses(secured.reach(secured.connect or ())):
         address = _split_address(endpoint)
         if endpoint.startswith("quic/"):
             yield _examine_quic(endpoint, member_keys)
@@ -211,7 +220,7 @@ def examine_links(
         else:
             yield _examine_reaching(endpoint, address, folder if member_keys else None)
 
-    if not safe.listen and not safe.connect:
+    if not secured.listen and not secured.connect:
         yield DoctorFinding(
             "links", "ok", "no endpoints given: --listen and --connect are tried if given"
         )
@@ -226,16 +235,19 @@ def _describe_untried(endpoint: str) -> DoctorFinding:
 def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
     """Checks if this machine can listen at an endpoint, by listening there for a moment.
 
+    The port may be in use already. An endpoint without encryption causes a warning.
+
     Args:
         endpoint: The endpoint, such as "tls/0.0.0.0:7447".
         address: Its host and port.
     """
     is_quic = endpoint.startswith("quic/")
-    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-    kind = socket.SOCK_DGRAM if is_quic else socket.SOCK_STREAM
+    host, _ = address
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    socket_type = socket.SOCK_DGRAM if is_quic else socket.SOCK_STREAM
 
     try:
-        with socket.socket(family, kind) as probe:
+        with socket.socket(family, socket_type) as probe:
             if not is_quic:  # with this option, two UDP sockets could share the port
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
@@ -254,7 +266,10 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 def _examine_reaching(
     endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
-    """Checks if another member answers at an endpoint of TCP or TLS.
+    """Checks if another member of a session answers at an endpoint of TCP or TLS.
+
+    The user learns before a session whether its members can reach each other, and whether the
+    connection is encrypted.
 
     Args:
         endpoint: The endpoint.
@@ -263,16 +278,18 @@ def _examine_reaching(
             connection is tried, and not the certificate.
     """
     try:
-        with socket.create_connection(address, CONNECT_S) as link:
-            if not endpoint.startswith("tls/"):
+        with socket.create_connection(address, CONNECT_S) as tcp_link:
+            is_encrypted = endpoint.startswith("tls/")
+            if not is_encrypted:
                 state: FindingState = "ok" if is_loopback(endpoint) else "warn"
                 return DoctorFinding("links", state, f"{endpoint} answers, unencrypted")
+
             context = _tls_context(folder)
-            with context.wrap_socket(link, server_hostname=address[0]) as safe:
+            with context.wrap_socket(tcp_link, server_hostname=address[0]) as tls_link:
                 authority = "whose authority is unknown"
                 if folder:
                     authority = "with a certificate of the same authority"
-                text = f"{endpoint} answers over {safe.version()}, {authority}"
+                text = f"{endpoint} answers over {tls_link.version()}, {authority}"
                 return DoctorFinding("links", "ok", text)
     except ssl.SSLError as error:
         reason = getattr(error, "verify_message", "") or error.reason or str(error)
@@ -284,9 +301,10 @@ def _examine_reaching(
 
 
 def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
-    """Checks if another member answers over QUIC, by connecting as a member.
+    """Checks if another member of the session answers over QUIC, by connecting to it.
 
-    Python has no QUIC client in its standard library. Therefore the connection uses Zenoh.
+    Python has no QUIC client in its standard library. Therefore the connection uses Zenoh, the
+    network library of the sessions.
 
     Args:
         endpoint: The endpoint.
@@ -313,10 +331,12 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
         folder: Folder of this member's keys. None accepts any certificate.
     """
     if folder is None:
+        # Only the connection is tried. No data is sent.
         context = ssl.create_default_context()
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE
         return context
+
     context = ssl.create_default_context(cafile=str(folder / AUTHORITY))
     context.load_cert_chain(folder / CERTIFICATE, folder / PRIVATE_KEY)
     return context
@@ -334,9 +354,13 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
     # protocol / host or [IPv6 address] : port, with optional Zenoh settings after ? or #
     pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
     match = re.fullmatch(pattern, endpoint)
-    if match is None or int(match[2]) >= 1 << 16:
+    if match is None:
         return None
-    return match[1].strip("[]"), int(match[2])
+    host, port_text = match.groups()
+    port = int(port_text)
+    if port >= 1 << 16:
+        return None
+    return host.strip("[]"), port
 
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
@@ -352,27 +376,29 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
     Yields:
         One finding about the clocks.
     """
-    begun_ns = clock.monotonic_ns()
-    wall_ns = clock.unix_ns()
-    previous_ns = begun_ns
+    started_ns = clock.monotonic_ns()
+    wall_start_ns = clock.unix_ns()
+    previous_ns = started_ns
     backward_steps = 0
     longest_gap_ns = 0
-    while previous_ns - begun_ns < CLOCK_TEST_NS:
+    while previous_ns - started_ns < CLOCK_TEST_NS:
         now_ns = clock.monotonic_ns()
         backward_steps += now_ns < previous_ns
         longest_gap_ns = max(longest_gap_ns, now_ns - previous_ns)
         previous_ns = now_ns
 
     # If both clocks run steadily, they have advanced by the same time.
-    step_ns = abs(clock.unix_ns() - wall_ns - (clock.monotonic_ns() - begun_ns))
+    wall_elapsed_ns = clock.unix_ns() - wall_start_ns
+    elapsed_ns = clock.monotonic_ns() - started_ns
+    step_ns = abs(wall_elapsed_ns - elapsed_ns)
 
     if backward_steps:
-        times = count_nouns(backward_steps, "time")
-        text = f"the monotonic clock went back {times} in 0.1 s"
+        times_text = count_nouns(backward_steps, "time")
+        text = f"the monotonic clock went back {times_text} in 0.1 s"
         yield DoctorFinding("clock", "fail", text)
     elif step_ns > MAX_CLOCK_STEP_NS:
-        step = f"the wall clock stepped by {step_ns / 1e6:.1f} ms in 0.1 s"
-        yield DoctorFinding("clock", "warn", f"{step}; that distorts no record")
+        step_text = f"the wall clock stepped by {step_ns / 1e6:.1f} ms in 0.1 s"
+        yield DoctorFinding("clock", "warn", f"{step_text}; that distorts no record")
     else:
         longest_ms = longest_gap_ns / 1e6
         text = f"steady; largest pause of a loop that never sleeps {longest_ms:.1f} ms"
@@ -384,6 +410,9 @@ def _examine_offsets(
 ) -> Iterator[DoctorFinding]:
     """Compares the clock of this machine with those of a session's members.
 
+    The delays of messages are computed from these clocks. They are only as accurate as the
+    known offset between the clocks.
+
     Args:
         connection: Endpoints of the session, and keys.
         clock: Clock of this process.
@@ -393,7 +422,7 @@ def _examine_offsets(
         For each member, the offset of its clock and the error bound of the offset.
     """
     try:
-        ping = ping_session(
+        measurement = ping_session(
             connection=connection,
             clock=clock,
             session=session,
@@ -404,21 +433,25 @@ def _examine_offsets(
     except (RunFailed, SessionError, UsageError) as error:
         yield DoctorFinding("clock", "fail", str(error))
         return
-    for row in ping.members if ping else ():
-        member = row["member"]
-        if row["same_clock"]:
+
+    for member_row in measurement.members if measurement else ():
+        member = member_row["member"]
+        if member_row["same_clock"]:
             yield DoctorFinding("clock", "ok", f"{member} has the same clock")
-        elif "offset_ns" not in row:
+        elif "offset_ns" not in member_row:
             yield DoctorFinding("clock", "warn", f"{member} answered too few pings")
         else:
-            offset_s = row["offset_ns"] / 1e9
-            bound_us = row["bound_us"]
+            offset_s = member_row["offset_ns"] / 1e9
+            bound_us = member_row["bound_us"]
             text = f"{member} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
-            yield DoctorFinding("clock", "ok" if bound_us <= MAX_BOUND_US else "warn", text)
+            state: FindingState = "ok" if bound_us <= MAX_BOUND_US else "warn"
+            yield DoctorFinding("clock", state, text)
 
 
 def _run_in_process(code: str) -> Any:
     """Runs Python code in a new process, and returns the value that it prints.
+
+    Some checks change the settings of their process, and must therefore not run in this one.
 
     Args:
         code: The code.
@@ -433,12 +466,14 @@ def _run_in_process(code: str) -> Any:
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False
     )
     if completed.returncode:
-        lines = completed.stderr.strip().splitlines() or ["it printed no reason"]
+        error_lines = completed.stderr.strip().splitlines() or ["it printed no reason"]
         ending = f"exit code {completed.returncode}"
         if completed.returncode < 0:
             ending = f"ended by signal {-completed.returncode}"
-        raise ChildProcessError(f"{ending}: {lines[-1]}")
-    return json.loads(completed.stdout.splitlines()[-1])
+        raise ChildProcessError(f"{ending}: {error_lines[-1]}")
+
+    last_line = completed.stdout.splitlines()[-1]
+    return json.loads(last_line)
 
 
 _RIGHTS_CODE = (
@@ -457,16 +492,17 @@ def examine_rights() -> Iterator[DoctorFinding]:
         One finding per setting. A single warning if the settings could not be tried.
     """
     try:
-        obtained: dict[str, str] = _run_in_process(_RIGHTS_CODE)
+        obtained_settings: dict[str, str] = _run_in_process(_RIGHTS_CODE)
     except ChildProcessError as error:
         text = f"could not be tried, the process that tries them failed ({error})"
         yield DoctorFinding("rights", "warn", text)
         return
-    wanted = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
+
+    wanted_settings = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
     remedy = "ticks will be late by milliseconds under load: see compose.realtime.yaml"
-    for name, prefix in wanted.items():
-        text = f"{name.replace('_', ' ')}: {obtained[name]}"
-        if obtained[name].startswith(prefix):
+    for name, prefix in wanted_settings.items():
+        text = f"{name.replace('_', ' ')}: {obtained_settings[name]}"
+        if obtained_settings[name].startswith(prefix):
             yield DoctorFinding("rights", "ok", text)
         else:
             yield DoctorFinding("rights", "warn", f"{text}; {remedy}")
@@ -490,7 +526,9 @@ def examine_system() -> DoctorFinding:
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Runs a site at decreasing tick rates until its ticks are punctual.
+    """Measures how punctual the control loop is on this machine, at decreasing tick rates.
+
+    The measurement ends at the first rate that the machine achieves.
 
     Args:
         clock: Clock of this process.
@@ -502,13 +540,14 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
     results: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
         if results:
-            last_rate_hz, last_quantile_us, _ = results[-1]
-            if is_held(last_rate_hz, last_quantile_us):
+            tried_rate_hz, tried_quantile_us, _ = results[-1]
+            if is_held(tried_rate_hz, tried_quantile_us):
                 break
         scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
         warm_up(scenario, "s", clock)
         late_us = sorted(rehearse_loop(scenario, "s", clock))
-        quantile_us = late_us[int(MIN_PUNCTUAL_SHARE * len(late_us))]
+        quantile_index = int(MIN_PUNCTUAL_SHARE * len(late_us))
+        quantile_us = late_us[quantile_index]
         results.append((rate_hz, quantile_us, late_us[-1]))
     return results
 
@@ -535,11 +574,10 @@ _RATES_CODE = (
 
 
 def examine_rate() -> DoctorFinding:
-    """Finds the highest tick rate that a single site achieves on this machine at present.
+    """Returns the highest tick rate that a single control loop achieves on this machine.
 
-    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until one is achieved.
-
-    A tick is one period of the control loop.
+    A tick is one period of the control loop. Each rate of `RATES_HZ` is tried for
+    `REHEARSAL_S`, until the loop is punctual.
     """
     if not is_core_cached():
         return DoctorFinding(
@@ -554,25 +592,25 @@ def examine_rate() -> DoctorFinding:
 
     # All rates before the last one were not achieved.
     rate_hz, late_us, largest_us = results[-1]
-    missed = results[:-1]
-    share = f"{MIN_PUNCTUAL_SHARE:.0%}"
+    missed_rates = results[:-1]
+    share_text = f"{MIN_PUNCTUAL_SHARE:.0%}"
     text = (
-        f"{share} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
+        f"{share_text} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
         f"all within {largest_us / 1e3:.1f} ms"
     )
 
     if not is_held(rate_hz, late_us):
         text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
-    text = f"a site alone holds {rate_hz} Hz: {text} ({share} must within half a period)"
-    if missed:
-        missed_hz, missed_us, _ = missed[-1]
+    text = f"a site alone holds {rate_hz} Hz: {text} ({share_text} must within half a period)"
+    if missed_rates:
+        missed_hz, missed_us, _ = missed_rates[-1]
         text += f"; at {missed_hz} Hz within {missed_us / 1e3:.2f} ms: lower rate_hz"
-    return DoctorFinding("rate", "warn" if missed else "ok", text)
+    return DoctorFinding("rate", "warn" if missed_rates else "ok", text)
 
 
 def examine_room(folder: Path) -> Iterator[DoctorFinding]:
-    """Checks the free disk space, the load of the processors, and the compiled code.
+    """Checks whether disk space, processors and compiled code suffice for a session.
 
     If the control code has not been compiled and cached yet, the first run takes longer to
     start.
@@ -580,27 +618,31 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     Args:
         folder: Folder where results would be stored. It need not exist.
     """
+    # The folder may be created later. Its nearest existing parent has the same disk.
     candidates = (folder.absolute(), *folder.absolute().parents)
-    existing = next(path for path in candidates if path.is_dir())
-    free = shutil.disk_usage(existing).free
+    existing_folder = next(path for path in candidates if path.is_dir())
+    free_bytes = shutil.disk_usage(existing_folder).free
 
     state: FindingState = "ok"
-    if free < MIN_FREE_BYTES:
+    if free_bytes < MIN_FREE_BYTES:
         state = "fail"
-    elif free < LOW_FREE_BYTES:
+    elif free_bytes < LOW_FREE_BYTES:
         state = "warn"
-    if not os.access(existing, os.W_OK):
-        yield DoctorFinding("disk", "fail", f"{existing} cannot be written to")
-    yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {existing}")
+    if not os.access(existing_folder, os.W_OK):
+        yield DoctorFinding("disk", "fail", f"{existing_folder} cannot be written to")
+    yield DoctorFinding(
+        "disk", state, f"{free_bytes / 1e9:.1f} GB are free in {existing_folder}"
+    )
 
     cores = workers.count_cores()
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    text = f"{count_nouns(cores, 'processor')}, on which {load:.1f} programs want to run"
+    waiting_programs = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    cores_text = count_nouns(cores, "processor")
+    text = f"{cores_text}, on which {waiting_programs:.1f} programs want to run"
     warning = check_machine_load(SystemClock())
     if warning:
         text = f"{text}; {warning}"
-    is_short = cores < 2 or load >= cores or bool(warning)
-    yield DoctorFinding("processors", "warn" if is_short else "ok", text)
+    is_overloaded = cores < 2 or waiting_programs >= cores or bool(warning)
+    yield DoctorFinding("processors", "warn" if is_overloaded else "ok", text)
 
     if is_core_cached():
         yield DoctorFinding("core", "ok", "compiled")

@@ -71,15 +71,15 @@ def describe_site(
     """
     row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
     if stats is not None:
-        ages = []
+        age_texts = []
         for peer, age_us in stats.age_us.items():
             has_arrived = age_us >= 0
-            age = f"{age_us / 1000:.0f} ms" if has_arrived else "none"
-            ages.append(f"{peer} {age}")
+            age_text = f"{age_us / 1000:.0f} ms" if has_arrived else "none"
+            age_texts.append(f"{peer} {age_text}")
         row |= {
             "time": f"{stats.t_ns / NS_PER_S:.1f} s",
             "mode": stats.mode,
-            AGES: ", ".join(ages),
+            AGES: ", ".join(age_texts),
             "late": f"{stats.late_max_us} us",
             "overruns": f"{stats.overruns}",
         }
@@ -96,6 +96,9 @@ def describe_site(
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
     """Returns the texts of a site's row that follow from its newest record.
+
+    The display of `trilat demo` and `trilat watch` has one row per site, the process that runs
+    one arm.
 
     Args:
         scenario: Scenario of the session.
@@ -173,11 +176,11 @@ def describe_row(row: SiteRow) -> str:
         "hand": "held",
         "late": "late",
     }
-    parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
+    texts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
     for label, heading in headings_by_label.items():
         if row[heading]:
-            parts.append(f"{label} {row[heading]}")
-    return "; ".join(parts)
+            texts.append(f"{label} {row[heading]}")
+    return "; ".join(texts)
 
 
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
@@ -192,15 +195,15 @@ def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
     Returns:
         The panels in the order of the alarms. Each contains the reason, and advice to the user.
     """
-    blocks = []
+    panels = []
     for name, alarm in alarms:
         colour = "red" if alarm.word in ("FAULT", "STOPPED") else "yellow"
-        head = f" {name} {alarm.word} "
+        heading = f" {name} {alarm.word} "
         text = Text.assemble(
-            (head, f"bold reverse {colour}"), f"  {alarm.reason}\n", (alarm.advice, "bold")
+            (heading, f"bold reverse {colour}"), f"  {alarm.reason}\n", (alarm.advice, "bold")
         )
-        blocks.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
-    return blocks
+        panels.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
+    return panels
 
 
 class SessionDisplay:
@@ -269,8 +272,8 @@ class SessionDisplay:
             return
 
         table = Table(title=escape(title), title_justify="left")
-        for head in HEADS:
-            table.add_column(head, justify="right" if head in NUMBERS else "left")
+        for heading in HEADS:
+            table.add_column(heading, justify="right" if heading in NUMBERS else "left")
         for row in rows:
             table.add_row(*map(escape, row.values()))
         # The table is started only now. If it was started before the `with` block, a signal
@@ -309,10 +312,10 @@ class SessionMonitor:
         self._display = display
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        self._states = {
-            name: bus.inbox(topics.key(session, name, topics.STATE), 1)
-            for name in scenario.names
-        }
+        # Only the newest record of a site is shown, so that an inbox holds a single message.
+        self._states = {}
+        for name in scenario.names:
+            self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)
 
     def poll(self) -> None:
         """Receives the messages that have arrived, and updates the display if that is due.

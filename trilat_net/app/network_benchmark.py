@@ -95,7 +95,7 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
         bus: Network connection of the far end.
         member: Name of the far end, under which its messages are published.
     """
-    put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
+    publish = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
         """Sends a message of a benchmark back to its sender, marked as a reply.
@@ -106,9 +106,9 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
         header = _parse_header(payload)
         if header is None:
             return
-        *fields, is_reply = header
+        *sender_fields, is_reply = header
         if not is_reply:
-            put(_HEADER.pack(*fields, 1) + payload[_HEADER.size :])
+            publish(_HEADER.pack(*sender_fields, 1) + payload[_HEADER.size :])
 
     bus.tap(topics.key(SESSION, "*", topics.SAMPLE), answer)
 
@@ -173,6 +173,9 @@ class NearEnd:
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
         """Sends messages at a constant rate, and measures their round trips.
 
+        The message rate does not depend on the replies, so that the load is that of a real
+        session.
+
         Args:
             size_bytes: Size of a message, in bytes.
             rate_hz: Rate of the messages, in 1/s.
@@ -183,8 +186,8 @@ class NearEnd:
         """
         count = max(10, round(rate_hz * duration_s))
         clock = self._clock
-        trips_s = np.full(count, np.nan)
-        first = self._number
+        round_trips_s = np.full(count, np.nan)
+        first_number = self._number
 
         def count_missing() -> int:
             """Stores the round trip times of messages that have come back meanwhile.
@@ -194,21 +197,23 @@ class NearEnd:
             Returns:
                 The number of messages of this measurement that have not come back yet.
             """
-            for number, trip_ns in self._read_replies():
-                if number >= first:
-                    trips_s[number - first] = trip_ns / 1e9
-            return int(np.isnan(trips_s).sum())
+            for number, round_trip_ns in self._read_replies():
+                if number >= first_number:
+                    round_trips_s[number - first_number] = round_trip_ns / 1e9
+            return int(np.isnan(round_trips_s).sum())
 
-        begun_ns = clock.monotonic_ns()
-        for n in range(count):
-            clock.sleep_until(begun_ns + round(n * 1e9 / rate_hz))
+        started_ns = clock.monotonic_ns()
+        for sent_count in range(count):
+            clock.sleep_until(started_ns + round(sent_count * 1e9 / rate_hz))
             self._send(size_bytes)
-            if n % 1000 == 0:
+            if sent_count % 1000 == 0:
                 count_missing()  # empties the inbox, which would overflow otherwise
+
+        # The last replies are still on their way.
         until_ns = clock.monotonic_ns() + _LAST_REPLY_NS
         while count_missing() and clock.monotonic_ns() < until_ns:
             clock.sleep_until(clock.monotonic_ns() + 5_000_000)
-        return trips_s
+        return round_trips_s
 
 
 def _open(
@@ -218,7 +223,9 @@ def _open(
     listens: bool,
     insecure: bool,
 ) -> tuple[ZenohBus, str]:
-    """Opens the network connection of a near or far end.
+    """Opens the network connection of one end of the benchmark.
+
+    The near end sends messages, and the far end sends them back.
 
     Args:
         endpoint: Endpoint to listen at or to connect to.
@@ -269,6 +276,8 @@ def run_far_end(
 ) -> None:
     """Runs the far end of a benchmark, which sends every message back to the near end.
 
+    It runs on the other machine, where the user starts it with `trilat ping --answer`.
+
     Args:
         endpoints: Endpoints to listen at.
         keys: Folder with the keys of a site, for encrypted endpoints.
@@ -281,21 +290,24 @@ def run_far_end(
     Raises:
         UsageError: An endpoint or the keys cannot be used.
     """
-    known = None if keys is None else read_member_keys(keys)
+    member_keys = None if keys is None else read_member_keys(keys)
     clock = SystemClock()
-    begun_ns = clock.monotonic_ns()
+    started_ns = clock.monotonic_ns()
     with ExitStack() as stack:
         for endpoint in endpoints:
-            bus, member = _open(endpoint, known, listens=True, insecure=insecure)
+            bus, member = _open(endpoint, member_keys, listens=True, insecure=insecure)
             answer_benchmarks(stack.enter_context(closing(bus)), member)
         say(f"answers benchmarks at {', '.join(endpoints)}; Ctrl-C ends it")
-        while not stopped() and clock.monotonic_ns() - begun_ns < duration_s * 1e9:
+        while not stopped() and clock.monotonic_ns() - started_ns < duration_s * 1e9:
             clock.sleep_until(clock.monotonic_ns() + _RETRY_NS)
 
 
 @contextmanager
 def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
-    """Runs a far end for all transports in a process on this machine, as a context manager.
+    """Runs the far end of a benchmark in a process on this machine, as a context manager.
+
+    The far end sends back the messages of the benchmark, over each protocol. Without another
+    machine, only this machine itself is measured.
 
     Args:
         duration_s: Duration of the benchmark, in s. The process ends some time later by itself.
@@ -305,15 +317,16 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
     """
     with tempfile.TemporaryDirectory() as folder:
         near_keys, far_keys = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
-        free = find_free_endpoints(len(PROTOCOLS))
-        endpoints = [
-            endpoint.replace("tcp", protocol)
-            for protocol, endpoint in zip(PROTOCOLS, free, strict=True)
-        ]
+        free_endpoints = find_free_endpoints(len(PROTOCOLS))
+        endpoints = []
+        for protocol, endpoint in zip(PROTOCOLS, free_endpoints, strict=True):
+            endpoints.append(endpoint.replace("tcp", protocol))
+
         seconds = math.ceil(duration_s + 2 * CONNECT_NS / 1e9)
         arguments = ["ping", "--keys", str(far_keys), "--seconds", str(seconds)]
         for endpoint in endpoints:
             arguments += ["--answer", endpoint]
+
         child = subprocess.Popen(
             [sys.executable, "-m", "trilat_net", *arguments],
             stdout=subprocess.DEVNULL,
@@ -371,6 +384,7 @@ def find_needs(scenario: Scenario) -> _ScenarioNeeds:
     # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their actual
     # delay is the result of the benchmark.
     overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
+
     in_use_ms: float | None = None
     stable_ms: list[list[float]] | None = None
     try:
@@ -388,6 +402,7 @@ def find_needs(scenario: Scenario) -> _ScenarioNeeds:
         ]
         if not overrides:
             in_use_ms = 1e3 * float(loop.conditions.age_s.max())
+
     return _ScenarioNeeds(
         sample_bytes=_measure_sample(scenario),
         rate_hz=max(rates_hz),
@@ -408,8 +423,8 @@ def _measure_sample(scenario: Scenario) -> int:
     Args:
         scenario: The scenario.
     """
-    coordinates = max(arm.counts.shared for arm in scenario.arms.values())
-    vectors = {name: [0.5] * coordinates for name in ("q", "qd", "tau_x")}
+    coordinate_count = max(arm.counts.shared for arm in scenario.arms.values())
+    vectors = {name: [0.5] * coordinate_count for name in ("q", "qd", "tau_x")}
     sample = PeerSample(
         v=VERSION,
         site=max(scenario.names, key=len),
@@ -445,16 +460,19 @@ def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, An
         "good": False,
         "lost_share": row["lost"] / row["sent"],
     }
-    times = row["one_way_us"]
-    if times is None:
+
+    one_way_us = row["one_way_us"]
+    if one_way_us is None:
         unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
+
         return {**fields, "hidden": False, **unknown}
 
     period_ms = 1e3 / needs.rate_hz
-    p99_ms = times["p99"] / 1e3
+    p99_ms = one_way_us["p99"] / 1e3
     # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
-    ticks = max(1, math.ceil(max(p99_ms, needs.held_ms) / period_ms - 1e-9))
-    age_ms = max(period_ms * ticks, needs.in_use_ms or 0.0)
+    arrival_ms = max(p99_ms, needs.held_ms)
+    age_ticks = max(1, math.ceil(arrival_ms / period_ms - 1e-9))
+    age_ms = max(period_ms * age_ticks, needs.in_use_ms or 0.0)
     is_hidden = p99_ms <= needs.held_ms
     # Upper end of the stable interval that contains the age, if there is one.
     limits_ms = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
@@ -466,7 +484,7 @@ def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, An
         "p99_ms": p99_ms,
         "age_ms": age_ms,
         "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
-        "playout_ms": math.ceil(times["max"] / 1e3),
+        "playout_ms": math.ceil(one_way_us["max"] / 1e3),
     }
 
 
@@ -525,10 +543,10 @@ class NetworkBenchmark(Result):
         """
         flat_rows = []
         for row in self.rows:
-            times = row["one_way_us"] or dict.fromkeys(("p50", "p99", "max"))
-            flat = {key: value for key, value in row.items() if key != "one_way_us"}
-            flat |= {f"{name}_us": value for name, value in times.items()}
-            flat_rows.append(flat)
+            one_way_us = row["one_way_us"] or dict.fromkeys(("p50", "p99", "max"))
+            flat_row = {key: value for key, value in row.items() if key != "one_way_us"}
+            flat_row |= {f"{name}_us": value for name, value in one_way_us.items()}
+            flat_rows.append(flat_row)
         return flat_rows
 
     def blocks(self) -> Iterator[Any]:
@@ -573,8 +591,8 @@ def ping_benchmark(
         UsageError: An endpoint or the keys cannot be used.
         RunFailed: No far end replies at an endpoint.
     """
-    loaded = load_scenario(scenario, set)
-    needs = find_needs(loaded)
+    loaded_scenario = load_scenario(scenario, set)
+    needs = find_needs(loaded_scenario)
     far_endpoints = tuple(connect or ())
     with ExitStack() as stack:
         if not connect:
@@ -587,12 +605,14 @@ def ping_benchmark(
 
     # Only the case with the scenario's own message size and rate is judged.
     scenario_case = (needs.sample_bytes, needs.rate_hz)
-    verdicts = [
-        judge_network(needs, row)
-        for row in rows
-        if (row["bytes"], row["rate_hz"]) == scenario_case
-    ]
-    return NetworkBenchmark(loaded.name, duration_s, needs, rows, verdicts, far_endpoints)
+    verdicts = []
+    for row in rows:
+        row_case = (row["bytes"], row["rate_hz"])
+        if row_case == scenario_case:
+            verdicts.append(judge_network(needs, row))
+    return NetworkBenchmark(
+        loaded_scenario.name, duration_s, needs, rows, verdicts, far_endpoints
+    )
 
 
 def _measure_endpoint(
@@ -602,6 +622,9 @@ def _measure_endpoint(
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
     """Measures the transport of one endpoint, with all message sizes and rates.
+
+    A program on another machine (the far end) returns each message, so that round trips are
+    measured.
 
     Args:
         endpoint: Endpoint of the far end.
@@ -618,32 +641,33 @@ def _measure_endpoint(
     protocol = endpoint.partition("/")[0]
     bus, member = _open(endpoint, keys, listens=False, insecure=False)
     with closing(bus):
-        near = NearEnd(bus, SystemClock(), member)
-        if not near.wait_for_far_end():
+        near_end = NearEnd(bus, SystemClock(), member)
+        if not near_end.wait_for_far_end():
             port = endpoint.rpartition(":")[2]
             raise RunFailed(
                 f"no program answered at {endpoint} within {CONNECT_NS // 10**9} s: on that "
                 f"machine, start trilat ping --answer {protocol}/0.0.0.0:{port}; over tls or "
                 "quic, also give --keys of another site"
             )
+
         for size_factor, rate_share in product(SIZE_FACTORS, RATE_SHARES):
             size_bytes = size_factor * needs.sample_bytes
             rate_hz = rate_share * needs.rate_hz
-            trips_s = near.measure(size_bytes, rate_hz, case_s)
+            round_trips_s = near_end.measure(size_bytes, rate_hz, case_s)
             yield {
                 "transport": protocol,
                 "bytes": size_bytes,
                 "rate_hz": rate_hz,
-                "sent": len(trips_s),
-                "lost": int(np.isnan(trips_s).sum()),
-                "one_way_us": _summarise_trips(trips_s),
+                "sent": len(round_trips_s),
+                "lost": int(np.isnan(round_trips_s).sum()),
+                "one_way_us": _summarise_trips(round_trips_s),
             }
 
 
 def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
-    """Returns the median, the 99 % quantile and the maximum of the one-way times, in us.
+    """Returns the median, the 99th percentile and the maximum of the one-way times, in us.
 
-    A one-way time is half of a round trip.
+    A one-way time is half of a round trip, because the clocks of two machines differ.
 
     Args:
         trips_s: Round trip times in s, NaN for lost messages.
@@ -651,7 +675,8 @@ def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
     Returns:
         The three values. None if all messages were lost.
     """
-    one_way_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6
+    arrived_s = trips_s[np.isfinite(trips_s)]
+    one_way_us = arrived_s / 2 * 1e6
     if not len(one_way_us):
         return None
     p50, p99 = np.percentile(one_way_us, (50, 99))

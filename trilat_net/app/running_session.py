@@ -58,8 +58,10 @@ GATHERING_NS = 500_000_000
 
 It applies to sessions that sites may leave, in which some sites may never reply.
 """
+RETRY_NS = 50_000_000
+"""Time between two attempts to reach a site, in ns."""
 STATES_KEPT = 4096
-"""Number of records of each site that `RunningSession.states` keeps.
+"""Number of records that `RunningSession.records` and `states` keep.
 
 A peer's sample that is in use is found among them by its tick.
 """
@@ -126,6 +128,8 @@ class ShareHistory:
         for ramp in started_ramps:
             self._shares_before = self._interpolate(ramp.start_ns)
             self._ramp = ramp
+
+        # The other ramps have not begun yet.
         self._later_ramps = [ramp for ramp in self._later_ramps if ramp.start_ns > t_ns]
         return self._interpolate(t_ns)
 
@@ -246,11 +250,14 @@ class RunningSession:
             while True:
                 # Errors are ignored until the last attempt, which raises its error.
                 is_last_try = self._clock.monotonic_ns() >= give_up_ns
-                with nullcontext() if is_last_try else suppress(SessionError):
+                ignore_error = nullcontext() if is_last_try else suppress(SessionError)
+                with ignore_error:
                     info = self._find_running(bus, site)
                     break
-                self._clock.sleep_until(self._clock.monotonic_ns() + 50_000_000)
-            yield bus, parse_embedded(info.scenario, self.name)
+                self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
+
+            scenario = parse_embedded(info.scenario, self.name)
+            yield bus, scenario
 
     def lead(
         self,
@@ -261,7 +268,7 @@ class RunningSession:
         say: Callable[[str], None] = print,
         timeout_s: float = REPLY_TIMEOUT_S,
     ) -> None:
-        """Moves an arm with an input device until the session ends.
+        """Moves an arm with an input device, such as a 3D mouse, until the session ends.
 
         The command `trilat hand --device` does the same.
 
@@ -297,6 +304,7 @@ class RunningSession:
                     "a device can lead only an end effector: "
                     f"the hand of {site} must have the mode 'tip'"
                 )
+
             device_hand = make_device_hand(
                 hand=hand,
                 device=device,
@@ -350,6 +358,9 @@ class RunningSession:
     def send_order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
         """Sends an order such as "stop" to some sites, and waits for their replies.
 
+        A site is the process that controls one robot arm. No order is sent if one of the sites
+        does not run, so that the user learns of a misspelled name before any arm reacts.
+
         Args:
             sites: Names of the sites. Empty addresses all sites, or all that are present if the
                 scenario allows sites to leave.
@@ -362,17 +373,21 @@ class RunningSession:
             SessionError: The session has not begun or has no such site, or a site does not
                 reply.
         """
-        with self.reach("" if order == "stop" else OPERATOR) as bus:
+        # In a session with keys, every member may stop arms, but only the operator may do more.
+        member = "" if order == "stop" else OPERATOR
+        with self.reach(member) as bus:
             scenario, infos = self._find_sites(bus)
             for name in sites:
                 if name not in scenario.names:
                     known = f"its sites are {', '.join(scenario.names)}"
                     raise SessionError(f"session {self.name!r} has no site {name!r}; {known}")
+
             addressed = list(sites) or _list_present(scenario, infos)
             for name in addressed:
                 if name not in infos or not infos[name].running:
                     state = "has not begun" if name in infos else "did not answer"
                     raise SessionError(f"session {self.name!r}: {name} {state}")
+
             request = ChangeRequest(order=order, source=SOURCE)
             return [self._send_change(bus, name, request) for name in addressed]
 
@@ -400,11 +415,13 @@ class RunningSession:
         with self.reach() as bus:
             scenario, infos = self._find_sites(bus)
             present = _list_present(scenario, infos)
+
             missing = [name for name in present if name not in infos]
             if missing:
                 raise SessionError(
                     f"session {self.name!r}: these sites did not answer: {', '.join(missing)}"
                 )
+
             waiting = [name for name in present if not infos[name].running]
             if waiting:
                 names = ", ".join(waiting)
@@ -412,15 +429,19 @@ class RunningSession:
                     f"session {self.name!r} has not begun: these sites wait for the others: "
                     f"{names}"
                 )
+
+            # The end lies ahead of every site's present time, so that no site has passed it.
             times_s = [infos[name].ticks / scenario.sites[name].rate_hz for name in present]
-            request = ChangeRequest(stop_s=max(times_s) + AHEAD_S)
+            end_s = max(times_s) + AHEAD_S
+            request = ChangeRequest(stop_s=end_s)
             return [self._send_change(bus, name, request).text for name in present]
 
     def _find_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
-        """Queries all sites of the session who they are, and collects their replies.
+        """Asks all sites of the session for their identities, and collects the replies.
 
-        The search ends when all sites of the scenario have replied. If the scenario allows
-        sites to leave, it also ends `GATHERING_NS` after the first reply.
+        A site is the process that controls one robot arm. The search ends when all sites of the
+        scenario have replied. If the scenario allows sites to leave, some may be absent. Then
+        the search also ends `GATHERING_NS` after the first reply.
 
         Returns:
             The scenario of the session, and the replies by the name of the site.
@@ -438,14 +459,17 @@ class RunningSession:
                 scenario = parse_embedded(info.scenario, self.name)
             if scenario is None or info.member not in scenario.sites:
                 continue
+
             infos[info.member] = info
             if first_reply_ns is None:
                 first_reply_ns = clock.monotonic_ns()
+
             waited_ns = clock.monotonic_ns() - first_reply_ns
             is_complete = len(infos) == len(scenario.names)
-            has_waited = scenario.sites_may_return and waited_ns > GATHERING_NS
-            if is_complete or has_waited:
+            has_waited_enough = scenario.sites_may_return and waited_ns > GATHERING_NS
+            if is_complete or has_waited_enough:
                 return scenario, infos
+
         if scenario is None:
             raise SessionError(
                 f"no site of session {self.name!r} answers; "
@@ -465,9 +489,12 @@ class RunningSession:
     def _find_running(self, bus: Bus, site: str) -> Info:
         """Waits for the reply of one site, and checks that the site runs.
 
+        All members of the session are asked. The reply of any site contains the scenario, which
+        tells whether the name of the wanted site is misspelled.
+
         Args:
             bus: Network connection that reaches the session.
-            site: Name of the site.
+            site: Name of the site, the process that controls one arm.
 
         Returns:
             The identity of the site.
@@ -478,16 +505,18 @@ class RunningSession:
         """
         read_names = embedded_names_reader(self.name)
         for info in self._find_members(bus):
-            if info.member == site and not info.running:
-                raise SessionError(
-                    f"session {self.name!r} has not begun: {site} waits for the others"
-                )
             if info.member == site:
+                if not info.running:
+                    raise SessionError(
+                        f"session {self.name!r} has not begun: {site} waits for the others"
+                    )
                 return info
+
             names = read_names(info.scenario) if info.scenario else ()
             if names and site not in names:
                 known = f"its sites are {', '.join(names)}"
                 raise SessionError(f"session {self.name!r} has no site {site!r}; {known}")
+
         raise SessionError(
             f"site {site!r} of session {self.name!r} does not answer; "
             "to try other endpoints, name them with --connect"
@@ -570,10 +599,11 @@ class RunningSession:
             A function that returns the records that have arrived since its last call.
         """
         with self.reach("") as bus:
-            inboxes = [
-                bus.inbox(topics.key(self.name, site, topics.STATE), 4096)
-                for site in sites or ("*",)
-            ]
+            addressed = sites or ("*",)  # all sites
+            inboxes = []
+            for site in addressed:
+                key = topics.key(self.name, site, topics.STATE)
+                inboxes.append(bus.inbox(key, STATES_KEPT))
 
             def receive() -> list[State]:
                 """Returns the records of the sites that have arrived since the last call.
@@ -638,6 +668,7 @@ class RunningSession:
                     info = self._find_running(bus, as_site)
                     scenario = parse_embedded(info.scenario, self.name)
                     picture_delay = PictureDelay(scenario, as_site)
+
                 user_record = newest_records[as_site]
                 visible_records = {as_site: user_record}
                 # The field `used` states which sample of each peer the control law used.
@@ -654,8 +685,9 @@ class RunningSession:
     def mark(self, text: str) -> str:
         """Stores a text in the log, as a mark of the present moment.
 
-        The first site of the scenario that is present publishes the mark as an event, which the
-        recorder stores.
+        For example, a user marks when something remarkable happens, and finds the moment in the
+        log later. The first site of the scenario that is present publishes the mark as an
+        event, which the recorder stores.
 
         Args:
             text: Text of the mark, for a reader of the log.
@@ -666,7 +698,8 @@ class RunningSession:
         with self.reach() as bus:
             scenario, infos = self._find_sites(bus)
             first_present = next(name for name in scenario.names if name in infos)
-            return self._send_change(bus, first_present, ChangeRequest(mark=text)).text
+            reply = self._send_change(bus, first_present, ChangeRequest(mark=text))
+            return reply.text
 
     @contextmanager
     def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
@@ -714,9 +747,9 @@ class RunningSession:
             records = bus.inbox(topics.key(self.name, site, topics.STATE), 256)
             events = bus.inbox(topics.key(self.name, site, topics.EVENT), 256)
             scenario = parse_embedded(info.scenario, self.name)
-            now_ns = 0  # time of the newest record, since the epoch
+            now_ns = 0  # time of the newest record, since the start of the session
             history = ShareHistory(scenario, site)
-            # Changes from before the subscription.
+            # The weights may have been changed before this subscription.
             for event in list_past_events(bus, self._clock, self.name, site):
                 history.add_change(event.command)
 

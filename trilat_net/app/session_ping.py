@@ -131,7 +131,8 @@ class SessionPing:
         """
         for info in self._members.poll():
             self.infos[info.member] = info
-            self._first_ns = self._first_ns or self._clock.monotonic_ns()
+            if self._first_ns is None:
+                self._first_ns = self._clock.monotonic_ns()
         for stats in read_messages(self._stats, LinkStats):
             self.links[stats.site] = stats
         self.pinger.poll(self._boots)
@@ -180,7 +181,7 @@ class SessionPing:
         links = []
         for site, stats in sorted(self.links.items()):
             for peer in stats.delay_us:
-                link = {
+                link_row = {
                     "from": peer,
                     "to": site,
                     "delay_us": stats.delay_us[peer],
@@ -189,7 +190,7 @@ class SessionPing:
                     "offset_us": stats.offset_us.get(peer, 0),
                     "bound_us": stats.bound_us.get(peer, 0),
                 }
-                links.append(link)
+                links.append(link_row)
 
         return PingReport(self._session, members, links)
 
@@ -214,13 +215,16 @@ class SessionPing:
             "answers": len(rtts_ns),
             "same_clock": has_same_clock,
         }
+
         if rtts_ns:
             ordered_ns = sorted(rtts_ns)
             count = len(ordered_ns)
+            median_index = count // 2
+            p99_index = min(count - 1, count * 99 // 100)
             fields["rtt_us"] = {
                 "min": ordered_ns[0] / 1000,
-                "p50": ordered_ns[count // 2] / 1000,
-                "p99": ordered_ns[min(count - 1, count * 99 // 100)] / 1000,
+                "p50": ordered_ns[median_index] / 1000,
+                "p99": ordered_ns[p99_index] / 1000,
             }
             changes_ns = [abs(following - rtt) for rtt, following in pairwise(rtts_ns)]
             fields["jitter_us"] = sum(changes_ns) / max(1, len(changes_ns)) / 1000
@@ -278,6 +282,7 @@ def ping_session(
         ) as bus:
             if bus is None:
                 return None
+
             ping = SessionPing(bus, clock, session, count)
             begun_ns = clock.monotonic_ns()
             while not ping.is_over(int(timeout_s * 1e9), begun_ns):
@@ -287,6 +292,7 @@ def ping_session(
                 clock.sleep_until(clock.monotonic_ns() + ping.pinger.pause_ns(POLL_NS))
     except SessionError as error:
         raise RunFailed(str(error)) from None
+
     if not ping.infos:
         endpoints = connection.connect or [default_endpoint(session, 0)]
         raise RunFailed(
@@ -341,6 +347,9 @@ def ping_topic(
 ) -> TopicDelays:
     """Measures the delays of a ROS 2 topic, from the sending time that each message carries.
 
+    The function receives the messages of the topic for some time, and then evaluates them for
+    each program that publishes on the topic.
+
     Args:
         graph: Connection to the ROS 2 programs.
         clock: Clock of this process.
@@ -373,6 +382,7 @@ def ping_topic(
     while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
         clock.sleep_until(clock.monotonic_ns() + 10 * POLL_NS)
     lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
+
     if not samples:
         raise RunFailed(
             f"no publisher sent a message on /{topic} in {lasted_s:.3g} s: check the topic "
@@ -391,6 +401,9 @@ def ping_topic(
 
 def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
     """Returns the row of a publisher, with a histogram of its delays.
+
+    A publisher is a program that sends messages on the ROS 2 topic. The table lets the user
+    compare the publishers.
 
     Args:
         samples: Number and delay in ns of each message that arrived. The publisher numbers its

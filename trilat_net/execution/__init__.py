@@ -19,6 +19,7 @@ __all__ = [
     "explain_not_repeatable",
     "find_absent_samples",
     "record_virtual",
+    "simulate_columns",
     "simulate_scenario",
     "simulate_without_operators",
     # Runs side by side
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from .log_checks import LogCheckReport, check_log_files
     from .rerun_execution import describe_rerun_changes
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
+    from .unwritten_run import simulate_columns
     from .verification import verify
     from .virtual import (
         SimulatedLog,
@@ -75,6 +77,7 @@ else:
             "log_checks": "LogCheckReport check_log_files",
             "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
+            "unwritten_run": "simulate_columns",
             "verification": "verify",
             "virtual": (
                 "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"

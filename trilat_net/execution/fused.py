@@ -62,11 +62,14 @@ from ..scenario import PlantPlayer, Scenario, Wall, make_hand_players, refuse_ex
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Marks which numbers of a row are floats and which are integers, each of eight bytes.
+    """Returns which of the 8-byte numbers in an element of an array are floats.
 
-    Only floats can be scaled (`scale_differences`).
+    For a structured type with the fields x (two float64) and count (int64), the result is
+    [True, True, False]. A small disturbance of a run scales only the floats
+    (`scale_differences`). The size of every field of the kernel is a multiple of eight bytes.
 
-    The fields of all data types of the kernel are multiples of eight bytes.
+    Args:
+        dtype: Data type of the element. It may have fields, which may have fields themselves.
     """
     if dtype.fields is None:
         return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
@@ -91,11 +94,11 @@ def scale_differences(x: Array, y: Array, factor: float) -> Array:
 
 
 class _RunState:
-    """All arrays that change during a run, viewed as 64-bit integers.
+    """The complete state of a simulated run: all arrays that change, viewed as 64-bit integers.
 
-    A run creates one object, with which its state can be copied to another run, or mixed with
-    that of another run. The views share the memory of the run, so a change of an object changes
-    the run. Integers are used because equal integers mean equal bits.
+    With this object, the state of a run can be copied to another run, or brought closer to it.
+    The views share the memory of the run, so a change of the object changes the run. Integers
+    are used because equal integers mean equal bits.
 
     Args:
         arrays: The arrays that contain the state. Their memory is shared, not copied.
@@ -151,7 +154,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
 
     Raises:
         ScenarioError: Another arm is external, or the tick rates differ so much that too many
-            samples would arrive in one tick of the slowest site.
+            samples (sent states) would arrive in one tick (control period) of the slowest site.
     """
     refuse_external_arms(scenario, plants)
     ratio = _find_largest_ratio(scenario)
@@ -175,20 +178,21 @@ class _HandActor(Protocol):
     """Interface of a live operator in a compiled run.
 
     A live operator is a person or program that moves an arm while the run is in progress. The
-    compiled loop asks for the operator's actions in advance, for as many ticks as possible, so
-    that it rarely has to leave compiled code.
+    compiled loop asks for the operator's actions in advance, for as many ticks (control
+    periods) as possible, so that it rarely has to leave compiled code.
     """
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what the operator does from tick `k` on, for as many ticks as are certain.
+        """Returns the operator's next actions: how firmly and where the operator pulls the arm.
 
-        A tick is one period of the site's control loop. The result ends before the first tick
-        whose action depends on a state of the arm that has not been computed yet.
+        The actions begin with tick `k`. A tick is one period of the site's control loop. The
+        result ends before the first tick whose action depends on a state of the arm that has
+        not been computed yet.
 
         Args:
             k: Number of the first tick.
             end: Number of the tick before which the result ends at the latest.
-            arrays: State of the site before tick `k`.
+            arrays: State of the site (arm controller) before tick `k`.
 
         Returns:
             An array with one row per tick. A row contains the numbers of `HandInForce`.
@@ -201,7 +205,7 @@ class RunTotals(NamedTuple):
     Attributes:
         rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
             is the difference between the angle of a joint and its reference. The value is that
-            of the joint of all sites for which it is largest.
+            of the joint of all sites (arm controllers) for which it is largest.
         effort_nm: Root mean square of tau - G(q) over sites and joints, in N m. tau is the
             control torque, and G(q) is the torque that compensates gravity in the pose q.
         force_peak_n: Largest force of a wall on an arm, in N. None if there is no wall.
@@ -221,7 +225,8 @@ class RunInputs(NamedTuple):
     `read_run_inputs` reads the inputs from a log, and `FusedRun` uses them.
 
     Attributes:
-        feed: Ticks in which samples of other sites arrived, and actions of live operators.
+        feed: Ticks (control periods) in which samples of other sites (arm controllers) arrived,
+            and actions of live operators.
         changes: Changes of links or sites during the run, in the order of time. Each entry
             contains the tick before which the site applies the change, the index of the site,
             and the change.
@@ -240,9 +245,9 @@ def _make_prompt_inputs(sites: int) -> RunInputs:
     """Returns the inputs of a run that receives nothing from outside.
 
     A site is a simulated process that runs one arm. In such a run, every sample (the state that
-    a site sends to the others) arrives promptly, in the first tick after it was sent. No
-    setting changes, and no live operator (person or program) moves an arm. The delays that the
-    scenario states for its links are still applied, by the receivers.
+    a site sends to the others) arrives promptly, in the first tick (control period) after it
+    was sent. No setting changes, and no live operator (person or program) moves an arm. The
+    delays that the scenario states for its links are still applied, by the receivers.
 
     Args:
         sites: Number of sites of the scenario.
@@ -259,15 +264,16 @@ def _make_prompt_inputs(sites: int) -> RunInputs:
 
 
 class RunMemory(NamedTuple):
-    """All arrays of a run, for modules that compute several runs together.
+    """All arrays of a simulated run, for modules that compute several runs side by side.
 
-    N is the number of sites.
+    N is the number of sites (processes that run one arm), and P the largest number of peers
+    (other sites) from which a site receives samples (sent states).
 
     Attributes:
         tables: Arrays of all sites.
         progress: How far each site is, shape (N,), see `ProgressRow`.
         next_samples: For each site and peer the next sample to accept, shape (N, P).
-        sent: Latest records of the sites.
+        sent: Latest records (results of control periods) of the sites.
         peaks: Peaks in intervals of 50 ms, see `run_until`.
         sums: Sums over the records, shape (N,), see `SumsRow`.
         settled_rad: Position error below which an arm counts as settled, rad.
@@ -370,11 +376,11 @@ class FusedRun:
         self._selected: dict[int, SiteArrays] = {}
 
     def _allocate_records(self, keep: int) -> RecentRecords:
-        """Allocates memory for the recent records of every site.
+        """Allocates memory for the recent records of every site (arm controller).
 
         A record is the stored result of one tick (period of the control loop). It must be
         stored until `pop_records` returns it, until the slowest peer has received it, and, in a
-        repeated run, until the latest sample has arrived.
+        repeated run, until the latest sample (sent state) has arrived.
 
         Args:
             keep: Number of recent records of each site that `pop_records` must find.
@@ -402,8 +408,8 @@ class FusedRun:
         """Connects live operators to their sites, and allocates memory for their actions.
 
         A live operator is a person or program that moves an arm while the run is in progress.
-        The compiled loop reads the actions from `self._inputs`. There is space for no tick yet;
-        `plan` adds it.
+        The compiled loop reads the actions from `self._inputs`. There is space for no tick
+        (control period) yet; `plan` adds it.
 
         Args:
             hands: Live operators, by site.
@@ -429,12 +435,12 @@ class FusedRun:
         """Creates the users' control laws, and connects them to the arrays of the run.
 
         A law that can be compiled is called within the compiled loop. A law in plain Python is
-        called between the stages of a tick. The laws are stored in `self._laws`, and the arrays
-        that the compiled loop needs in `self._law_arrays`, which stays None without users'
-        laws.
+        called between the stages of a tick (control period). The laws are stored in
+        `self._laws`, and the arrays that the compiled loop needs in `self._law_arrays`, which
+        stays None without users' laws.
 
         Args:
-            setups: Setups of the sites, in the order of the scenario.
+            setups: Setups of the sites (arm controllers), in the order of the scenario.
         """
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
@@ -495,11 +501,12 @@ class FusedRun:
     def step_to(self, last_ns: int) -> None:
         """Executes all planned ticks up to a time, and applies the changes up to that time.
 
-        Nothing happens if a site has diverged, that is, if its arm has left its limits.
+        Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
+        its limits.
 
         Args:
-            last_ns: Time of the last tick to be executed, in ns after the epoch. The epoch is
-                the common start time of the sites.
+            last_ns: Time of the last tick (control period) to be executed, in ns after the
+                epoch. The epoch is the common start time of the sites.
 
         Raises:
             LawFailed: A user's control law failed.
@@ -522,8 +529,8 @@ class FusedRun:
 
         The programs act as operators, or compute the motion of an arm (plants). A program needs
         the state of the arm at a certain time. Therefore the compiled loop pauses before the
-        tick of this time, and the program is called. Between two pauses, the loop executes many
-        ticks at once.
+        tick (control period) of this time, and the program is called. Between two pauses, the
+        loop executes many ticks at once.
 
         Args:
             last_ns: Time of the last tick to be executed, in ns after the epoch, the common
@@ -584,11 +591,15 @@ class FusedRun:
     def _request_actions(self, i: int) -> int:
         """Requests the next actions of an operator, if the site has executed the previous ones.
 
+        The operator is a program that answers with its actions for some ticks (periods of the
+        control loop) in advance. They are written to the inputs of the compiled loop.
+
         Args:
             i: Index of the site.
 
         Returns:
-            Time at which the operator needs the state of the arm again, in ns.
+            Time at which the operator needs the state of the arm again, in ns after the epoch.
+            `NEVER_NS` after the last tick.
         """
         progress = self._progress[i]
         if progress["t_ns"] == NEVER_NS:
@@ -605,8 +616,8 @@ class FusedRun:
         """Executes the planned ticks up to a time for which no user's program is needed.
 
         These programs are those of operators and plants (simulated arms). Control laws are
-        called. If a user's law is plain Python, the loop over the ticks runs in Python too.
-        Otherwise the whole loop is compiled.
+        called. If a user's law is plain Python, the loop over the ticks (control periods) runs
+        in Python too. Otherwise the whole loop is compiled.
 
         Args:
             last_ns: Time of the last tick to be executed, in ns after the epoch, the common
@@ -644,7 +655,10 @@ class FusedRun:
             raise next(law_failures, error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
-        """Executes ticks as `run_until` does, calling laws in plain Python between the stages.
+        """Executes ticks in a Python loop, because a control law is not compiled.
+
+        The loop equals that of the compiled function `run_until`. Within each tick, the law is
+        called after the measurements (`sense_site`) and before the motion (`finish_site`).
 
         Args:
             last_ns: Time of the last tick, in ns after the epoch.
@@ -688,8 +702,8 @@ class FusedRun:
     def advance_to(self, until_s: float) -> None:
         """Continues the run until it is as long as a run with a duration of `until_s` seconds.
 
-        Nothing happens if a site has diverged, that is, if its arm has left its limits. Nothing
-        happens either if the run is already that long.
+        Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
+        its limits. Nothing happens either if the run is already that long.
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -706,8 +720,8 @@ class FusedRun:
         values in it are kept.
 
         Args:
-            ticks: Total number of ticks of each site, in the order of the scenario. Ticks that
-                have been executed already are included.
+            ticks: Total number of ticks of each site (arm controller), in the order of the
+                scenario. Ticks that have been executed already are included.
         """
         progress: Row
         for progress, planned_ticks in zip(self._progress, ticks, strict=True):
@@ -736,7 +750,7 @@ class FusedRun:
 
     @cached_property
     def _state(self) -> _RunState:
-        """All arrays of the run that change while it is executed."""
+        """State of the run, with which it can be copied to another run."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
         arrays += [array for array in tables if isinstance(array, np.ndarray)]
@@ -817,8 +831,8 @@ class FusedRun:
         Args:
             field: Name of the field, for example "q" for the joint angles or "qd" for the
                 velocities.
-            offsets: Numbers to add, one row per site, shape (N, n). The unit is that of the
-                field.
+            offsets: Numbers to add, one row per site (arm controller), shape (N, n). The unit
+                is that of the field.
         """
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
@@ -830,7 +844,8 @@ class FusedRun:
             field: Name of the field, for example "qd" for the joint velocities.
 
         Returns:
-            The largest absolute difference over all sites and joints, in the unit of the field.
+            The largest absolute difference over all sites (arm controllers) and joints, in the
+            unit of the field.
         """
         difference = self._tables.site[field] - other._tables.site[field]
         return float(np.abs(difference).max())
@@ -843,8 +858,8 @@ class FusedRun:
 
         Returns:
             The joint angles q in rad, shape (100, N, n), and the estimated parameters
-            theta_hat, shape (100, N, P). N is the number of sites, n that of joints, and P that
-            of parameters.
+            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n that of
+            joints, and P that of parameters.
         """
         q = []
         theta_hat = []
@@ -868,9 +883,9 @@ class FusedRun:
     def settled_s(self) -> float | None:
         """Time from which the synchronisation errors of all sites stay small, in s.
 
-        The error e of a site is the difference between its joint angles and their reference. It
-        counts as small if |e| of every joint is below `settled_rad`. None if the limit is
-        exceeded in the last tick.
+        The error e of a site (arm controller) is the difference between its joint angles and
+        their reference. It counts as small if |e| of every joint is below `settled_rad`. None
+        if the limit is exceeded in the last tick (control period).
         """
         last_site = int(np.argmax(self._progress["unsettled_ns"]))
         progress: Row = self._progress[last_site]
@@ -887,7 +902,8 @@ class FusedRun:
         Each array has the shape (intervals, 3 n), where n is the number of joints. A row
         contains the largest synchronisation error |e| of each joint in rad, the largest speed
         |qd| of each joint in rad/s, and the last angle q of each joint in rad. An interval
-        without a tick of the site contains -1. The last interval may be incomplete.
+        without a tick (control period) of the site (arm controller) contains -1. The last
+        interval may be incomplete.
         """
         buckets = []
         for peaks, progress in zip(self._peaks, self._progress, strict=True):
@@ -976,10 +992,10 @@ class FusedRun:
         return [row[layout.columns()["tau_x"]] for row, layout in pairs]
 
     def pop_records(self) -> list[tuple[IntArray, Array]]:
-        """Returns the records that each site has produced since the last call.
+        """Returns the records that each site (arm controller) has produced since the last call.
 
-        A record is the stored result of one tick. Only a limited number of recent records is
-        stored (see `keep` of the constructor); older ones are lost.
+        A record is the stored result of one tick (control period). Only a limited number of
+        recent records is stored (see `keep` of the constructor); older ones are lost.
 
         Returns:
             For each site, the nominal times of the records in ns, shape (K,), and the records,
@@ -1017,7 +1033,8 @@ class FusedRun:
 def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
     """Explains why a run cannot be repeated exactly from its log alone.
 
-    For example, the log may lack records, or a control law may be code that must not run here.
+    For example, the log may lack records (results of control periods), or a control law may be
+    code that must not run here.
 
     Args:
         log: Log of the run.
@@ -1044,9 +1061,9 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
 def read_run_inputs(log: Log) -> RunInputs:
     """Reads from a log everything that is needed to repeat its run.
 
-    These inputs are the ticks (periods of the control loop) in which samples of other sites
-    arrived, the changes of settings, and the actions of live operators (persons or programs
-    that moved an arm). The run must be repeatable, see `explain_not_repeatable`.
+    These inputs are the ticks (periods of the control loop) in which samples (sent states) of
+    other sites arrived, the changes of settings, and the actions of live operators (persons or
+    programs that moved an arm). The run must be repeatable, see `explain_not_repeatable`.
 
     Args:
         log: Log of the run.
@@ -1144,7 +1161,7 @@ def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
     Args:
         feed: Inputs of the run without operators.
         log: Log whose actions are added.
-        ticks: Largest number of ticks of a site.
+        ticks: Largest number of ticks (control periods) of a site.
 
     Returns:
         The inputs with the actions in `hands` and with `hand_indices`. They are unchanged if no
@@ -1183,8 +1200,8 @@ def _write_actions(feed_actions: Array, first_tick: int, actions: Array) -> None
       columns). M is the largest m of all sites. The columns beyond m stay zero.
 
     Args:
-        feed_actions: Actions of one site in the feed, one row per tick, shape (K, 1 + 2 M). The
-            converted actions are written into this array.
+        feed_actions: Actions of one site in the feed, one row per tick (control period), shape
+            (K, 1 + 2 M). The converted actions are written into this array.
         first_tick: Tick of the first action.
         actions: Actions of the operator, one row per tick, shape (ticks, 3 + 2 m).
     """
@@ -1211,7 +1228,11 @@ def _count_coordinates(setup: SiteSetup) -> int:
 
 
 def _find_live_row(setup: SiteSetup) -> int:
-    """Returns the index of the live operator among a site's torque sources, or -1."""
+    """Returns the index of the live operator among the operators and environments of a site.
+
+    A live operator is a person or program that moves the arm while the run is in progress. The
+    result is -1 if the site has none.
+    """
     for index, source in enumerate(setup.actors):
         if source.kind in LIVE_KINDS:
             return index

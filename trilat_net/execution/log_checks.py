@@ -42,12 +42,12 @@ class LogCheckReport(CheckReport):
     """Findings of all checks of a log, which decide whether the log can be trusted.
 
     The report passes under three conditions. The log must be unchanged since it was written,
-    enough of its records must have been compared, and every repeated execution must agree with
-    the log.
+    enough of its records (results of control periods) must have been compared, and every
+    repeated execution must agree with the log.
 
     Attributes:
         log: The checked log.
-        result: Result of executing the sites of the log again.
+        result: Result of executing the sites (arm controllers) of the log again.
         findings: One finding for each check, in the order in which they are shown.
     """
 
@@ -118,8 +118,9 @@ class LogCheckReport(CheckReport):
                 virtual time, as `compare_with_virtual` does.
             progress: Function that is called now and then with the amount of work done and the
                 total. None if nobody wants to know.
-            min_coverage: Smallest fraction of the ticks of every site that must be compared. A
-                log with a smaller fraction fails even if all compared records agree.
+            min_coverage: Smallest fraction of the ticks (control periods) of every site (arm
+                controller) that must be compared. A log with a smaller fraction fails even if
+                all compared records agree.
             resume_every: Every how many ticks a site is restored from the records, see
                 `verify`. 0 means never.
 
@@ -146,14 +147,16 @@ def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
 def check_log_files(
     sources: Sequence[str], min_coverage: float, allowed: CodeConsents
 ) -> list[Finding]:
-    """Checks a log in a worker process.
+    """Checks one log, as a function that a worker process of a pool can run.
 
-    The arguments can be sent to another process, so that many logs can be checked in parallel.
-    A user's control law that cannot be created gives a failed finding instead of an error.
+    Many logs can thus be checked in parallel: the arguments and the result can be sent to
+    another process. A user's control law that cannot be created gives a failed finding instead
+    of an error.
 
     Args:
         sources: Paths of the files that the log consists of.
-        min_coverage: Smallest fraction of the ticks of every site that must be compared.
+        min_coverage: Smallest fraction of the ticks (control periods) of every site that must
+            be compared.
         allowed: Permissions to run code of users, which are added to those of this process.
 
     Returns:
@@ -275,7 +278,8 @@ def _check_virtual_time(
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
     """Returns the finding about records that are missing from the log.
 
-    The log fails if too small a fraction of the ticks of a site could be compared.
+    The log fails if too small a fraction of the ticks (control periods) of a site (arm
+    controller) could be compared.
 
     Args:
         log: The log.
@@ -285,25 +289,25 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
     if coverage.expected:
         records_in_file = sum(len(log[name]) for name in coverage.expected)
         expected_records = sum(coverage.expected.values())
-        parts = [
+        clauses = [
             f"{records_in_file}/{expected_records} in the file",
             coverage.describe(result.min_coverage),
         ]
     else:
         # No site may be executed, so no number of records is expected of any.
-        parts = [f"{sum(map(len, log.values()))} in the file"]
+        clauses = [f"{sum(map(len, log.values()))} in the file"]
     if result.withheld:
-        parts.append(f"{', '.join(result.withheld)} not judged")
+        clauses.append(f"{', '.join(result.withheld)} not judged")
     if log.unknown_ends:
-        parts.append(describe_unknown_ends(log.unknown_ends))
+        clauses.append(describe_unknown_ends(log.unknown_ends))
     if log.damaged:
         plural = "s" if len(log.damaged) > 1 else ""
-        parts.append(f"damaged in {len(log.damaged)} place{plural}")
+        clauses.append(f"damaged in {len(log.damaged)} place{plural}")
     elif not log.complete:
-        parts.append("the file was not finished")
+        clauses.append("the file was not finished")
 
     has_coverage = not coverage.expected or coverage.share >= result.min_coverage
-    return Finding("records", "; ".join(parts), has_coverage and not log.damaged)
+    return Finding("records", "; ".join(clauses), has_coverage and not log.damaged)
 
 
 def _check_execution(result: VerifyResult, recorded: str) -> Finding:
@@ -358,11 +362,12 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
 
 
 def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Finding:
-    """Adds to a finding how to check that a user's law keeps all of its memory in the records.
+    """Adds advice about user-defined control laws with hidden state to a finding.
 
-    A law may remember something that its records lack, such as an attribute of its object. A
-    run that is executed as a whole repeats this memory too, so that all records agree. A site
-    that is restored from its records does not have it.
+    A law may store something outside of the records (results of control periods), such as an
+    attribute of its object. A run that is executed again as a whole repeats this hidden state,
+    so that all records agree. Only a site (arm controller) that is restored from its records
+    lacks it, which the advised command tests.
 
     Args:
         finding: Finding of a check.
@@ -370,16 +375,17 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
         result: Result of executing the log again, without restoring sites from records.
 
     Returns:
-        The finding, with an advice if it is about whole runs of users' laws that agree.
+        The finding, with the advice if it says that whole runs of users' laws agree.
     """
     files = list(dict.fromkeys(str(law.file) for law in find_user_laws(log.scenario)))
-    is_about_runs = finding.check == "executed again" and finding.passed
-    if not (files and is_about_runs and result.whole_run) or result.withheld:
+    have_runs_agreed = finding.check == "executed again" and finding.passed and result.whole_run
+    if not files or not have_runs_agreed or result.withheld:
         return finding
-    words = ["trilat", "verify", *log.sources]
+
+    arguments = ["trilat", "verify", *log.sources]
     for file in files:
-        words += ["--law", file]
-    command = join_arguments([*words, "--resume-every", "100"])
+        arguments += ["--law", file]
+    command = join_arguments([*arguments, "--resume-every", "100"])
     advice = f"memory of your law that the records lack would not show here, but by: {command}"
     return replace(finding, text=f"{finding.text}; {advice}")
 
@@ -396,14 +402,15 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
     At most `_MAX_GAPS_NAMED` ranges are listed. The others are counted.
 
     Args:
-        gaps: Site, first tick and last tick of each range.
+        gaps: Site (arm controller), first tick (control period) and last tick of each range.
     """
     texts = []
     remaining = _MAX_GAPS_NAMED
     for site, site_gaps in itertools.groupby(gaps, key=lambda gap: gap[0]):
         ranges = []
-        for _, first, last in site_gaps:
-            ranges.append(f"{first}-{last}" if last > first else f"{first}")
+        for _, first_tick, last_tick in site_gaps:
+            is_range = last_tick > first_tick
+            ranges.append(f"{first_tick}-{last_tick}" if is_range else f"{first_tick}")
         if remaining > 0:
             texts.append(f"{site} {', '.join(ranges[:remaining])}")
         remaining -= len(ranges)
@@ -417,13 +424,13 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
 def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Returns the finding of a comparison with another execution.
+    """Returns the finding that states how many records equal those of another execution.
 
     Args:
         label: Name of the check.
         comparison: The comparison.
-        excused_from: Tick from which differences are expected and do not fail the check. None
-            if there is no such tick.
+        excused_from: Tick (control period) from which differences are expected and do not fail
+            the check. None if there is no such tick.
     """
     first = comparison.first
     text = f"{comparison.identical}/{count_nouns(comparison.records, 'record')} identical"

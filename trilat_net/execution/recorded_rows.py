@@ -33,9 +33,9 @@ class SampleTable(NamedTuple):
 
     Attributes:
         bits: Position, velocity and external torque of each sample in the coordinates that
-            the sites share, as the bits of the numbers, shape (N, 3 m).
-        rows: Row in `bits` of the sample of each site and tick, shape (sites, ticks). -1 if
-            the log has no record of the tick.
+            the sites (arm controllers) share, as the bits of the numbers, shape (N, 3 m).
+        rows: Row in `bits` of the sample of each site and tick (control period), shape (sites,
+            ticks). -1 if the log has no record of the tick.
         sites: Index of each site in `rows`.
     """
 
@@ -47,24 +47,29 @@ class SampleTable(NamedTuple):
 def make_sample_table(log: Log) -> SampleTable | None:
     """Collects the states (samples) that all sites of a log sent, for the compiled loop.
 
+    The loop executes a site (arm controller) again, and looks up the content of each sample
+    that arrived.
+
     Args:
         log: The log.
 
     Returns:
-        The samples. None if a record of the log does not have the exact layout.
+        The samples. None if a record (result of a control period) of the log does not have the
+        exact layout.
     """
     bits = []
-    rows = np.full((len(log), 1 + max(part.last_tick for part in log.values())), -1, np.int64)
-    count = 0
-    for site, part in enumerate(log.values()):
-        if part.indexed is None:
+    last_tick = max(site_log.last_tick for site_log in log.values())
+    rows = np.full((len(log), last_tick + 1), -1, np.int64)
+    sample_count = 0
+    for site, site_log in enumerate(log.values()):
+        if site_log.indexed is None:
             return None
         # A sender in task space sends the motion of its end effector.
-        fields = ("x", "xd", "wrench") if part.layout.task else ("q", "qd", "tau_x")
-        bits.append(part.indexed.vector_words(fields))
+        fields = ("x", "xd", "wrench") if site_log.layout.task else ("q", "qd", "tau_x")
+        bits.append(site_log.indexed.vector_words(fields))
         # Of several records of one tick, the last one counts.
-        rows[site, part.tick] = np.arange(count, count + len(part))
-        count += len(part)
+        rows[site, site_log.tick] = np.arange(sample_count, sample_count + len(site_log))
+        sample_count += len(site_log)
     widths = {part_words.shape[1] for part_words in bits}
     if len(widths) > 1:
         return None
@@ -77,7 +82,11 @@ def _find_samples(
     counts: IntArray, entries: IntArray, peers: IntArray, rows: IntArray, arrivals: IntArray,
     is_complete: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Looks up the samples that arrived in each tick.
+    """Finds out for which ticks the log contains the content of all samples that arrived.
+
+    A sample is the state that another site (arm controller), a peer, sent. The record of a tick
+    (control period) lists only the senders of the samples and the ticks in which they were
+    sent.
 
     Args:
         counts: Number of arrivals of each of K records, shape (K,).
@@ -107,25 +116,27 @@ def _find_samples(
 
 
 class PlainRows:
-    """Reads records of one site in blocks that compiled code can execute again.
+    """Reads records of one site in blocks whose ticks compiled code can execute again.
 
-    A record is plain if all inputs of its tick are in the log.
+    Only ordinary (plain) records are read: those for which all inputs of the tick (control
+    period) are in the log.
 
     Args:
-        part: Records of the site.
+        site_log: Records of the site (arm controller).
         indexed: The same records with the places of their values.
         samples: Samples of all sites.
-        resume_every: Records of ticks that are divisible by this number are not plain. 0: none.
+        resume_every: Every how many ticks a record does not count as plain, because the site is
+            restored from its records there. 0 means never.
     """
 
     def __init__(
         self,
-        part: SiteLog,
+        site_log: SiteLog,
         indexed: IndexedRecords,
         samples: SampleTable,
         resume_every: int = 0,
     ) -> None:
-        self._part = part
+        self._site_log = site_log
         self._indexed = indexed
         self._samples = samples
         self._resume_every = resume_every
@@ -140,15 +151,18 @@ class PlainRows:
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts the records from a row on that one block can execute, at most `BLOCK_ROWS`.
+        """Counts the records that compiled code can execute next in one block.
 
-        The first of these records must belong to the present start of the site, and to the
-        next tick.
+        The caller makes sure that the first of them belongs to the present start of the site's
+        process, and to the next tick (control period). A block has at most `BLOCK_ROWS`
+        records (results of control periods).
 
         Args:
-            row: Row of the first record.
+            row: Index of the first record.
             before_tick: Tick before which the records end. None for no such tick.
         """
+        # `_stops` has the indices of the records that are not plain. The block ends before the
+        # next one of them.
         stops = self._stops
         index = int(np.searchsorted(stops, row))
         is_plain = index == len(stops) or stops[index] > row
@@ -156,36 +170,45 @@ class PlainRows:
             return 0
         if not is_plain:
             index += 1
-        stop = int(stops[index]) if index < len(stops) else len(self._part)
+        stop = int(stops[index]) if index < len(stops) else len(self._site_log)
         stop = min(stop, row + BLOCK_ROWS)
         if before_tick is not None:
-            stop = min(stop, int(np.searchsorted(self._part.tick, before_tick)))
+            stop = min(stop, int(np.searchsorted(self._site_log.tick, before_tick)))
         return max(0, stop - row)
 
     def _is_first_of_run(self, row: int) -> bool:
-        """True if a record is plain except that it does not follow the record before it."""
+        """True if a record is complete although it does not follow the record before it.
+
+        Such a record is the first one of a series that compiled code can execute.
+        """
         return bool(self._is_complete[row])
 
     @cached_property
     def _stops(self) -> IntArray:
-        """Rows of all records that are not plain, in ascending order."""
-        follows = np.zeros(len(self._part), np.bool_)
-        ticks = self._part.tick
+        """Indices of all records before which compiled code must stop, in ascending order.
+
+        They lack an input of their tick, or do not follow the record before them.
+        """
+        follows = np.zeros(len(self._site_log), np.bool_)
+        ticks = self._site_log.tick
         follows[1:] = (ticks[1:] == ticks[:-1] + 1) & (self._boots[1:] == self._boots[:-1])
         return np.flatnonzero(~(follows & self._is_complete))
 
     @cached_property
     def _is_complete(self) -> NDArray[np.bool_]:
         """For each record, whether all inputs of its tick are in the log, shape (K,)."""
-        ticks = self._part.tick
+        ticks = self._site_log.tick
+        nominal_times_ns = ticks * NS_PER_S // self._site_log.rate_hz
+        # The compiled loop applies no changes of settings, and computes the nominal times.
         is_complete: NDArray[np.bool_] = self._indexed.change_counts == 0
-        is_complete &= self._indexed.ints("t_ns") == ticks * NS_PER_S // self._part.rate_hz
+        is_complete &= self._indexed.ints("t_ns") == nominal_times_ns
         if self._resume_every:
             is_complete &= ticks % self._resume_every != 0
+
         counts, entries = self._indexed.arrivals
         self._first_arrival = _sum_before(counts)
         self._arrivals = np.zeros(entries.shape, np.int64)
-        peers = [self._samples.sites[peer] for peer in self._part.peers]
+        peers = [self._samples.sites[peer] for peer in self._site_log.peers]
         _find_samples(
             counts,
             entries,
@@ -198,20 +221,24 @@ class PlainRows:
 
     @cached_property
     def _memory(self) -> tuple[IntArray, IntArray]:
-        """Index of the first number of `mem` of each record, shape (K + 1,), and their bits."""
+        """Internal states of the site and its control law (field `mem`) in all records.
+
+        The first array has the index of the first number of each record in the second array,
+        and the total length, shape (K + 1,). The second array has the bits of the numbers.
+        """
         counts, bits = self._indexed.memory_words
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads plain records in the form that the compiled loop needs.
+        """Reads some records in the form that the compiled loop needs.
 
         Args:
-            first: Row of the first record.
-            count: Number of records.
+            first: Index of the first record (result of a control period).
+            count: Number of records, all of which must be plain (see `PlainRows`).
         """
         last = first + count
         block = self._indexed.select(slice(first, last))
-        layout = self._part.layout
+        layout = self._site_log.layout
         first_memory, memory = self._memory
         return RecordedRows(
             bits=block.vector_words(list(layout.columns())),
@@ -228,13 +255,13 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes the ticks of plain records again.
+        """Executes the ticks of some records again in compiled code, to verify the records.
 
         Args:
-            repeater: Executes the ticks of the site.
-            first: Row of the first record.
-            count: Number of records.
-            external: True if the motion of the arm was measured.
+            repeater: Executes the ticks (control periods) of the site (arm controller).
+            first: Index of the first record.
+            count: Number of records, all of which must be plain (see `PlainRows`).
+            external: True if the motion of the arm was measured, as that of a real robot is.
 
         Returns:
             The number of records before the first one that differs from its execution.
@@ -243,16 +270,23 @@ class PlainRows:
         if external:
             block = self._indexed.select(slice(first, first + count))
             rows = rows._replace(plants=_read_plants(block))
-        return repeater.repeat(int(self._part.tick[first]), rows, self._samples.bits)
+        return repeater.repeat(int(self._site_log.tick[first]), rows, self._samples.bits)
 
 
 def _sum_before(counts: IntArray) -> IntArray:
-    """Returns the sum of the entries before each of K entries, and of all, shape (K + 1,)."""
+    """Returns where each of K lists begins if all lists are stored one after another.
+
+    For the lengths [2, 0, 3], the result is [0, 2, 2, 5]. The last entry is the total length.
+    """
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
 
 
 def _read_hands(block: IndexedRecords) -> Array:
-    """Returns grip, target, and target one second later of a live hand, shape (K, 1 + 2 m)."""
+    """Returns the actions of a live operator, a person or program that moved the arm.
+
+    For m target coordinates, the shape is (K, 1 + 2 m): firmness of the grip, target, and the
+    position that the target would reach after one second.
+    """
     action = block.vectors(["hand"])["hand"]
     coordinates = (action.shape[1] - _FIRST_TARGET) // 2
     target = action[:, _FIRST_TARGET : _FIRST_TARGET + coordinates]
@@ -261,7 +295,11 @@ def _read_hands(block: IndexedRecords) -> Array:
 
 
 def _read_plants(block: IndexedRecords) -> Array:
-    """Returns q, qd and the torque ON the arm as they were measured, shape (K, 3 n)."""
+    """Returns the measurements of an external arm, such as a real robot, shape (K, 3 n).
+
+    For n joints, they are the joint angles q in rad, the velocities qd in rad/s, and the
+    external torque ON the arm in N m.
+    """
     vectors = block.vectors(["q", "qd", "tau_x"])
     return np.concatenate([vectors["q"], vectors["qd"], -vectors["tau_x"]], axis=1)
 

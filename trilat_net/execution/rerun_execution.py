@@ -88,8 +88,8 @@ class _ChangedValue(NamedTuple):
 class RerunRequest:
     """A checked request for a rerun: which sites of a log to execute again, and how.
 
-    `resolve_rerun_request` creates it. The sites that are not executed keep the records of the
-    log.
+    `resolve_rerun_request` creates it. The sites (arm controllers) that are not executed keep
+    the records (results of control periods) of the log.
 
     Attributes:
         original: Scenario of the log.
@@ -156,7 +156,7 @@ def resolve_rerun_request(
         _check_key(key, replaced, recorded)
 
     requested = load_scenario(original, overrides)
-    _check_frame(original, requested, recorded)
+    _check_recorded_limits(original, requested, recorded)
     scenario = requested
     if recorded:
         scenario = _join_scenarios(original, requested, recorded)
@@ -193,42 +193,48 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
     """Refuses a changed setting that cannot have an effect in a rerun.
 
-    For example, a setting of a site whose records are copied has no effect.
+    A rerun executes some sites (arm controllers) of a log again, and copies the records
+    (results of control periods) of the others. For example, a setting of a site whose records
+    are copied has no effect.
 
     Args:
-        key: Dotted path of the key.
+        key: Dotted path of the setting, such as "sites.m1.control.Kd".
         replaced: Names of the executed sites.
         recorded: Names of the other sites.
     """
-    group, _, rest = key.partition(".")
-    if group in _TEXT_KEYS:
+    section, _, path_in_section = key.partition(".")
+    if section in _TEXT_KEYS:
         raise ScenarioError(
             "only describes the scenario and has no effect in a rerun", path=key
         )
-    if group == "rate_hz" or rest.endswith(".rate_hz"):
-        return  # `_check_frame` checks the rates of the resolved scenario
-    owner = rest.partition(".")[0]
-    if group == "links":
-        concerned = owner.partition("->")[2]
-    elif group in ("sites", "dominance"):
-        concerned = owner
+    if section == "rate_hz" or path_in_section.endswith(".rate_hz"):
+        return  # `_check_recorded_limits` checks the rates of the resolved scenario
+
+    section_entry = path_in_section.partition(".")[0]
+    if section == "links":
+        affected_site = section_entry.partition("->")[2]
+    elif section in ("sites", "dominance"):
+        affected_site = section_entry
     else:
-        return
-    if concerned in recorded:
-        reason = f"{concerned} stays as recorded"
-        if group == "links":
+        return  # the setting concerns the whole scenario
+
+    if affected_site in recorded:
+        reason = f"{affected_site} stays as recorded"
+        if section == "links":
             reason += ", and a link belongs to its receiver"
         executed = f"the rerun executes only {', '.join(replaced)}"
         raise ScenarioError(
-            f"has no effect: {reason}; {executed}: add --replace {concerned}", path=key
+            f"has no effect: {reason}; {executed}: add --replace {affected_site}", path=key
         )
 
 
-def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str]) -> None:
+def _check_recorded_limits(
+    original: Scenario, requested: Scenario, recorded: Sequence[str]
+) -> None:
     """Refuses changes of a rerun that the recorded arrivals of samples do not cover.
 
-    These are other sites, a longer duration, and other tick rates if some sites are not
-    executed.
+    These are other sites (arm controllers), a longer duration, and other tick rates if some
+    sites are not executed.
 
     Args:
         original: Scenario of the log.
@@ -262,13 +268,16 @@ def _join_scenarios(
 ) -> Scenario:
     """Returns the requested scenario, but with the original settings of the recorded sites.
 
-    The settings of a site include the links over which it receives, and the planned changes of
-    these links and of its dominance factors.
+    A rerun executes some sites (arm controllers) of a log again with the requested settings.
+    The recorded sites are not executed and keep their settings. These include the links over
+    which they receive, and the planned changes of these links and of their dominance factors
+    (how strongly a site follows each other site).
 
     Args:
         original: Scenario of the log.
         requested: Scenario with the changes.
-        recorded: Names of the sites that are not executed, and keep their records.
+        recorded: Names of the sites that are not executed, and keep their records (results of
+            control periods).
     """
 
     def choose(site: str) -> Scenario:
@@ -291,7 +300,7 @@ def _join_scenarios(
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[_ChangedValue]:
-    """Returns the values that differ between two scenarios."""
+    """Returns the settings that differ between two scenarios, with both values of each."""
     before = dict(flatten_table(msgspec.to_builtins(original)))
     after = dict(flatten_table(msgspec.to_builtins(other)))
     return [
@@ -304,7 +313,7 @@ def _find_changes(original: Scenario, other: Scenario) -> list[_ChangedValue]:
 def describe_rerun_changes(request: RerunRequest) -> list[str]:
     """Describes which settings a rerun changes, in lines for the user.
 
-    If several sites or links are changed in the same way, they share a line.
+    If several sites (arm controllers) or links are changed in the same way, they share a line.
 
     Args:
         request: The checked request for the rerun.
@@ -343,8 +352,8 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
     """
     replaced_objects: set[str] = set()  # as group.owner
     for change in request.changes:
-        group, _, rest = change.key.partition(".")
-        owner, _, key = rest.partition(".")
+        group, _, path_in_group = change.key.partition(".")
+        owner, _, key = path_in_group.partition(".")
         replacement = _describe_replacement(request, group, owner, key)
         if replacement is None:  # the change concerns a single value
             values = f"{_shorten(change.before)} -> {_shorten(change.after)}"
@@ -368,25 +377,29 @@ def _describe_replacement(
     Args:
         request: The request.
         group: First part of the changed key, for example "links".
-        owner: Second part of the key: a link or a site.
+        owner: Second part of the key: a link or a site (arm controller).
         key: Rest of the key.
 
     Returns:
         Subject, owner and text, see `_describe_changes`. None if the change concerns a single
         value.
     """
-    before = request.original
-    after = request.scenario
+    original = request.original
+    changed = request.scenario
     if group == "links":
-        before_text = before.links[owner].describe()
-        after_text = after.links[owner].describe()
-        if before_text != after_text:
-            return "link", owner, f"{before_text} -> {after_text}"
+        original_text = original.links[owner].describe()
+        changed_text = changed.links[owner].describe()
+        if original_text != changed_text:
+            return "link", owner, f"{original_text} -> {changed_text}"
     if group == "sites" and key.startswith("control."):
-        before_law = msgspec.to_builtins(before.sites[owner].control)
-        after_law = msgspec.to_builtins(after.sites[owner].control)
-        if before_law["law"] != after_law["law"]:
-            return "control", owner, f"{describe_law(before_law)} -> {describe_law(after_law)}"
+        original_law = msgspec.to_builtins(original.sites[owner].control)
+        changed_law = msgspec.to_builtins(changed.sites[owner].control)
+        if original_law["law"] != changed_law["law"]:
+            return (
+                "control",
+                owner,
+                f"{describe_law(original_law)} -> {describe_law(changed_law)}",
+            )
     return None
 
 
@@ -403,7 +416,7 @@ class RerunTick(NamedTuple):
     A tick is one period of the control loop, and its record is the stored result.
 
     Attributes:
-        site: Name of the site.
+        site: Name of the site (arm controller).
         tick: Number of the tick.
         t_ns: Nominal time of the tick, in ns after the epoch (the common start time).
         mode: Operating mode in which the site executed the tick, for example running or at
@@ -427,7 +440,7 @@ class RerunTick(NamedTuple):
 
 
 class RerunSite:
-    """Executes one site of a log again, tick by tick.
+    """Executes one site (arm controller) of a log again, tick (control period) by tick.
 
     The state of the site is certain if it follows from the ticks before. It becomes uncertain
     after a gap in the log. Then records are copied until two consecutive records determine the
@@ -462,7 +475,7 @@ class RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        part = log[name]
+        site_log = log[name]
         scenario = request.scenario
         setup = scenario.setup(name)
         self.name = name
@@ -471,23 +484,27 @@ class RerunSite:
         self.first: RecordDifference | None = None
         self.lacking = 0
         self.diverged = False
+
+        # The executed site, and its inputs according to the log.
         self._site = Site(setup)
         self._channel = setup.channel
-        self._part = part
+        self._site_log = site_log
         self._changed = bool(request.changes)
         self._inputs = RecordedInputs(
-            part=part,
+            site_log=site_log,
             samples=samples,
             ends=log.last_ticks,
             changes=log.commands(name),
             links=setup.links,
         )
         self._last_tick = min(deliveries.last, scenario.ticks(name) - 1)
+
         # At another rate, records and ticks have different times and cannot be compared.
-        same_rate = self._site.rate_hz == part.rate_hz
-        self._recorded_ticks: list[int] = part.tick.tolist() if same_rate else []
+        has_same_rate = self._site.rate_hz == site_log.rate_hz
+        self._recorded_ticks: list[int] = site_log.tick.tolist() if has_same_rate else []
         self._rows = {tick: row for row, tick in enumerate(self._recorded_ticks)}
-        self._boot = part.states[0].boot if len(part) else 0
+
+        self._boot = site_log.states[0].boot if len(site_log) else 0
         self._stats = LoopStats(self._site, self._boot)
         self._certain = deliveries.first == 0  # whether the state of the site is known
 
@@ -505,7 +522,7 @@ class RerunSite:
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:
-        """Executes the next tick of the site.
+        """Executes the next tick of the site (arm controller).
 
         A tick is a period of the control loop. It can be executed only if the state of the site
         before it is known (certain). There are three cases:
@@ -548,7 +565,11 @@ class RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of the log. Ends if there is no further record."""
+        """Continues at the next record of the log, and leaves out the ticks before it.
+
+        The inputs of these ticks are not known. If there is no further record, the site is
+        done.
+        """
         index = bisect.bisect_right(self._recorded_ticks, self.k)
         self.k = self._last_tick + 1
         if index < len(self._recorded_ticks):
@@ -556,10 +577,13 @@ class RerunSite:
         self._certain = False
 
     def _execute(self, row: int | None) -> RerunTick:
-        """Executes the next tick, and compares it with the record of the log.
+        """Executes the next tick (control period), and compares it with the record of the log.
+
+        Its inputs are the samples that arrive according to `deliveries`, and the changes and
+        the operator's actions in the log.
 
         Args:
-            row: Row of the record. None if the log does not contain a record of the tick.
+            row: Index of the record. None if the log does not contain a record of the tick.
         """
         arrivals, missing = self._inputs.find_arrivals(self.deliveries.entries.get(self.k, ()))
         arrivals = arrivals[:MAX_ARRIVALS]
@@ -567,27 +591,27 @@ class RerunSite:
         self.lacking += len(missing)
         changes = [change for _, change in self._inputs.pop_changes(self.k)]
         hand: Sequence[float] = ()
-        if self._site.layout.hand == self._part.layout.hand:
-            hand = find_recorded_hand(self._part, self._site, self.k)
+        if self._site.layout.hand == self._site_log.layout.hand:
+            hand = find_recorded_hand(self._site_log, self._site, self.k)
 
         output = self._site.step(TickInput(self.k, arrivals, changes, hand=hand))
         stats = self._stats.pop_stats(output) if self._stats.is_due(self.k) else None
 
         same = False
         if row is not None:
-            state = self._part.states[row]
+            state = self._site_log.states[row]
             comparable = output
             if self._changed or missing:
                 # The checksum covers samples that have changed, or that the log lacks.
                 comparable = output._replace(rx_crc=state.rx_crc)
-            same = equal_record(state, comparable, self._part.peers)
+            same = equal_record(state, comparable, self._site_log.peers)
             if not same and not self._changed and self._inputs.is_uncertain(state, output):
                 return self._keep_record(row)
             if not same and self.first is None:
                 self.first = find_first_difference(
                     logged=state,
                     computed=comparable,
-                    peers=self._part.peers,
+                    peers=self._site_log.peers,
                     equal=equal_bits,
                     channel=self._channel,
                 )
@@ -596,7 +620,7 @@ class RerunSite:
         payload = encode_state(
             site=self.name,
             boot=self._boot,
-            peers=self._part.peers,
+            peers=self._site_log.peers,
             output=output,
             arrivals=arrivals,
             late_us=0,
@@ -614,22 +638,22 @@ class RerunSite:
         )
 
     def _keep_record(self, row: int) -> RerunTick:
-        """Copies the record of the next tick, which is not executed.
+        """Copies the record of the next tick from the log, because it cannot be executed.
 
-        The state of the site becomes uncertain.
+        The state of the site (arm controller) is not known afterwards.
 
         Args:
-            row: Row of the record.
+            row: Index of the record in the log.
         """
         self._certain = False
-        output = read_output(self._part.states[row], self._part.peers)
+        output = read_output(self._site_log.states[row], self._site_log.peers)
         self.output = output
         return RerunTick(
             site=self.name,
             tick=output.tick,
             t_ns=output.t_ns,
             mode=output.mode,
-            payload=self._part.payloads[row],
+            payload=self._site_log.payloads[row],
             same=False,
             kept=True,
             stats=None,
@@ -646,8 +670,8 @@ No sample is in transit for longer.
 class RerunExecution:
     """Executes all requested sites of a log again, together.
 
-    The sites exchange the samples that they compute now. Samples of the other sites are those
-    of the log.
+    A site is the control process of an arm. The executed sites exchange the samples (states)
+    that they compute now. The samples of the other sites are those of the log.
 
     Args:
         log: The log.
@@ -681,26 +705,33 @@ class RerunExecution:
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:
-        """Returns the arrivals at a site in the rerun.
+        """Determines in which tick of a site each sample of the other sites arrives.
 
-        Without changed settings, they are those of the records. Otherwise the arrivals in gaps
-        are assumed, and all arrivals are converted if tick rates were changed.
+        A sample is the state that a site (arm controller) sends in one tick, a period of its
+        control loop. There are three cases:
+
+        - No setting was changed: the samples arrive as the records (results of control periods)
+          of the site list them.
+        - Settings were changed: arrivals in ticks without a record are assumed.
+        - Tick rates were changed: in addition, all arrivals are converted to the new rates.
 
         Raises:
             LogError: Too many records are missing, or a site that joined late has another rate.
         """
-        part = self._log[name]
+        site_log = self._log[name]
         original = self._log.scenario
         scenario = self._request.scenario
         if not self._request.changes:
-            return read_deliveries(part)
-        rates_hz = [original.sites[peer].rate_hz for peer in part.peers]
-        new_rates_hz = [scenario.sites[peer].rate_hz for peer in part.peers]
+            return read_deliveries(site_log)
+
+        rates_hz = [original.sites[peer].rate_hz for peer in site_log.peers]
+        new_rates_hz = [scenario.sites[peer].rate_hz for peer in site_log.peers]
         new_rate_hz = scenario.sites[name].rate_hz
-        ends = [self._log.last_ticks[peer] for peer in part.peers]
-        deliveries = complete_deliveries(part, rates_hz, ends)
-        if part.rate_hz == new_rate_hz and rates_hz == new_rates_hz:
+        last_ticks = [self._log.last_ticks[peer] for peer in site_log.peers]
+        deliveries = complete_deliveries(site_log, rates_hz, last_ticks)
+        if site_log.rate_hz == new_rate_hz and rates_hz == new_rates_hz:
             return deliveries
+
         if deliveries.first > 0:
             raise LogError(
                 f"{self._log.source}: the records of {name} begin at tick {deliveries.first}: "
@@ -709,7 +740,7 @@ class RerunExecution:
             )
         return retime_deliveries(
             deliveries=deliveries,
-            rate_hz=part.rate_hz,
+            rate_hz=site_log.rate_hz,
             new_rate_hz=new_rate_hz,
             rates_hz=rates_hz,
             new_rates_hz=new_rates_hz,
@@ -754,7 +785,10 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: RerunSite) -> None:
-        """Keeps the last record of a site for its peers, and removes one that is too old."""
+        """Stores the newest sample (state) of an executed site, which its peers will receive.
+
+        A sample that is so old that it cannot arrive any more is removed.
+        """
         output = site.output
         recent = self._recent[site.name]
         recent[output.tick] = make_arrival(0, output.tick, output)
@@ -764,10 +798,11 @@ class RerunExecution:
     def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:
         """Chooses the site that executes its next tick, by its index in a list.
 
-        A tick can be executed once all samples that arrive in it are known. The earliest such
-        tick is chosen. If no tick is ready, because each site waits for a sample of another
-        one, the earliest tick is chosen all the same: the execution must go on, and the missing
-        samples then count as not contained in the log.
+        A tick (control period) can be executed once all samples that arrive in it are known.
+        The earliest such tick is chosen. If no tick is ready, because each site (arm
+        controller) waits for a sample of another one, the earliest tick is chosen all the same:
+        the execution must go on, and the missing samples then count as not contained in the
+        log.
 
         Args:
             pending: Next tick of each executed site that has not finished, as (time in ns,
@@ -785,12 +820,12 @@ class RerunExecution:
     def _is_ready(self, receiver: str, k: int) -> bool:
         """True if a site does not have to wait for samples that arrive in its next tick.
 
-        A sample is the state that a sender publishes in one tick. It is ready if the sender has
-        executed this tick, or has finished and never will. The samples of a sender that is not
-        executed in this rerun are in the log, so they are always ready.
+        A sample is the state that a sender publishes in one tick (control period). It is ready
+        if the sender has executed this tick, or has finished and never will. The samples of a
+        sender that is not executed in this rerun are in the log, so they are always ready.
 
         Args:
-            receiver: Name of the site.
+            receiver: Name of the site (arm controller).
             k: Number of its next tick.
         """
         sender_names = self._log[receiver].peers

@@ -90,9 +90,9 @@ def make_arrival(
 ) -> Arrival:
     """Returns the message with which a sample of another site arrives at a receiver.
 
-    A sample is the state that a site publishes in one tick. The message contains all numbers
-    that the control law of the sender sends, for all receivers. `select_peer_channels` selects
-    the numbers for one receiver.
+    A sample is the state that a site (arm controller) publishes in one tick (control period).
+    The message contains all numbers that the control law of the sender sends, for all
+    receivers. `select_peer_channels` selects the numbers for one receiver.
 
     Args:
         peer: Index of the sender among the sites from which the receiver gets samples.
@@ -129,8 +129,8 @@ def select_peer_channels(
 
     Args:
         arrivals: Arrivals with the numbers for all receivers.
-        links: Links of the receiver, in the order of its peers. A peer is a site from which it
-            gets samples.
+        links: Links of the receiver, in the order of its peers. A peer is a site (arm
+            controller) from which it gets samples (sent states).
     """
     selected = []
     for arrival in arrivals:
@@ -143,15 +143,16 @@ def select_peer_channels(
     return selected
 
 
-def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    """Returns what an operator did with a site's arm in one tick, according to the log.
+def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
+    """Returns how an operator moved a site's arm in one tick, according to the log.
 
-    A site is a process that runs one arm, and a tick is a period of its control loop. The site
-    is executed again, possibly with another number of ticks per second. Therefore the newest
-    record up to the time of the tick is used.
+    The operator is a person or program that moves the arm. A site is a process that runs one
+    arm, and a tick is a period of its control loop. The site is executed again, possibly with
+    another number of ticks per second. Therefore the newest record (result of a control period)
+    up to the time of the tick is used.
 
     Args:
-        part: Records of the site in the log.
+        site_log: Records of the site in the log.
         site: The site that is executed again.
         k: Number of the tick of the executed site.
 
@@ -159,29 +160,29 @@ def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
         The operator's grip, target and velocity, in the order of `HandInForce`. Empty if the
         site had no operator with a live connection.
     """
-    if not part.layout.hand:
+    if not site_log.layout.hand:
         return []
     t_ns = k * NS_PER_S // site.rate_hz
-    count = int(np.searchsorted(part.t_ns, t_ns, side="right"))
-    if not count:
+    earlier_records = int(np.searchsorted(site_log.t_ns, t_ns, side="right"))
+    if not earlier_records:
         return []
-    action: list[float] = part.hand[count - 1].tolist()
+    action: list[float] = site_log.hand[earlier_records - 1].tolist()
     return action
 
 
 class RecordedInputs(Generic[Change]):
     """Everything that one site received according to a log: samples and changes of settings.
 
-    With these inputs, the site can be executed again. A sample is the state that another site
-    (a peer) published in one tick.
+    With these inputs, the site (arm controller) can be executed again. A sample is the state
+    that another site (a peer) published in one tick (control period).
 
     Args:
-        part: Records of the site.
+        site_log: Records of the site.
         samples: Records or arrivals of all sites, by site and tick.
         ends: Last tick of each site.
         changes: Changes that took effect at the site, by tick.
         links: Links over which the site receives, in the order of its peers.
-        states: Records of the site, if they are not to be decoded as those of `part` are.
+        states: Records of the site, if they are not to be decoded as those of `site_log` are.
 
     Attributes:
         samples: Samples of each peer, by the tick in which the peer published them.
@@ -194,21 +195,21 @@ class RecordedInputs(Generic[Change]):
 
     def __init__(
         self,
-        part: SiteLog,
+        site_log: SiteLog,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
         ends: Mapping[str, int],
         changes: Mapping[int, Sequence[Change]],
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
-        self._part = part
-        self._states = part.states if states is None else states
+        self._site_log = site_log
+        self._states = site_log.states if states is None else states
         self._links = links
-        self.samples = [samples[peer] for peer in part.peers]
-        self.ends = [ends[peer] for peer in part.peers]
+        self.samples = [samples[peer] for peer in site_log.peers]
+        self.ends = [ends[peer] for peer in site_log.peers]
         self._changes = sorted(changes.items(), reverse=True)
-        self.assumed: list[set[int]] = [set() for _ in part.peers]
-        self.lacking: list[set[int]] = [set() for _ in part.peers]
+        self.assumed: list[set[int]] = [set() for _ in site_log.peers]
+        self.lacking: list[set[int]] = [set() for _ in site_log.peers]
 
     @property
     def next_change_tick(self) -> int | None:
@@ -216,7 +217,7 @@ class RecordedInputs(Generic[Change]):
         return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Removes and returns the changes that take effect up to a tick.
+        """Removes and returns the changes that take effect up to a tick (control period).
 
         Args:
             tick: Last tick whose changes are returned.
@@ -234,10 +235,10 @@ class RecordedInputs(Generic[Change]):
     def find_arrivals(
         self, entries: Sequence[ArrivalEntry]
     ) -> tuple[list[Arrival], list[ArrivalEntry]]:
-        """Looks up the content of samples that arrived in a tick.
+        """Looks up the content of samples that arrived in a tick (control period).
 
-        The record of a tick lists only which samples arrived. Their content is in the records
-        of the senders.
+        The record of a tick lists only which samples (sent states) arrived. Their content is in
+        the records of the senders.
 
         Args:
             entries: Arrived samples, in the form of the field `rx` of a record.
@@ -247,22 +248,23 @@ class RecordedInputs(Generic[Change]):
             missing from the log.
         """
         arrivals: list[Arrival] = []
-        missing: list[ArrivalEntry] = []
+        unknown_entries: list[ArrivalEntry] = []
         for entry in entries:
             peer, tick, latency_us = entry
-            is_peer = 0 <= peer < len(self.samples)
-            sample = self.samples[peer].get(tick) if is_peer else None
+            is_known_peer = 0 <= peer < len(self.samples)
+            sample = self.samples[peer].get(tick) if is_known_peer else None
             if sample is None:
-                missing.append(entry)
+                unknown_entries.append(entry)
             else:
                 arrivals.append(make_arrival(peer, tick, sample, latency_us))
-        return select_peer_channels(arrivals, self._links), missing
+        return select_peer_channels(arrivals, self._links), unknown_entries
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Remembers samples that arrived according to the log, but whose content is unknown.
+        """Stores which samples arrived although the log does not contain their content.
 
-        A sample is the state that another site sent. The log does not contain the record of the
-        sender. A tick that uses the sample cannot be computed with certainty.
+        A sample is the state that another site (arm controller) sent. Its content is unknown if
+        the record of the sender is missing. A tick (control period) that uses the sample cannot
+        be computed with certainty.
 
         Args:
             entries: The samples: index of the sender, number of the tick in which it sent the
@@ -297,12 +299,15 @@ class RecordedInputs(Generic[Change]):
         if ticks_before != [tick - 2, tick - 1]:
             return False
 
-        last = states[row - 1]
-        if detached and last.mode in RESTING_MODES:
+        last_record = states[row - 1]
+        if detached and last_record.mode in RESTING_MODES:
             return True
-        used_ticks = read_output(last, self._part.peers).used  # of each peer; -1 for no sample
-        pairs = zip(used_ticks, self.samples, strict=True)
-        return all(used_tick < 0 or used_tick in samples for used_tick, samples in pairs)
+        used_ticks = read_output(last_record, self._site_log.peers).used
+        for used_tick, samples in zip(used_ticks, self.samples, strict=True):
+            has_sample = used_tick >= 0
+            if has_sample and used_tick not in samples:
+                return False
+        return True
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
         """Restores the state that a site had at a given point of a log, after missing records.
@@ -318,7 +323,7 @@ class RecordedInputs(Generic[Change]):
             changes: Changes of settings since the last executed tick of the site.
         """
         states = self._states
-        peers = self._part.peers
+        peers = self._site_log.peers
         for change in changes:
             site.apply_change(change, states[row].t_ns)
 
@@ -349,10 +354,10 @@ class RecordedInputs(Generic[Change]):
     def _find_in_use(self, peer: int, used_tick: int, coordinates: int) -> Arrival | None:
         """Returns the sample of a peer that the site used in its last tick before a gap.
 
-        A sample is the state that a peer, another site, sent in one of its ticks. If the log
-        does not contain it, a sample of zeros takes its place. This happens only for a site
-        that holds a position of its own and therefore does not use the sample, see
-        `can_resume`. The sample is remembered in `lacking`.
+        A sample is the state that a peer, another site (arm controller), sent in one of its
+        ticks (control periods). If the log does not contain it, a sample of zeros takes its
+        place. This happens only for a site that holds a position of its own and therefore does
+        not use the sample, see `can_resume`. The sample is remembered in `lacking`.
 
         Args:
             peer: Index of the peer.
@@ -376,15 +381,16 @@ class RecordedInputs(Generic[Change]):
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
         """True if a difference of a record may be due to missing data of the log.
 
-        In each tick, a site uses the newest sample (state) of each other site, its peers. The
-        tick is uncertain if the arrival of such a sample was assumed, because no record lists
-        it, or if the content of the sample is missing from the log.
+        In each tick (control period), a site (arm controller) uses the newest sample (state) of
+        each other site, its peers. The tick is uncertain if the arrival of such a sample was
+        assumed, because no record lists it, or if the content of the sample is missing from the
+        log.
 
         Args:
             state: Record of the tick in the log.
             output: Result of executing the same tick again.
         """
-        for peer, peer_name in enumerate(self._part.peers):
+        for peer, peer_name in enumerate(self._site_log.peers):
             # Ticks of the used samples. -1 before the first sample.
             used_in_log = state.used.get(peer_name, -1)
             used_in_execution = output.used[peer]
@@ -397,14 +403,19 @@ class RecordedInputs(Generic[Change]):
         return False
 
     def _find_waiting(
-        self, row: int, peer: int, used: int, rate_hz: int
+        self, row: int, peer: int, used_tick: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Returns the samples newer than the one in use that arrived before a record.
+        """Finds the samples of a peer that were waiting in its link before a given record.
+
+        A sample, the state that a peer sends, waits at the receiver until the delay of the link
+        has passed. If records are missing from the log, it is not certain which samples had
+        arrived.
 
         Args:
-            row: Row of the record.
+            row: Index of the record, among the records of the receiver.
             peer: Index of the peer.
-            used: Tick of the sample in use.
+            used_tick: Tick of the peer's sample that the receiver uses. Older samples are never
+                used again.
             rate_hz: Tick rate of the peer, in Hz.
 
         Returns:
@@ -419,30 +430,33 @@ class RecordedInputs(Generic[Change]):
         next_listed = self.ends[peer] + 1
         if position < len(listing.rows):
             next_listed = listing.first_ticks[position]
+
         # The last sample before t_ns: the first tick at or after t_ns, less one.
         last_sent = -(-t_ns * rate_hz // NS_PER_S) - 1
         newest_probable = max(last_sent, next_listed - 1)
         newest_listed = self._find_newest_listed(row, peer)
+
         # A sample does not wait longer than the longest permitted delay.
-        oldest = (t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
-        start = max(used + 1, oldest)
-        newest = min(max(newest_probable, newest_listed), self.ends[peer])
-        certain: set[int] = set()
-        probable: set[int] = set()
-        for tick in range(start, newest + 1):
+        oldest_tick = (t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
+        first_tick = max(used_tick + 1, oldest_tick)
+        newest_tick = min(max(newest_probable, newest_listed), self.ends[peer])
+        certain_ticks: set[int] = set()
+        probable_ticks: set[int] = set()
+        for tick in range(first_tick, newest_tick + 1):
             first_row = listing.first_rows.get(tick)
             if first_row is None:
                 if tick <= newest_probable:
-                    probable.add(tick)
+                    probable_ticks.add(tick)
             elif first_row < row:
-                certain.add(tick)
-        return certain, probable
+                certain_ticks.add(tick)
+        return certain_ticks, probable_ticks
 
     def _find_newest_listed(self, row: int, peer: int) -> int:
-        """Returns the newest sample of a peer in the last records before a row.
+        """Returns the newest sample (sent state) of a peer in the last records before a row.
 
         Returns:
-            Tick of the sample. -1 if these records list no sample of the peer.
+            Tick of the sample. -1 if these records (results of control periods) list no sample
+            of the peer.
         """
         newest = -1
         for state in self._states[max(0, row - _LOOK_BACK) : row]:
@@ -455,9 +469,9 @@ class RecordedInputs(Generic[Change]):
     def _listings(self) -> "list[_PeerListing]":
         """For each peer (site that sends samples), which records list samples from it.
 
-        The record of a tick lists the samples that arrived in this tick. The index answers two
-        questions quickly: in which record is a sample listed first, and which sample does the
-        next record after a gap list.
+        The record of a tick (control period) lists the samples (sent states) that arrived in
+        this tick. The index answers two questions quickly: in which record is a sample listed
+        first, and which sample does the next record after a gap list.
         """
         listings = [_PeerListing(first_rows={}, rows=[], first_ticks=[]) for _ in self.samples]
         for row, state in enumerate(self._states):
@@ -476,10 +490,11 @@ class RecordedInputs(Generic[Change]):
 
 
 class _PeerListing(NamedTuple):
-    """Records of a site that list samples of one peer.
+    """Records of a site (arm controller) that list samples of one peer.
 
     Attributes:
-        first_rows: For the tick of each sample, the row of the first record that lists it.
+        first_rows: For the tick (control period) of each sample, the row of the first record
+            that lists it.
         rows: Rows of all records that list a sample of the peer, in ascending order.
         first_ticks: For each of these rows, the tick of the first sample that the record lists.
     """

@@ -50,16 +50,15 @@ WINDOWS = 16
 class Push(NamedTuple):
     """Small displacement of the state of a twin, for example by 1e-6 rad at one joint.
 
-    A twin is a second execution of the same run.
-
-    The difference between the twin and the run then shows whether small disturbances grow or
-    die away.
+    A twin is a second execution of the same run. Its difference from the run then shows whether
+    small disturbances grow or die away.
 
     Attributes:
         name: Description for the user, for example "1e-06 rad at m1 joint 1".
         field: Displaced part of the state: joint angles "q" in rad, joint velocities "qd" in
             rad/s, or estimated arm parameters "theta_hat".
-        by: Displacement of every number of this part, shape (N, n), with one row per site.
+        by: Displacement of every number of this part, shape (N, n), with one row per site (arm
+            controller).
         at_s: Time of the push, in s after the epoch (the common start time).
         again: If True, a twin whose difference has decayed to rounding errors is pushed again.
             Otherwise the twin ends.
@@ -143,7 +142,8 @@ class Push(NamedTuple):
         A push is a small displacement of the state of a twin, which is a second execution of
         the run. Different pushes displace different joints or estimates:
 
-        - one push of all estimated parameters if the control law of a site estimates any;
+        - one push of all estimated parameters if the control law of a site (arm controller)
+          estimates any;
         - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`.
           The sizes differ, because growth may depend on the amplitude;
         - one push of each joint, because a joint that does not act on the others shows its
@@ -159,22 +159,24 @@ class Push(NamedTuple):
         """
         # The target of "m1 joint 1" is "m1.q1".
         joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
-        learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
+        has_estimates = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
+        # One push for each joint, and two for the estimates and for a random direction.
         complete_count = len(joint_targets) + 2
         if count is None:
             count = min(complete_count, MAX_PUSHES)
 
         pushes = []
-        if learns and count > 2:
+        if has_estimates and count > 2:
             pushes.append(cls.parse(scenario, "theta"))
-        if count < complete_count:
-            numbers = range(1, count - len(pushes) + 1)
-            pushes += [_push_in_random_direction(scenario, number) for number in numbers]
-        else:
+        has_push_for_each_joint = count >= complete_count
+        if has_push_for_each_joint:
             random_count = min(3, count - len(joint_targets) - len(pushes))
             factors = (1.0, 1e-3, 1e3)[:random_count]
             pushes += [cls.parse(scenario, "q", factor * PUSH_RAD) for factor in factors]
             pushes += [cls.parse(scenario, target) for target in joint_targets]
+        else:
+            numbers = range(1, count - len(pushes) + 1)
+            pushes += [_push_in_random_direction(scenario, number) for number in numbers]
         return [push._replace(again=True, largest=LARGEST) for push in pushes]
 
 
@@ -183,7 +185,7 @@ class TwinPath(NamedTuple):
 
     A twin is a second execution of the run in which the state received a small push. If the
     difference becomes large, it is scaled down, and if it has decayed, the twin is pushed
-    again. The run has K intervals, and all sites together have J joints.
+    again. The run has K intervals, and all sites (arm controllers) together have J joints.
 
     Attributes:
         push: Push of the twin.
@@ -191,8 +193,8 @@ class TwinPath(NamedTuple):
         largest: Natural logarithm of the largest difference of velocity of each joint in each
             interval, in rad/s, shape (K, J). It is computed as if the difference had never been
             scaled down. -inf if the twin and the run are equal.
-        last: Difference of velocity in the last tick of each interval, in rad/s, shape (K, J).
-            It is the actual difference, which may have been scaled down.
+        last: Difference of velocity in the last tick (control period) of each interval, in
+            rad/s, shape (K, J). It is the actual difference, which may have been scaled down.
         scale: Natural logarithm of the factor by which `last` must be multiplied to undo the
             scaling, shape (K,).
         pushed: Indices of the intervals in which the twin was pushed.
@@ -218,10 +220,11 @@ class Twins(NamedTuple):
 
     Attributes:
         paths: Course of the difference of each twin from the run.
-        joints: Names of the joints of all sites, for example "m1 joint 1".
+        joints: Names of the joints of all sites (arm controllers), for example "m1 joint 1".
         speed: Largest speed of each joint of the run in each interval of 50 ms, in rad/s, shape
             (K, J). The differences can be compared with it.
-        same: True if the repeated run has the same bits as the records of the log.
+        same: True if the repeated run has the same bits as the records (results of control
+            periods) of the log.
     """
 
     paths: Sequence[TwinPath]
@@ -243,7 +246,7 @@ class Twins(NamedTuple):
 
         Raises:
             NotRepeatable: The run cannot be repeated, or the repeated run differs from the
-                records.
+                records (results of control periods).
             LogError: A record cannot be read.
         """
         reason = explain_not_repeatable(log, own_laws=own_laws)
@@ -284,18 +287,14 @@ class Twins(NamedTuple):
 
 
 def _list_joints(scenario: Scenario) -> tuple[str, ...]:
-    """Returns the names of the joints of all sites, for example "m1 joint 1".
+    """Returns the names of the joints of all arms, for example "m1 joint 1" for the arm m1.
 
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        The names, site by site, in the order of the scenario.
+    The names are in the order of the arms in the scenario, the description of the experiment.
     """
     joints = []
     for name in scenario.names:
-        count = scenario.layout(name).joints
-        joints += [f"{name} joint {number}" for number in range(1, count + 1)]
+        joint_count = scenario.layout(name).joints
+        joints += [f"{name} joint {number}" for number in range(1, joint_count + 1)]
     return tuple(joints)
 
 
@@ -310,8 +309,10 @@ def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
     push = Push.parse(scenario, "q")
     generator = np.random.Generator(np.random.Philox(number))
     directions = generator.uniform(-1.0, 1.0, push.by.shape)
-    by = np.where(push.by != 0.0, PUSH_RAD * directions, 0.0)
-    return push._replace(name=f"{push.name}, direction {number}", by=by, direction=number)
+    displacements = np.where(push.by != 0.0, PUSH_RAD * directions, 0.0)
+    return push._replace(
+        name=f"{push.name}, direction {number}", by=displacements, direction=number
+    )
 
 
 LEAST_PUSH = 1e-11
@@ -349,17 +350,19 @@ def _count_estimates(scenario: Scenario) -> list[int]:
 
 def _describe_targets(scenario: Scenario, target: str) -> str:
     """Returns the error message for a wrong target, which lists the possible targets."""
-    sites = []
+    descriptions = []
     for name, estimates in zip(scenario.names, _count_estimates(scenario), strict=True):
         joints = scenario.layout(name).joints
-        numbers = f"{count_nouns(joints, 'joint')}, {count_nouns(estimates, 'estimate')}"
-        sites.append(f"{name} ({numbers})")
-    first = scenario.names[0]
-    examples = ", ".join(f"{first}.{number}" for number in ("q1", "qd1", "theta1", "q"))
-    sites_text = ", ".join(sites)
+        counts = f"{count_nouns(joints, 'joint')}, {count_nouns(estimates, 'estimate')}"
+        descriptions.append(f"{name} ({counts})")
+    first_site = scenario.names[0]
+    examples = ", ".join(
+        f"{first_site}.{variable}" for variable in ("q1", "qd1", "theta1", "q")
+    )
+    all_descriptions = ", ".join(descriptions)
     return (
         f"--push {target}: there is no such number; name a number as in {examples}, or q; "
-        f"the sites are {sites_text}"
+        f"the sites are {all_descriptions}"
     )
 
 
@@ -377,39 +380,64 @@ def _run_twins(
     inputs: RunInputs | None = None,
     log: Log | None = None,
 ) -> Twins:
-    """Executes a run and its twins, side by side in lanes if possible, else one by one.
+    """Executes a run and its twins, the copies that start slightly displaced.
+
+    If possible, all of them are computed side by side with vector instructions (each in a
+    lane). Otherwise they are executed one after another, with the same results.
 
     Args:
         scenario: The scenario.
         pushes: Push of each twin.
-        ticks: Number of ticks of each site.
+        ticks: Number of ticks (control periods) of each site (arm controller).
         inputs: Inputs of a recorded run that is repeated. None for a new run.
         log: Log of the recorded run, with which the repeated run is compared.
     """
-    # A single run must not load the code of lanes.
+    # Imported late, so that programs that need no twins do not load this code.
     from .lanes.twin_lanes import LaneEndedError, suits_twins
 
     run = FusedRun(scenario, inputs=inputs)
     has_changes = inputs is not None and bool(inputs.changes)
-    is_even = len(set(ticks)) == 1
-    count = 1 + len(pushes)
-    if is_even and not has_changes and suits_twins(run, count, ticks[0], LANE_SITE_TICKS):
+    has_equal_ticks = len(set(ticks)) == 1
+    run_count = 1 + len(pushes)
+    if (
+        has_equal_ticks
+        and not has_changes
+        and suits_twins(run, run_count, ticks[0], LANE_SITE_TICKS)
+    ):
         # If an arm leaves its limits, all runs are executed again, one by one.
         with suppress(LaneEndedError):
             return _LaneTwinRuns(scenario, pushes, ticks, inputs, log).run()
     return _TwinRuns(scenario, pushes, ticks, inputs, log).run()
 
 
-class _TwinRuns:
-    """A run and its twins, executed side by side.
+class _SiteVelocities(NamedTuple):
+    """Joint velocities of one site in a window of a run, divided into intervals of 50 ms.
 
-    The run is divided into windows. At the end of each window, the differences of the twins are
-    scaled down or pushed again if necessary.
+    Attributes:
+        cells: Index by which an array with a row per interval and a column per joint of all
+            sites (arm controllers) returns the intervals and joints of this site.
+        starts: Index of the first tick (control period) of each interval.
+        qd: Velocities of the run, in rad/s, with a row per tick and a column per joint.
+        twin_qd: Velocities of the displaced copy of the run (twin), in the same form.
+    """
+
+    cells: tuple[Ints, ...]
+    starts: Ints
+    qd: Array
+    twin_qd: Array
+
+
+class _TwinRuns:
+    """Executes a run together with its twins, the copies that are slightly displaced (pushed).
+
+    The run is divided into windows of time. At the end of each window, the difference between a
+    twin and the run is scaled down if it has become large, and the twin is pushed again if the
+    difference has decayed.
 
     Args:
         scenario: The scenario.
         pushes: Push of each twin.
-        ticks: Number of ticks of each site.
+        ticks: Number of ticks (control periods) of each site (arm controller).
         inputs: Inputs of a recorded run that is repeated. None for a new run.
         log: Log of the recorded run, with which the repeated run is compared.
     """
@@ -430,21 +458,23 @@ class _TwinRuns:
         durations_s = [count / rate_hz for count, rate_hz in zip(ticks, rates_hz, strict=True)]
         self._ends_s = _plan_windows(max(durations_s), pushes)
         longest_window_s = float(np.diff(self._ends_s, prepend=0.0).max())
-        keep = math.ceil(longest_window_s * max(rates_hz)) + 2
-        runs = self._make_runs(scenario, ticks, inputs, keep)
+        # The records of a whole window, with a margin for rounding.
+        record_count = math.ceil(longest_window_s * max(rates_hz)) + 2
+        runs = self._make_runs(scenario, ticks, inputs, record_count)
         self._run = runs[0]
         self._twins = runs[1:]
 
-        twins = len(pushes)
-        buckets = math.ceil(self._ends_s[-1] * BUCKETS_PER_S) + 1
-        joints = len(self._joints)
+        twin_count = len(pushes)
+        bucket_count = math.ceil(self._ends_s[-1] * BUCKETS_PER_S) + 1
+        joint_count = len(self._joints)
+
         # Arrays of the paths of all twins, see `TwinPath`. A bucket is an interval of 50 ms.
-        self._largest = np.full((twins, buckets, joints), -np.inf)
-        self._last = np.zeros((twins, buckets, joints))
-        self._scales = np.zeros((twins, buckets))
+        self._largest = np.full((twin_count, bucket_count, joint_count), -np.inf)
+        self._last = np.zeros((twin_count, bucket_count, joint_count))
+        self._scales = np.zeros((twin_count, bucket_count))
         # Present scale of each twin.
-        self._scale = np.zeros(twins)
-        self._speed = np.zeros((buckets, joints))
+        self._scale = np.zeros(twin_count)
+        self._speed = np.zeros((bucket_count, joint_count))
         self._pushed: list[list[int]] = [[] for _ in pushes]
         self._died: list[int | None] = [None for _ in pushes]
         self._same = True
@@ -454,47 +484,52 @@ class _TwinRuns:
         scenario: Scenario,
         ticks: Sequence[int],
         inputs: RunInputs | None,
-        keep: int,
+        record_count: int,
     ) -> list[Any]:
-        """Returns the run and its twins, before their first tick.
+        """Returns the run and its twins, before their first tick (control period).
 
         Args:
             scenario: The scenario.
-            ticks: Number of ticks of each site.
+            ticks: Number of ticks of each site (arm controller).
             inputs: Inputs of a recorded run that is repeated, or None.
-            keep: Number of records of each site that must be kept.
+            record_count: Number of records of each site that must be kept.
         """
-        count = 1 + len(self._pushes)
-        runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(count)]
+        run_count = 1 + len(self._pushes)
+        runs = [FusedRun(scenario, keep=record_count, inputs=inputs) for _ in range(run_count)]
         for run in runs:
             run.plan(ticks)
         return runs
 
     def run(self) -> Twins:
         """Simulates a run and its repetitions with a push, and returns the differences."""
-        for n, push in enumerate(self._pushes):
+        for twin_index, push in enumerate(self._pushes):
             if push.at_s == 0.0:
-                self._push(n, 0.0)
+                self._push(twin_index, 0.0)
+        # The logarithm of a difference of 0 is -inf, which is no error.
         with np.errstate(divide="ignore", invalid="ignore"):
             for end_s in self._ends_s.tolist():
                 self._execute_window(end_s)
+
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
         paths = []
-        for n, push in enumerate(self._pushes):
+        for twin_index, push in enumerate(self._pushes):
             path = TwinPath(
                 push=push,
                 t_s=t_s,
-                largest=self._largest[n],
-                last=self._last[n],
-                scale=self._scales[n],
-                pushed=tuple(self._pushed[n]),
-                died=self._died[n],
+                largest=self._largest[twin_index],
+                last=self._last[twin_index],
+                scale=self._scales[twin_index],
+                pushed=tuple(self._pushed[twin_index]),
+                died=self._died[twin_index],
             )
             paths.append(path)
         return Twins(paths, self._joints, self._speed, self._same)
 
     def _execute_window(self, end_s: float) -> None:
         """Executes the run and its twins to the end of a window, and measures the differences.
+
+        A twin that has not been pushed yet equals the run. Therefore it is not executed, but
+        copied from the run when its push is due.
 
         Args:
             end_s: End of the window, in s.
@@ -505,49 +540,60 @@ class _TwinRuns:
         if self._log is not None:
             self._compare_with_log(self._log, records)
         for cells, starts, qd, _ in self._split_buckets(records, records):
-            speed = np.maximum.reduceat(np.abs(qd), starts, axis=0)
-            self._speed[cells] = np.maximum(self._speed[cells], speed)
-        for n, twin in enumerate(self._twins):
-            is_pushed = bool(self._pushed[n])
-            if is_pushed and self._died[n] is None:
+            peak_speeds = np.maximum.reduceat(np.abs(qd), starts, axis=0)
+            self._speed[cells] = np.maximum(self._speed[cells], peak_speeds)
+
+        for twin_index, twin in enumerate(self._twins):
+            is_pushed = bool(self._pushed[twin_index])
+            if is_pushed and self._died[twin_index] is None:
                 twin.step_to(last_ns)
-                self._measure_difference(n, records, twin.pop_records())
+                self._measure_difference(twin_index, records, twin.pop_records())
                 # The state of a user's program cannot be copied or scaled.
                 if not twin.has_programs:
-                    self._renew_difference(n, end_s)
-            elif not is_pushed and self._pushes[n].at_s <= end_s:
+                    self._renew_difference(twin_index, end_s)
+            elif not is_pushed and self._pushes[twin_index].at_s <= end_s:
                 twin.copy_state(self._run)
-                self._push(n, end_s)
+                self._push(twin_index, end_s)
 
-    def _push(self, n: int, at_s: float) -> None:
-        """Displaces the state of a twin.
+    def _push(self, twin_index: int, at_s: float) -> None:
+        """Displaces the state of a twin by its push, and notes the time.
 
         Args:
-            n: Index of the twin.
+            twin_index: Index of the twin.
             at_s: Time of the push, in s.
         """
-        push = self._pushes[n]
-        self._twins[n].displace(push.field, push.by)
-        self._pushed[n].append(round(at_s * BUCKETS_PER_S))
-        self._scale[n] = 0.0
+        push = self._pushes[twin_index]
+        self._twins[twin_index].displace(push.field, push.by)
+        self._pushed[twin_index].append(round(at_s * BUCKETS_PER_S))
+        self._scale[twin_index] = 0.0
 
     def _compare_with_log(self, log: Log, records: Sequence[tuple[Ints, Array]]) -> None:
-        """Refuses a repeated run that differs from its log by more than rounding errors.
+        """Checks that the repeated run equals its log, up to rounding errors.
+
+        Otherwise the twins would tell something about another run than that of the log.
 
         Args:
             log: The log.
-            records: Times and records of each site since the last call.
+            records: Times and records (results of control periods) of each site (arm
+                controller) since the last call.
+
+        Raises:
+            NotRepeatable: A joint angle, velocity or torque differs.
         """
         for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, records, strict=True):
-            part = log[name]
+            site_log = log[name]
             columns = layout.columns()
-            first = int(np.searchsorted(part.t_ns, t_ns[0])) if len(t_ns) else 0
-            window = slice(first, first + len(t_ns))
-            logged = {"q": part.q[window], "qd": part.qd[window], "tau": part.tau[window]}
-            for signal, values in logged.items():
+            first_index = int(np.searchsorted(site_log.t_ns, t_ns[0])) if len(t_ns) else 0
+            window = slice(first_index, first_index + len(t_ns))
+            logged_signals = {
+                "q": site_log.q[window],
+                "qd": site_log.qd[window],
+                "tau": site_log.tau[window],
+            }
+            for signal, values in logged_signals.items():
                 difference = np.abs(rows[:, columns[signal]] - values).max(initial=0.0)
                 self._same &= bool(difference == 0.0)
-                if not difference <= SAME_RUN:
+                if not difference <= SAME_RUN:  # also if the difference is NaN
                     raise NotRepeatable(
                         f"twins cannot be run: in the repeated run, {signal} of {name} differs "
                         f"by {difference:.2g} from the recorded values, so the run could not "
@@ -558,62 +604,67 @@ class _TwinRuns:
         self,
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
-    ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
-        """Yields the velocities of each site in a window, divided into intervals of 50 ms.
+    ) -> Iterator[_SiteVelocities]:
+        """Yields the joint velocities of each site in a window, by intervals of 50 ms.
 
         Args:
-            records: Times and records of each site of the run.
+            records: Times and records (results of control periods) of each site (arm
+                controller) of the run.
             twin_records: Times and records of each site of a twin.
-
-        Yields:
-            The cells of an array of shape (K, J) to which the site belongs, the first row of
-            each interval, and the velocities of the run and of the twin in rad/s, with a row
-            per tick.
         """
-        column = 0
+        first_joint = 0  # index of the site's first joint among the joints of all sites
         sites = zip(self._layouts, records, twin_records, strict=True)
         for layout, (t_ns, rows), (twin_ns, twin_rows) in sites:
-            qd = layout.columns()["qd"]
-            # If one of them diverged, it ends before the other.
-            count = min(len(t_ns), len(twin_ns))
-            if count:
-                buckets = t_ns[:count] * BUCKETS_PER_S // NS_PER_S
-                starts = np.flatnonzero(np.diff(buckets, prepend=-1))
-                columns = np.arange(column, column + layout.joints)
-                cells = np.ix_(buckets[starts], columns)
-                yield cells, starts, rows[:count, qd], twin_rows[:count, qd]
-            column += layout.joints
+            end_joint = first_joint + layout.joints
+            # If the run or the twin diverged, it ends before the other.
+            tick_count = min(len(t_ns), len(twin_ns))
+            if tick_count:
+                intervals = t_ns[:tick_count] * BUCKETS_PER_S // NS_PER_S
+                starts = np.flatnonzero(np.diff(intervals, prepend=-1))
+                velocity_columns = layout.columns()["qd"]
+                yield _SiteVelocities(
+                    cells=np.ix_(intervals[starts], np.arange(first_joint, end_joint)),
+                    starts=starts,
+                    qd=rows[:tick_count, velocity_columns],
+                    twin_qd=twin_rows[:tick_count, velocity_columns],
+                )
+            first_joint = end_joint
 
     def _measure_difference(
         self,
-        n: int,
+        twin_index: int,
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> None:
-        """Adds the course of a twin's difference in one window to its path.
+        """Stores how the difference between a twin and the run developed in one window.
 
-        A window is a part of the run after which the difference may be scaled down.
+        A twin is a copy of the run that was slightly displaced. A window is a part of the run
+        after which the difference may be scaled down. The largest differences are stored as
+        logarithms, as if they had never been scaled down.
 
         Args:
-            n: Index of the twin.
-            records: Times and records of each site of the run.
+            twin_index: Index of the twin.
+            records: Times and records (results of control periods) of each site (arm
+                controller) of the run.
             twin_records: Times and records of each site of the twin.
         """
         for cells, starts, qd, twin_qd in self._split_buckets(records, twin_records):
             difference = twin_qd - qd
-            peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)
-            unscaled = np.log(peaks) + self._scale[n]
-            self._largest[n][cells] = np.maximum(self._largest[n][cells], unscaled)
+            peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)  # per interval
+            log_peaks = np.log(peaks) + self._scale[twin_index]
+            self._largest[twin_index][cells] = np.maximum(
+                self._largest[twin_index][cells], log_peaks
+            )
             ends = np.append(starts[1:], len(difference))
-            self._last[n][cells] = difference[ends - 1]
-            self._scales[n, cells[0].reshape(-1)] = self._scale[n]
+            self._last[twin_index][cells] = difference[ends - 1]
+            self._scales[twin_index, cells[0].reshape(-1)] = self._scale[twin_index]
 
     def _renew_difference(self, n: int, end_s: float) -> None:
         """Keeps the difference between a twin and the run from becoming too large or small.
 
         A twin is a second execution of the run that received a small push. A large difference
-        is scaled down, so that it stays small. A decayed difference consists only of rounding
-        errors; the twin is then pushed again, or ends.
+        is scaled down to the size of the push, so that it stays small. A decayed difference
+        consists only of rounding errors. The twin is then pushed again, or ends.
 
         Args:
             n: Index of the twin.
@@ -621,51 +672,81 @@ class _TwinRuns:
         """
         twin = self._twins[n]
         push = self._pushes[n]
-        bucket = round(end_s * BUCKETS_PER_S)
+        has_decayed = self._find_recent_peak(n, end_s) < math.log(SMALLEST)
+        if has_decayed and push.again:
+            twin.copy_state(self._run)
+            self._push(n, end_s)
+            return
+        if has_decayed and twin.diverged_s is None:
+            self._end_path(n)
+            return
+
+        is_ever_scaled = push.largest < math.inf
+        push_size = float(np.abs(push.by).max())
+        largest_distance = max(push.largest, 10.0 * push_size)
         distance_q = twin.measure_distance(self._run, "q")
         distance_qd = twin.measure_distance(self._run, "qd")
         distance = max(distance_q, distance_qd)
-        size = float(np.abs(push.by).max())
-        largest = max(push.largest, 10.0 * size)
-
-        # Only velocities show a decay, because a twin may come to rest at another position.
-        last_second = self._largest[n, max(0, bucket - BUCKETS_PER_S) : bucket]
-        recent = last_second.max(initial=-np.inf) - self._scale[n]
-        decayed = recent < math.log(SMALLEST)
-        if decayed and push.again:
-            twin.copy_state(self._run)
-            self._push(n, end_s)
-        elif decayed and twin.diverged_s is None:
-            unscaled = self._largest[n].max(axis=1) - self._scales[n]
-            larger = np.flatnonzero(unscaled >= math.log(SMALLEST))
-            died = int(larger[-1]) + 1 if len(larger) else self._pushed[n][0]
-            self._died[n] = died
-            self._largest[n, died:] = -np.inf
-        elif push.largest < math.inf and not distance <= largest:
-            factor = size / distance
+        is_too_large = not distance <= largest_distance  # also if the distance is NaN
+        if is_ever_scaled and is_too_large:
+            factor = push_size / distance
             twin.scale_difference(self._run, factor)
             self._scale[n] -= math.log(factor)
 
+    def _find_recent_peak(self, n: int, end_s: float) -> float:
+        """Returns the logarithm of a twin's largest velocity difference in the last second.
+
+        Positions do not show a decay, because a twin may come to rest at another position.
+
+        Args:
+            n: Index of the twin, a displaced copy of the run.
+            end_s: Present time, in s.
+        """
+        end_interval = round(end_s * BUCKETS_PER_S)
+        first_interval = max(0, end_interval - BUCKETS_PER_S)
+        last_second = self._largest[n, first_interval:end_interval]
+        # `_largest` is independent of the scaling, which is undone here.
+        return float(last_second.max(initial=-np.inf) - self._scale[n])
+
+    def _end_path(self, n: int) -> None:
+        """Notes that a twin's difference from the run has decayed to rounding errors.
+
+        Args:
+            n: Index of the twin, a displaced copy of the run.
+        """
+        actual_peaks = self._largest[n].max(axis=1) - self._scales[n]
+        larger_intervals = np.flatnonzero(actual_peaks >= math.log(SMALLEST))
+        if len(larger_intervals):
+            first_decayed = int(larger_intervals[-1]) + 1
+        else:
+            first_decayed = self._pushed[n][0]
+        self._died[n] = first_decayed
+        self._largest[n, first_decayed:] = -np.inf
+
 
 class _LaneTwinRuns(_TwinRuns):
-    """A run and its twins, side by side in lanes, with the same results as `_TwinRuns`."""
+    """Executes a run and its twins side by side, with the same results as `_TwinRuns`.
+
+    A twin is a copy of the run that was slightly displaced. Each run occupies one lane, an
+    element of the vector registers, so that one instruction computes a number of several runs.
+    """
 
     def _make_runs(
         self,
         scenario: Scenario,
         ticks: Sequence[int],
         inputs: RunInputs | None,
-        keep: int,
+        record_count: int,
     ) -> list[Any]:
-        """Returns the run and its twins, each in a lane."""
+        """Creates the run and its twins (displaced copies), each in a lane of the vectors."""
         from .lanes.twin_lanes import LaneTwin, TwinLanes
 
         run = FusedRun(scenario, inputs=inputs)
-        count = 1 + len(self._pushes)
+        run_count = 1 + len(self._pushes)
         self._lanes = TwinLanes(
-            run, count=count, ticks=ticks[0], feed=run.memory.feed, kept=keep
+            run, count=run_count, ticks=ticks[0], feed=run.memory.feed, kept=record_count
         )
-        return [LaneTwin(self._lanes, lane) for lane in range(count)]
+        return [LaneTwin(self._lanes, lane) for lane in range(run_count)]
 
     def _execute_window(self, end_s: float) -> None:
         """Executes the run and its twins to the end of a window, and measures the differences.
@@ -677,55 +758,63 @@ class _LaneTwinRuns(_TwinRuns):
         lanes.step_to(math.ceil(end_s * NS_PER_S) - 1)
         t_ns = lanes.read_times()
         if self._log is not None:
-            everything = slice(None)
-            run = slice(0, 1)
-            records = [
-                (t_ns, lanes.read_records(i, everything, run)[:, :, 0])
-                for i in range(len(self._layouts))
-            ]
+            all_columns = slice(None)
+            first_run = slice(0, 1)  # the other runs are the twins
+            records = []
+            for i in range(len(self._layouts)):
+                rows = lanes.read_records(i, all_columns, first_run)[:, :, 0]
+                records.append((t_ns, rows))
             self._compare_with_log(self._log, records)
 
-        measured = []
-        for n, pushed in enumerate(self._pushed):
-            if pushed and self._died[n] is None:
-                measured.append(n)
-        self._measure_window(t_ns, measured)
-        for n, push in enumerate(self._pushes):
-            if n in measured:
-                self._renew_difference(n, end_s)
-            elif not self._pushed[n] and push.at_s <= end_s:
-                # A twin without a push has the state of the run.
-                self._push(n, end_s)
+        active_twins = []
+        for twin_index, pushed_at in enumerate(self._pushed):
+            if pushed_at and self._died[twin_index] is None:
+                active_twins.append(twin_index)
+        self._measure_window(t_ns, active_twins)
+
+        for twin_index, push in enumerate(self._pushes):
+            if twin_index in active_twins:
+                self._renew_difference(twin_index, end_s)
+            elif not self._pushed[twin_index] and push.at_s <= end_s:
+                # A twin without a push has the state of the run, so nothing must be copied.
+                self._push(twin_index, end_s)
 
     def _measure_window(self, t_ns: Ints, measured: Sequence[int]) -> None:
-        """Adds the course of the run and of the differences in one window to the paths.
+        """Stores the speeds of the run, and the differences of its twins, in one window.
+
+        A window is a part of the run, which consists of intervals of 50 ms. The twins are
+        displaced copies of the run. `_TwinRuns` computes the same numbers twin by twin.
 
         Args:
-            t_ns: Times of the ticks of the window, ns.
+            t_ns: Times of the ticks (control periods) of the window, ns.
             measured: Indices of the twins that are measured.
         """
         if not len(t_ns):
             return
         twins = np.array(measured, dtype=np.int64)
-        buckets = t_ns * BUCKETS_PER_S // NS_PER_S
-        starts = np.flatnonzero(np.diff(buckets, prepend=-1))
-        rows = buckets[starts]
-        ends = np.append(starts[1:], len(t_ns))
-        runs = slice(0, 1 + len(self._pushes))
-        column = 0
+        intervals = t_ns * BUCKETS_PER_S // NS_PER_S
+        starts = np.flatnonzero(np.diff(intervals, prepend=-1))  # first tick of each interval
+        rows = intervals[starts]
+        last_ticks = np.append(starts[1:], len(t_ns)) - 1
+        all_runs = slice(0, 1 + len(self._pushes))
+        first_joint = 0  # index of the site's first joint among the joints of all sites
         for i, layout in enumerate(self._layouts):
-            qd = self._lanes.read_records(i, layout.columns()["qd"], runs)
-            columns = slice(column, column + layout.joints)
-            column += layout.joints
-            speed = np.maximum.reduceat(np.abs(qd[:, :, 0]), starts, axis=0)
-            self._speed[rows, columns] = np.maximum(self._speed[rows, columns], speed)
+            columns = slice(first_joint, first_joint + layout.joints)
+            first_joint += layout.joints
+            # Shape (ticks, joints, runs). Run 0 is the run itself, the others are the twins.
+            qd = self._lanes.read_records(i, layout.columns()["qd"], all_runs)
+            peak_speeds = np.maximum.reduceat(np.abs(qd[:, :, 0]), starts, axis=0)
+            self._speed[rows, columns] = np.maximum(self._speed[rows, columns], peak_speeds)
+
             difference = qd[:, :, 1 + twins] - qd[:, :, :1]
             peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)
-            unscaled = np.log(peaks) + self._scale[twins]
+            log_peaks = np.log(peaks) + self._scale[twins]
             for position, n in enumerate(measured):
-                known = self._largest[n][rows, columns]
-                self._largest[n][rows, columns] = np.maximum(known, unscaled[:, :, position])
-                self._last[n][rows, columns] = difference[ends - 1, :, position]
+                earlier_peaks = self._largest[n][rows, columns]
+                self._largest[n][rows, columns] = np.maximum(
+                    earlier_peaks, log_peaks[:, :, position]
+                )
+                self._last[n][rows, columns] = difference[last_ticks, :, position]
         for n in measured:
             self._scales[n, rows] = self._scale[n]
 

@@ -72,8 +72,8 @@ class RecordDifference(NamedTuple):
     Only the first field that differs is stated.
 
     Attributes:
-        site: Name of the site whose record it is.
-        tick: Number of the tick.
+        site: Name of the site (arm controller) whose record it is.
+        tick: Number of the tick (control period).
         field: Name of the field. For a vector, it includes the index of the number, for example
             "q[1]".
         logged: Value in the log.
@@ -120,8 +120,8 @@ def describe_law_failure(failure: LawFailed) -> RecordDifference:
     """Describes a user's control law that fails when a log is executed again.
 
     The law did not fail in the logged session. The site with the law (process that runs one
-    arm) cannot be executed further. The report counts the failure as a logged record that the
-    new execution did not reproduce.
+    arm) cannot be executed further. The report counts the failure as a logged record (result of
+    a control period) that the new execution did not reproduce.
 
     Args:
         failure: The error of the control law.
@@ -151,9 +151,9 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
     differs.
 
     Args:
-        logged: Record of a tick, as the log contains it.
+        logged: Record of a tick (control period), as the log contains it.
         computed: Result of executing the same tick again.
-        peers: Names of the other sites, in the order of the scenario.
+        peers: Names of the other sites (arm controllers), in the order of the scenario.
     """
     return (
         _pack_vectors(logged) == _pack_vectors(computed)
@@ -176,9 +176,9 @@ def find_first_difference(
     """Finds the first field in which a record differs from executing its tick again.
 
     Args:
-        logged: Record of a tick, as the log contains it.
+        logged: Record of a tick (control period), as the log contains it.
         computed: Result of executing the same tick again.
-        peers: Names of the other sites, in the order of the scenario.
+        peers: Names of the other sites (arm controllers), in the order of the scenario.
         equal: Function that decides whether two numbers count as equal.
         channel: Layout of the vectors that the site's control law sends, with their names. By
             default, the law sends none.
@@ -250,10 +250,11 @@ def _compare_fields(
 
 @dataclass(slots=True)
 class VerifyResult:
-    """Result of executing the sites of a log again, to check the log.
+    """Result of executing the sites (arm controllers) of a log again, to check the log.
 
-    A record is the stored result of one tick. It is judged by comparing it with the result of
-    executing the tick again. A record after a gap of the log may be impossible to judge.
+    A record is the stored result of one tick (control period). It is judged by comparing it
+    with the result of executing the tick again. A record after a gap of the log may be
+    impossible to judge.
 
     Attributes:
         whole_run: True if whole runs were executed, and bits were compared. False if single
@@ -344,7 +345,7 @@ class VerifyResult:
         self._keep_first(difference)
 
     def _keep_first(self, difference: RecordDifference | None) -> None:
-        """Keeps a difference if it is in the earliest tick so far."""
+        """Stores a difference as the first one, if it is in the earliest tick so far."""
         if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
 
@@ -358,9 +359,9 @@ _MOST_SINGLE_RECORDS = 1 << 12
 class _SiteVerifier:
     """Executes one site again from its records, and compares each record with the result.
 
-    The state of the executed site is certain as long as it follows from the records before. It
-    becomes uncertain at a gap of the log, and if the site uses a sample that the log does not
-    contain. Two consecutive records make it certain again.
+    The state of the executed site (arm controller) is certain as long as it follows from the
+    records before. It becomes uncertain at a gap of the log, and if the site uses a sample that
+    the log does not contain. Two consecutive records make it certain again.
 
     The log does not say which samples arrived during a gap. A sample that no record lists is
     assumed to have arrived there. While a sample with an assumed arrival is in use, a record
@@ -368,8 +369,8 @@ class _SiteVerifier:
     sample that arrived, but whose content is missing from the log.
 
     Most records are plain: their state is certain, and all of their inputs are in the log. A
-    compiled loop executes their ticks. It ends before the first record that differs. This
-    record is then examined like every record that is not plain, by `Site.step`.
+    compiled loop executes their ticks (control periods). It ends before the first record that
+    differs. This record is then examined like every record that is not plain, by `Site.step`.
 
     Args:
         log: The log.
@@ -422,7 +423,7 @@ class _SiteVerifier:
             self._plain_rows = PlainRows(self._log, indexed, samples, resume_every)
         self._states = _list_states(self._log, lazy=self._plain_rows is not None)
         self._inputs = RecordedInputs(
-            part=log[site],
+            site_log=log[site],
             samples=_map_records(log, lazy=self._plain_rows is not None),
             ends=log.last_ticks,
             changes=log.changes(site),
@@ -433,9 +434,10 @@ class _SiteVerifier:
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every recorded tick of a site again, and compares the results with the log.
 
-        A site is a process that runs one arm, and a tick is a period of its control loop. The
-        numbers of equal, different and missing records are added to the `VerifyResult` of this
-        object.
+        A site is a process that runs one arm, and a tick is a period of its control loop. Long
+        sequences of ordinary records (results of control periods) are executed by a compiled
+        loop, and the other records one by one. The numbers of equal, different and missing
+        records are added to the `VerifyResult` of this object.
 
         Args:
             report: Function that is called now and then with the number of examined records of
@@ -449,15 +451,17 @@ class _SiteVerifier:
         if len(self._log):
             next_tick = self._change_start(row, next_tick)
         while row < len(self._log):
-            repeated = self._repeat_plain(row, next_tick)
-            if repeated:
+            identical = self._repeat_plain(row, next_tick)
+            if identical:
                 if report is not None:
                     report(result.records)
-                result.records += repeated
-                result.identical += repeated
-                row += repeated
-                next_tick += repeated
+                result.records += identical
+                result.identical += identical
+                row += identical
+                next_tick += identical
                 continue
+
+            # The compiled loop cannot execute the next tick, or its record differs.
             if report is not None and row % PROGRESS_EVERY == 0:
                 report(result.records)
             next_tick = self._examine_record(row, next_tick)
@@ -468,44 +472,57 @@ class _SiteVerifier:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _repeat_plain(self, row: int, next_tick: int) -> int:
-        """Executes the ticks of plain records by the compiled loop.
+        """Executes the ticks of some ordinary records by the compiled loop, which is faster.
+
+        A record is ordinary (plain) if the state before it is known, and the log contains all
+        of its inputs. The compiled loop ends before the first record that differs.
 
         Args:
-            row: Row of the first record.
+            row: Index of the first record.
             next_tick: Tick whose record is expected next.
 
         Returns:
-            The number of records that are identical to the execution. 0 if the next record is
-            to be examined by itself.
+            The number of records that are identical to the execution. 0 if the next record must
+            be examined by itself.
         """
-        rows = self._plain_rows
-        if rows is None or not self._certain or self._law_failed:
+        plain_rows = self._plain_rows
+        if plain_rows is None or not self._certain or self._law_failed:
             return 0
         if self._single_records:
             self._single_records -= 1
             return 0
-        is_next = int(self._log.tick[row]) == next_tick and rows.read_boot(row) == self._boot
-        count = rows.count_plain(row, self._inputs.next_change_tick) if is_next else 0
-        if count < LEAST_ROWS:
+        is_expected = (
+            int(self._log.tick[row]) == next_tick and plain_rows.read_boot(row) == self._boot
+        )
+        plain_count = (
+            plain_rows.count_plain(row, self._inputs.next_change_tick) if is_expected else 0
+        )
+        if plain_count < LEAST_ROWS:
             return 0
 
         if self._repeater is None:
             self._repeater = TickRepeater(self._site)
-        repeated = rows.repeat(self._repeater, row, count, external=self._external)
-        # Where records differ or calendars must grow again and again, the loop is no gain.
-        if repeated == count:
+        repeated_count = plain_rows.repeat(
+            self._repeater, row, plain_count, external=self._external
+        )
+        # If the loop ends early, because records differ or its memory must grow, the next
+        # records are examined one by one. The number of these records is doubled each time,
+        # because starting the loop again and again would be slower than not using it.
+        if repeated_count == plain_count:
             self._next_single_records = 1
-        elif repeated < _MOST_SINGLE_RECORDS:
+        elif repeated_count < _MOST_SINGLE_RECORDS:
             self._single_records = self._next_single_records
             self._next_single_records = min(2 * self._next_single_records, _MOST_SINGLE_RECORDS)
-        return repeated
+        return repeated_count
 
     def _examine_record(self, row: int, next_tick: int) -> int:
-        """Examines one record, and adds what it finds to the result.
+        """Examines one record: whether it has the expected tick, and equals a new execution.
+
+        Gaps and differences are added to the result.
 
         Args:
-            row: Row of the record.
-            next_tick: Tick whose record is expected next.
+            row: Index of the record.
+            next_tick: Tick (control period) whose record is expected next.
 
         Returns:
             Tick whose record is expected after this one.
@@ -579,7 +596,7 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _can_resume(self, row: int) -> bool:
-        """True if the records before a row suffice to restore the state of the site."""
+        """True if the records before a given one suffice to restore the state of the site."""
         if self._law_failed or row - 2 < self._start_row:
             return False
         return self._inputs.can_resume(row, detached=self._detached)
@@ -641,10 +658,11 @@ class _SiteVerifier:
         self._repeater = None
 
     def _replace_site(self, row: int, state: State) -> None:
-        """Replaces the executed site by a new one, whose state is still to be restored.
+        """Replaces the simulated site by a new one, to find control laws with hidden state.
 
-        A law must keep all its state in its `memory`, which the records contain. Other state is
-        lost by the replacement. Therefore the following records differ and the fault is found.
+        A control law must keep all its state in its `memory`, which the records contain. Any
+        other state is lost by the replacement, so that the following records differ and the
+        fault is found.
 
         This method only marks the state as uncertain. The caller then restores it from the two
         records before the next one, as after a gap of the log. Nothing happens if the state is
@@ -667,15 +685,17 @@ class _SiteVerifier:
     def _make_difference(
         self, state: State, field: str, logged: Any, computed: Any
     ) -> RecordDifference:
-        """Returns a difference of a field of a record."""
+        """Describes the difference between a field of a record and its computed value."""
         return RecordDifference(
             site=state.site, tick=state.tick, field=field, logged=logged, computed=computed
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Returns the difference if a record belongs to another start or site.
+        """Reports a record that does not come from the process that is executed again.
 
-        None if it does not.
+        Returns:
+            The difference, if the record (result of a control period) states another start of
+            the process (boot) or another site. None otherwise.
         """
         name = self._log.name
         if state.boot != self._boot:
@@ -746,14 +766,15 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick that have not been executed yet.
+        """Returns the changes up to a tick (control period) that have not been executed yet.
 
         A change is a new model of a link, or new dominance factors (how strongly the site
-        follows its peers), or an order to the site. The log contains its text. An invalid text
-        proves that the log is not that of a real run, so the difference is reported.
+        follows its peers), or a command to the site (arm controller), such as a stop. The log
+        contains its text. An invalid text proves that the log is not that of a real run, so the
+        difference is reported.
 
-        At most `MAX_RAMPS` changes can wait at a site; more are left out. The changes are also
-        stored in `_applied`, so that `_replace_site` can repeat them.
+        At most `MAX_RAMPS` changes can wait at a site. Further ones are left out. The changes
+        are also stored in `_applied`, so that `_replace_site` can repeat them.
 
         Args:
             tick: Last tick whose changes are returned.
@@ -782,10 +803,11 @@ class _SiteVerifier:
     def _check_arrivals(
         self, state: State
     ) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
-        """Returns the possible arrivals of a record.
+        """Checks the arrivals of samples that a record lists, and returns the possible ones.
 
-        An arrival is impossible if there is no such peer, or if the peer never executed such a
-        tick.
+        A sample is the state that another site (arm controller), a peer, sends in each tick
+        (control period). An arrival is impossible if there is no such peer, or if the peer
+        never executed such a tick.
 
         Returns:
             The arrivals before the first impossible one, and the difference that reports it.
@@ -872,13 +894,14 @@ def _execute_sites(
 ) -> None:
     """Executes some sites of a log, and adds the counts and differences to a result.
 
-    Sites whose control law may not run are left out.
+    Sites (arm controllers) whose control law may not run are left out.
 
     Args:
         log: The log.
         sites: Names of the sites.
         result: Receives the counts and differences.
-        report: Function that is called now and then with the number of records so far.
+        report: Function that is called now and then with the number of records (results of
+            control periods) so far.
         resume_every: See `verify`.
     """
     # On another platform, each tick is computed from the two records before it.
@@ -886,13 +909,13 @@ def _execute_sites(
     if samples is None:
         _map_records(log, lazy=False)  # raises an error if a record cannot be read
     withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]
-    withheld = [name for law in withheld_laws for name in law.sites if name in sites]
-    result.withheld += withheld
-    for name in withheld:
+    withheld_sites = [name for law in withheld_laws for name in law.sites if name in sites]
+    result.withheld += withheld_sites
+    for name in withheld_sites:
         result.coverage.expected.pop(name, None)
 
     for name in sites:
-        if name in withheld:
+        if name in withheld_sites:
             continue
         verifier = _SiteVerifier(
             log=log, site=name, samples=samples, result=result, resume_every=resume_every
@@ -900,33 +923,40 @@ def _execute_sites(
         verifier.run(report)
 
 
-def _list_states(part: SiteLog, *, lazy: bool) -> Sequence[State]:
+def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
     """Returns the records of a site.
 
     Args:
-        part: Records of the site.
+        site_log: Records of the site.
         lazy: True if only few of them will be accessed.
     """
-    return LazyRecords(part.payloads, part.decode, heavy=True) if lazy else part.states
+    if lazy:
+        return LazyRecords(site_log.payloads, site_log.decode, heavy=True)
+    return site_log.states
 
 
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
-    """Returns the records of all sites of a log, by site and tick.
+    """Returns the records of all sites (arm controllers) of a log, by site and tick.
 
     Args:
         log: The log.
-        lazy: True if only few of them will be accessed.
+        lazy: True if only few records (results of control periods) will be accessed. They are
+            then decoded when they are accessed, and not all of them at once.
     """
     if not lazy:
         return {name: log[name].by_tick for name in log.sites}
     return {
-        name: RecordsByTick(_list_states(part, lazy=True), part.tick)
-        for name, part in log.items()
+        name: RecordsByTick(_list_states(site_log, lazy=True), site_log.tick)
+        for name, site_log in log.items()
     }
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
-    """Adds the first difference between copied records and those of the source log.
+    """Checks that the records of a site in a rerun are copies of those in the source log.
+
+    A rerun executes some sites (arm controllers) of a log again with other settings, and copies
+    the records (results of control periods) of the others. The first difference is added to the
+    result.
 
     Args:
         recorded: Records of the site in the rerun.
@@ -937,7 +967,7 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
         return
     for copied, original in zip_longest(recorded.states, source.states):
         is_pair = copied is not None and original is not None
-        # the rerun may have written records in a newer version
+        # The rerun may have written records in a newer version.
         if is_pair and copied == msgspec.structs.replace(original, v=copied.v):
             continue
         difference = RecordDifference(
@@ -962,10 +992,13 @@ def _open_rerun_source(log: Log) -> Log | None:
     """
     names = log.session.get("rerun_of", "").split()
     digests = log.session.get("rerun_of_sha256", "").split()
-    files = [Path(log.sources[0]).with_name(Path(name).name) for name in names]
-    if not files or len(files) != len(digests) or not all(map(Path.is_file, files)):
+    rerun_path = Path(log.sources[0])
+    files = [rerun_path.with_name(Path(name).name) for name in names]
+    if not files or len(files) != len(digests):
         return None
-    if list(map(digest_file, files)) != digests:
+    if not all(file.is_file() for file in files):
+        return None
+    if [digest_file(file) for file in files] != digests:
         return None
     source = open_log(*files)
     return source if source.sites == log.sites else None

@@ -76,14 +76,15 @@ from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message of a site that is to be written to a log.
+    """One message of a site (arm controller) that is to be written to a log.
 
     Attributes:
         site: Name of the site that sends the message.
         t_ns: Nominal time of the message, in ns after the epoch (the common start time).
             Messages are written in this order.
         sent_ns: Time at which the site sent the message, in ns after the epoch.
-        channel: Channel of the site: "state" for records, "link" for statistics, or "event".
+        channel: Channel of the site: "state" for records (results of control periods), "link"
+            for statistics, or "event".
         sequence: Tick of a record or of statistics, or number of an event.
         payload: Encoded message.
         message: Decoded message.
@@ -101,14 +102,14 @@ class SiteEntry(NamedTuple):
 class SiteChannels:
     """Channels of one site in a log that is being written: records, statistics and events.
 
-    The `make_…` methods convert ticks and messages to entries, and `write` writes an entry to
-    the log. An account for each channel counts the messages, so that the log can state whether
-    any are missing.
+    The `make_…` methods convert ticks (control periods) and messages to entries, and `write`
+    writes an entry to the log. An account for each channel counts the messages, so that the log
+    can state whether any are missing.
 
     Args:
         scenario: Scenario of the log.
         session: Name of the session of the log.
-        site: Name of the site.
+        site: Name of the site (arm controller).
         boot: Number that identifies this start of the site. Every message contains it.
 
     Attributes:
@@ -119,15 +120,15 @@ class SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
-        spec = scenario.sites[site]
+        settings = scenario.sites[site]
         self.peers = scenario.peers(site)
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self.ticks = 0
         self._site = site
         self._boot = boot
-        self._rate_hz = spec.rate_hz
-        self._glides = spec.on_stale.action == "glide"
+        self._rate_hz = settings.rate_hz
+        self._glides = settings.on_stale.action == "glide"
         self._mode = Mode.RUN
         self._event_count = 0
         self._last_ns = 0
@@ -138,10 +139,10 @@ class SiteChannels:
         """Returns the messages of a tick that follow its record: statistics and events.
 
         Args:
-            output: Record of the tick: the stored result.
+            output: Record of the tick (control period): the stored result.
             stats: Statistics of the site's links. None if they are not due in this tick.
-            law_failure: Error of a user's control law that changed the mode of the site. None
-                if there was no error.
+            law_failure: Error of a user's control law that changed the mode of the site (arm
+                controller). None if there was no error.
 
         Returns:
             An entry for the statistics, and an entry for an event if the mode of the site has
@@ -167,13 +168,14 @@ class SiteChannels:
         return self.make_new_event_entry("mode", text, output.t_ns)
 
     def _exclude_skipped_ticks(self, tick: int, cmd: Sequence[str]) -> None:
-        """Tells the accounts that messages of skipped ticks are not missing.
+        """Excludes the ticks that a site skipped from the counts of missing messages.
 
-        A site skips ticks if its loop has fallen behind; a command in the next record says how
-        many.
+        A site (arm controller) skips ticks if its control loop has fallen behind. It publishes
+        nothing for these ticks. The next record (result of a control period) states their
+        number among its commands.
 
         Args:
-            tick: Tick of that record.
+            tick: Tick of the record.
             cmd: Texts of the commands in the record.
         """
         skipped = count_skipped_ticks(cmd)
@@ -218,7 +220,7 @@ class SiteChannels:
         return self.make_event_entry(event, number)
 
     def make_record_entry(self, state: State, payload: bytes) -> SiteEntry:
-        """Returns the record of a tick as a message for the log.
+        """Returns the record of a tick (control period) as a message for the log.
 
         A record in the format of an older version is encoded again in the current format.
 
@@ -227,11 +229,14 @@ class SiteChannels:
             payload: The same record as it was encoded.
         """
         self._exclude_skipped_ticks(state.tick, state.cmd)
+        # Old versions did not store the time of sending.
         sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
+
         if state.v != VERSION:
+            # A record lists only the arrivals, not the contents of the samples.
             arrivals = [
-                Arrival(peer=peer, tick=tick, q=(), qd=(), latency_us=us)
-                for peer, tick, us in state.rx
+                Arrival(peer=peer, tick=tick, q=(), qd=(), latency_us=latency_us)
+                for peer, tick, latency_us in state.rx
             ]
             payload = encode_state(
                 site=state.site,
@@ -257,19 +262,22 @@ class SiteChannels:
     def make_stats_entry(self, stats: LinkStats) -> SiteEntry:
         """Returns statistics of a site's links as a message for the log.
 
+        Statistics in the format of an older version are converted to the present version.
+
         Args:
-            stats: The statistics, for example the numbers of received and lost samples.
+            stats: The statistics, for example the numbers of received and lost samples (sent
+                states).
         """
-        present = stats
+        converted = stats
         if stats.v != VERSION:
-            present = msgspec.structs.replace(stats, v=VERSION)
+            converted = msgspec.structs.replace(stats, v=VERSION)
         return SiteEntry(
             site=self._site,
             t_ns=stats.t_ns,
             sent_ns=stats.t_ns,
             channel=topics.LINK,
             sequence=stats.tick,
-            payload=encode(present),
+            payload=encode(converted),
             message=stats,
         )
 
@@ -282,7 +290,8 @@ class SiteChannels:
             event: The event.
             number: Number of the event. It is used only if the event itself has none.
         """
-        numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=number)
+        has_number = event.n >= 0  # events of the oldest versions have none
+        numbered = event if has_number else msgspec.structs.replace(event, n=number)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
         t_ns = max(event.t_ns, 0)  # a log has no times before the epoch
         return SiteEntry(
@@ -331,7 +340,7 @@ def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
 
 
 class SiteTick(NamedTuple):
-    """One tick of one site in virtual time, after it was executed.
+    """One tick of one site (arm controller) in virtual time, after it was executed.
 
     A tick is one period of the site's control loop.
 
@@ -374,8 +383,8 @@ def check_virtual(scenario: Scenario) -> None:
     real_robots = set(scenario.outside)
     simulated_by_user = set(scenario.external) - real_robots
     refuse_external_arms(scenario, simulated_by_user)
-    for name, spec in scenario.sites.items():
-        if isinstance(spec.control, ImportedLaw):
+    for name, settings in scenario.sites.items():
+        if isinstance(settings.control, ImportedLaw):
             # A site creates its control law, and raises an error if this is not possible. The
             # site itself is not needed.
             Site(scenario.setup(name))
@@ -385,8 +394,8 @@ def _find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
     """Finds the ticks that a site skipped because its control loop was too late.
 
     A site is a process that runs one arm, and a tick is a period of its control loop. The
-    record of the next executed tick states the number of skipped ticks, in the form of a
-    change.
+    record (result of a control period) of the next executed tick states the number of skipped
+    ticks, in the form of a change.
 
     Args:
         commands: For each tick, the changes that the site applied before it.
@@ -395,12 +404,12 @@ def _find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
         A mapping from the first skipped tick of each range to the first tick after the range.
         Empty if no tick was skipped.
     """
-    next_ticks = {}
+    end_ticks = {}
     for tick, changes in commands.items():
         for change in changes:
             if change.skipped:
-                next_ticks[tick - change.skipped] = tick
-    return next_ticks
+                end_ticks[tick - change.skipped] = tick
+    return end_ticks
 
 
 def execute_virtual(
@@ -484,7 +493,11 @@ def execute_virtual(
 def _find_ready(
     pending: Sequence[tuple[int, int, int]], sites: Sequence[Site], network: Network
 ) -> int:
-    """Returns the position in `pending` of the first site that can execute its next tick.
+    """Selects the site that executes the next tick of a simulation.
+
+    A site, the simulated process of one arm, can execute its next tick (period of the control
+    loop) as soon as the samples (sent states) that it needs are in the simulated network. Of
+    the sites that are ready, the one with the earliest tick is selected.
 
     Args:
         pending: Next tick of each site, as (time in ns, index of the site, tick), in order of
@@ -493,7 +506,7 @@ def _find_ready(
         network: Network between the sites.
 
     Returns:
-        The position. 0 if no site is ready, so that the run always goes on.
+        The position in `pending`. 0 if no site is ready, so that the run always continues.
     """
     for position, (_, index, k) in enumerate(pending):
         if network.is_ready(sites[index].name, k):
@@ -547,8 +560,9 @@ class _VirtualChannels(SiteChannels):
         self._writer.add(
             self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output
         )
-        due = self._stats.is_due(output.tick, count_skipped_ticks(output.cmd))
-        stats = self._stats.pop_stats(output) if due else None
+
+        are_stats_due = self._stats.is_due(output.tick, count_skipped_ticks(output.cmd))
+        stats = self._stats.pop_stats(output) if are_stats_due else None
         law_failure = self._executed_site.law_failure
         for entry in self.make_tick_entries(output, stats, law_failure):
             self.write(entry, self._writer)
@@ -675,7 +689,8 @@ def record_virtual(
         scenario: Description of the experiment, with its sites and links.
         path: File to which the log is written.
         force: If True, an existing file is replaced.
-        stopped: Function that is called after each tick. The run ends if it returns True.
+        stopped: Function that is called after each tick (control period). The run ends if it
+            returns True.
         views_hz: Rate of the additional channels for viewers, in Hz.
         hands: Actions of live operators, see `execute_virtual`.
         policies: Sites whose live operator is a trained program. An event of each says so.
@@ -747,7 +762,7 @@ def simulate_scenario(
 ) -> SimulatedLog:
     """Simulates an experiment in virtual time, and returns the log of the run.
 
-    In virtual time, all sites run in this process, as fast as possible.
+    In virtual time, all sites (arm controllers) run in this process, as fast as possible.
 
     Args:
         scenario: Description of the experiment.

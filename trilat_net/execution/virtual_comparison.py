@@ -45,7 +45,7 @@ class RecordComparison(NamedTuple):
 
     Attributes:
         records: Number of records that were compared. A record is the stored result of one
-            tick.
+            tick (control period).
         identical: Number of records in which all computed fields have the same bits.
         first: Difference in the earliest tick. None if all records are identical.
     """
@@ -58,9 +58,9 @@ class RecordComparison(NamedTuple):
 class _LateSample(NamedTuple):
     """Sample that had not arrived at its receiver when it should have come into use.
 
-    A sample is the state that a site publishes in one tick. It is due after the delay that the
-    scenario states for the link. Samples that are lost according to the scenario are never due,
-    and do not count.
+    A sample is the state that a site (arm controller) publishes in one tick (control period).
+    It is due after the delay that the scenario states for the link. Samples that are lost
+    according to the scenario are never due, and do not count.
 
     Attributes:
         site: Name of the receiver.
@@ -93,8 +93,8 @@ def _compare_records(
 
     Args:
         log: Log whose records are compared.
-        executed: Results of the other execution in any order, each with the name of the site.
-            Ticks that the log does not contain are skipped.
+        executed: Results of the other execution in any order, each with the name of the site
+            (arm controller). Ticks (control periods) that the log does not contain are skipped.
         arrivals: If True, the same samples must have arrived in each tick as well. Their
             checksums are compared.
     """
@@ -128,9 +128,9 @@ def find_absent_samples(log: Log) -> list[_LateSample]:
     A sample is the state that a site (process that runs one arm) sends in one tick (period of
     its control loop). It is due at its receiver after the delay that the scenario describes.
 
-    If records of the receiver are missing, the log does not show whether a sample was lost or
-    arrived in these ticks. The sample counts as lost if the receiver still uses an older sample
-    in the first recorded tick from the due tick on.
+    If records (results of control periods) of the receiver are missing, the log does not show
+    whether a sample was lost or arrived in these ticks. The sample counts as lost if the
+    receiver still uses an older sample in the first recorded tick from the due tick on.
 
     Args:
         log: Log of a live session.
@@ -145,32 +145,38 @@ def find_absent_samples(log: Log) -> list[_LateSample]:
 
 
 def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
-    """Returns the samples that had not arrived at one site when they were due.
+    """Finds the samples that had not arrived at one site when they were due.
+
+    A sample is the state that another site (peer) sent in one tick. It is due after the delay
+    that the scenario prescribes for the link.
 
     Args:
         log: Log of a live session.
         name: Name of the receiver.
     """
-    part = log[name]
+    site_log = log[name]
     commands = log.commands(name)
-    peer_ticks = [log.scenario.ticks(peer) for peer in part.peers]
-    _, arrivals = part.arrivals
-    arrived = [
-        set(arrivals[arrivals[:, 0] == peer, 1].tolist()) for peer in range(len(part.peers))
-    ]
-    # only the links of the site are used, so its law is left out
+    peer_ticks = [log.scenario.ticks(peer) for peer in site_log.peers]
+    _, arrivals = site_log.arrivals
+    arrived_ticks = []  # for each peer, the ticks of all samples that ever arrived
+    for peer in range(len(site_log.peers)):
+        is_from_peer = arrivals[:, 0] == peer
+        arrived_ticks.append(set(arrivals[is_from_peer, 1].tolist()))
+    # Only the links of the site are used, so its control law is left out.
     site = Site(log.scenario.setup(name)._replace(law_factory=None))
-    checked = [0] * len(part.peers)  # for each peer, the number of samples examined so far
+    examined_counts = [0] * len(
+        site_log.peers
+    )  # for each peer, the number of samples examined so far
     absent = []
-    for state in part.states:
+    for state in site_log.states:
         for command in commands.get(state.tick, ()):
             site.apply_change(command, state.t_ns)
 
-        # samples that arrived in this tick, but were due earlier
+        # Samples that arrived in this tick, but were due earlier.
         for peer, tick, _ in state.rx:
-            # a damaged record may list any peer and tick
-            exists = 0 <= peer < len(peer_ticks) and 0 <= tick < peer_ticks[peer]
-            due_tick = site.release_tick(peer, tick) if exists else None
+            # A damaged record may list any peer and tick.
+            is_possible = 0 <= peer < len(peer_ticks) and 0 <= tick < peer_ticks[peer]
+            due_tick = site.release_tick(peer, tick) if is_possible else None
             if due_tick is None or due_tick >= state.tick or site.is_measured(peer):
                 continue
             absent.append(
@@ -183,15 +189,15 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
                 )
             )
 
-        # samples that were sent before this tick and never arrived
-        for peer, sender in enumerate(part.peers):
+        # Samples that were sent before this tick and never arrived.
+        for peer, sender in enumerate(site_log.peers):
             newest = state.t_ns * site.peer_rate_hz(peer) // NS_PER_S
             sent = min(newest, log.last_ticks[sender]) + 1
-            for tick in range(checked[peer], sent):
-                if tick in arrived[peer] or site.is_measured(peer):
+            for tick in range(examined_counts[peer], sent):
+                if tick in arrived_ticks[peer] or site.is_measured(peer):
                     continue
                 due_tick = site.release_tick(peer, tick)
-                if due_tick is None or not _uses_older(part, sender, tick, due_tick):
+                if due_tick is None or not _uses_older(site_log, sender, tick, due_tick):
                     continue
                 absent.append(
                     _LateSample(
@@ -202,14 +208,23 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
                         arrived_tick=None,
                     )
                 )
-            checked[peer] = max(checked[peer], sent)
+            examined_counts[peer] = max(examined_counts[peer], sent)
     return absent
 
 
-def _uses_older(part: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if the first record from `due_tick` on uses a sample that is older than `tick`."""
-    row = int(np.searchsorted(part.tick, due_tick))
-    return bool((part.used[sender][row : row + 1] < tick).any())
+def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
+    """True if a receiver still used an older sample when a given sample was due.
+
+    Args:
+        site_log: Records of the receiver.
+        sender: Name of the site (arm controller) that sent the sample, its state in one tick
+            (control period).
+        tick: Tick in which the sample was sent.
+        due_tick: Tick of the receiver in which the sample was due. If it has no record, the
+            next record is examined.
+    """
+    row = int(np.searchsorted(site_log.tick, due_tick))
+    return bool((site_log.used[sender][row : row + 1] < tick).any())
 
 
 class _VirtualComparison(NamedTuple):
@@ -221,13 +236,13 @@ class _VirtualComparison(NamedTuple):
 
     Attributes:
         fed: Comparison with a simulation in which each sample arrives when it arrived in the
-            session. All records must be equal.
+            session. All records (results of control periods) must be equal.
         plain: Comparison with a simulation of a perfect network, in which samples arrive at
             once. The records must be equal up to the first late or lost sample. If an arm is
             external, no records are compared, because its motion is known only for the recorded
             run.
-        absent: Samples that arrived too late or never, by the tick in which they should have
-            been there.
+        absent: Samples that arrived too late or never, by the tick (control period) in which
+            they should have been there.
     """
 
     fed: RecordComparison
@@ -296,12 +311,12 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
             control loop) is executed when its record is read.
 
             Args:
-                network: Network that delivers the samples. None for one in which they arrive at
-                    once.
+                network: Network that delivers the samples (sent states). None for one in which
+                    they arrive at once.
                 ticks_before: Number of ticks of earlier simulations, for the progress.
 
             Yields:
-                Name of the site, and record of the tick.
+                Name of the site (arm controller), and record of the tick.
             """
             ticks = virtual.execute_virtual(
                 scenario=scenario,
@@ -330,12 +345,12 @@ def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
 
     Arrivals in gaps of the log are assumed, unless too many records are missing.
     """
-    part = log[name]
-    rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
-    ends = [log.last_ticks[peer] for peer in part.peers]
+    site_log = log[name]
+    rates_hz = [log.scenario.sites[peer].rate_hz for peer in site_log.peers]
+    ends = [log.last_ticks[peer] for peer in site_log.peers]
     with suppress(LogError):
-        return complete_deliveries(part, rates_hz, ends).entries
-    return read_deliveries(part).entries
+        return complete_deliveries(site_log, rates_hz, ends).entries
+    return read_deliveries(site_log).entries
 
 
 def _cut_to_records(log: Log) -> Scenario:

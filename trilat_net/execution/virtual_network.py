@@ -34,9 +34,9 @@ from .resumption import ArrivalEntry, make_arrival
 class Network(Protocol):
     """Interface of a network between the sites of a simulation in virtual time.
 
-    A network decides in which tick of the receiver a sample arrives. A sample is the state that
-    a site publishes in one tick. The simulation calls `send` after each tick of a site, and
-    `deliver` before each one.
+    A network decides in which tick (control period) of the receiver a sample arrives. A sample
+    is the state that a site (arm controller) publishes in one tick. The simulation calls `send`
+    after each tick of a site, and `deliver` before each one.
     """
 
     def send(self, sender: str, output: TickRecord) -> None:
@@ -73,8 +73,8 @@ class Network(Protocol):
 class PromptNetwork:
     """Network without any delay of its own.
 
-    Each sample arrives in the receiver's first tick after it was sent. The delays that a
-    scenario states are applied later, by the receiver.
+    Each sample arrives in the receiver's first tick (control period) after it was sent. The
+    delays that a scenario states are applied later, by the receiver.
 
     Args:
         rates: Tick rate of each site, in Hz, by name.
@@ -113,13 +113,13 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Network in which samples arrive in the same ticks as in a log.
+    """Network in which samples arrive in the same ticks (control periods) as in a log.
 
     Only the times come from the log. The content of a sample is that of the running sender,
     which may differ from the log if settings were changed.
 
     Args:
-        schedule: Arrivals at each site, by tick of the receiver.
+        schedule: Arrivals at each site (arm controller), by tick of the receiver.
         peers: For each site, the names of the other sites in the order of the scenario.
     """
 
@@ -142,10 +142,10 @@ class RecordedNetwork:
     def is_ready(self, receiver: str, k: int) -> bool:
         """True if all samples that the log lists for tick `k` of a receiver have been sent.
 
-        In a live session, a site whose loop ran late may have received samples with later times
-        than that of its own tick. The senders of such samples must run first. Meanwhile this
-        method is called repeatedly. Each call continues with the first sample that had not been
-        sent when the last call ended.
+        In a live session, a site (arm controller) whose loop ran late may have received samples
+        with later times than that of its own tick (control period). The senders of such samples
+        must run first. Meanwhile this method is called repeatedly. Each call continues with the
+        first sample that had not been sent when the last call ended.
 
         Args:
             receiver: Name of the receiving site.
@@ -166,9 +166,9 @@ class RecordedNetwork:
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """Returns the samples that, according to the log, arrive in tick `k` of a receiver.
 
-        A sample that its sender has not produced does not arrive. After a gap in the log, more
-        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`). Then only the
-        newest are returned.
+        A sample (sent state) that its sender has not produced does not arrive. After a gap in
+        the log, more samples may be assumed to arrive than a tick (control period) accepts
+        (`MAX_ARRIVALS`). Then only the newest are returned.
         """
         peers = self._peers[receiver]
         arrivals = []
@@ -199,22 +199,22 @@ class Deliveries(NamedTuple):
     last: int
 
 
-def read_deliveries(part: SiteLog) -> Deliveries:
-    """Reads from the records of a site which samples arrived in each tick.
+def read_deliveries(site_log: SiteLog) -> Deliveries:
+    """Reads from the records of a site (arm controller) which samples arrived in each tick.
 
-    Ticks without a record are left out; `complete_deliveries` fills them in.
+    Ticks (control periods) without a record are left out; `complete_deliveries` fills them in.
 
     Args:
-        part: Records of the site, each of which lists the samples that arrived in its tick.
+        site_log: Records of the site, each of which lists the samples that arrived in its tick.
     """
-    counts, rows = part.arrivals
+    counts, rows = site_log.arrivals
     arrivals = rows.tolist()
     entries: dict[int, Sequence[ArrivalEntry]] = {}
     start = 0
-    for tick, stop in zip(part.tick.tolist(), np.cumsum(counts).tolist(), strict=True):
-        # a damaged record may list a peer that the site does not have
+    for tick, stop in zip(site_log.tick.tolist(), np.cumsum(counts).tolist(), strict=True):
+        # A damaged record may list a peer that the site does not have.
         entries[tick] = [
-            entry for entry in arrivals[start:stop] if 0 <= entry[0] < len(part.peers)
+            entry for entry in arrivals[start:stop] if 0 <= entry[0] < len(site_log.peers)
         ]
         start = stop
     return Deliveries(
@@ -226,7 +226,7 @@ def read_deliveries(part: SiteLog) -> Deliveries:
 
 
 def complete_deliveries(
-    part: SiteLog, rates_hz: Sequence[int], ends: Sequence[int]
+    site_log: SiteLog, rates_hz: Sequence[int], last_ticks: Sequence[int]
 ) -> Deliveries:
     """Returns the arrivals at a site for every tick from its first record to its last one.
 
@@ -238,32 +238,32 @@ def complete_deliveries(
     delay of the link.
 
     Args:
-        part: Records of the site, each of which lists the samples that arrived in its tick.
+        site_log: Records of the site, each of which lists the samples that arrived in its tick.
         rates_hz: Tick rates of the sites that send samples to it (its peers), in Hz.
-        ends: Last tick of each peer, in the same order.
+        last_ticks: Last tick of each peer, in the same order.
 
     Raises:
         LogError: Fewer than half of the ticks have a record.
     """
-    recorded = read_deliveries(part)
-    ticks = recorded.last + 1 - recorded.first
-    if len(recorded.entries) == ticks:
+    recorded = read_deliveries(site_log)
+    tick_count = recorded.last + 1 - recorded.first
+    if len(recorded.entries) == tick_count:
         return recorded
-    if 2 * len(recorded.entries) < ticks:
+    if 2 * len(recorded.entries) < tick_count:
         raise LogError(
-            f"{part.name} has records of only {len(recorded.entries)} of "
-            f"{count_nouns(ticks, 'tick')}: too few to execute the ticks between them"
+            f"{site_log.name} has records of only {len(recorded.entries)} of "
+            f"{count_nouns(tick_count, 'tick')}: too few to execute the ticks between them"
         )
 
     unrecorded = [
         tick for tick in range(recorded.first, recorded.last) if tick not in recorded.entries
     ]
     assumed: dict[int, list[list[int]]] = {}
-    for peer, (peer_hz, end) in enumerate(zip(rates_hz, ends, strict=True)):
+    for peer, (peer_hz, end) in enumerate(zip(rates_hz, last_ticks, strict=True)):
         arrivals = _assume_arrivals(
             recorded=recorded,
             unrecorded=unrecorded,
-            rate_hz=part.rate_hz,
+            rate_hz=site_log.rate_hz,
             peer=peer,
             peer_hz=peer_hz,
             end=end,
@@ -278,15 +278,15 @@ def complete_deliveries(
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns when each sample of a peer arrived for the first time.
+    """Returns when each sample (sent state) of a peer arrived for the first time.
 
     Args:
         deliveries: Arrivals at the receiver.
         peer: Index of the sender among the receiver's peers.
 
     Returns:
-        For the tick of each sample, the tick of its first arrival and its latency in
-        microseconds.
+        For the tick (control period) of each sample, the tick of its first arrival and its
+        latency in microseconds.
     """
     first_arrivals: dict[int, tuple[int, int]] = {}
     for k in sorted(deliveries.entries):
@@ -389,17 +389,18 @@ def retime_deliveries(
     entries: dict[int, list[ArrivalEntry]] = {}
     for peer, (old_hz, new_hz) in enumerate(zip(rates_hz, new_rates_hz, strict=True)):
         first_arrivals = _find_first_arrivals(deliveries, peer)
-        for sample in range(end_ns * new_hz // NS_PER_S + 1):
-            stamp_ns = sample * NS_PER_S // new_hz
-            # the last sample m of the log with the stamp m * NS_PER_S // old_hz <= stamp_ns
-            model = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
-            if model not in first_arrivals:
+        for sample_tick in range(end_ns * new_hz // NS_PER_S + 1):
+            stamp_ns = sample_tick * NS_PER_S // new_hz
+            # The last sample m of the log with the stamp m * NS_PER_S // old_hz <= stamp_ns.
+            model_tick = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
+            if model_tick not in first_arrivals:
                 continue
-            arrival_tick, latency_us = first_arrivals[model]
+            arrival_tick, latency_us = first_arrivals[model_tick]
             arrival_ns = arrival_tick * NS_PER_S // rate_hz
-            lag_ns = arrival_ns - model * NS_PER_S // old_hz
-            tick = _round_up_to_tick(stamp_ns + lag_ns, new_rate_hz)
-            entries.setdefault(tick, []).append((peer, sample, latency_us))
+            model_stamp_ns = model_tick * NS_PER_S // old_hz
+            lag_ns = arrival_ns - model_stamp_ns
+            new_arrival_tick = _round_up_to_tick(stamp_ns + lag_ns, new_rate_hz)
+            entries.setdefault(new_arrival_tick, []).append((peer, sample_tick, latency_us))
     return Deliveries(
         entries=dict(entries),
         unrecorded=frozenset(),

@@ -78,11 +78,11 @@ class LogAndRerun(NamedTuple):
 
 
 class SiteEffect(NamedTuple):
-    """Difference that a rerun makes to one site, compared with the log.
+    """Difference that a rerun makes to one site (arm controller), compared with the log.
 
     A rerun executes sites of a log again, usually with changed settings. The figures are taken
-    over those ticks of which both the log and the rerun have a record. They are None if there
-    is no such tick.
+    over those ticks of which both the log and the rerun have a record (result of a control
+    period). They are None if there is no such tick.
 
     Attributes:
         site: Name of the site.
@@ -129,8 +129,9 @@ class SiteEffect(NamedTuple):
 class LinkEffect(NamedTuple):
     """Difference that a rerun makes to one link: how old the samples are when they are used.
 
-    A link is the directed connection from one site to another. Ages are taken over those ticks
-    in which the receiver uses a sample both in the log and in the rerun.
+    A link is the directed connection from one site (arm controller) to another. Ages are taken
+    over those ticks (control periods) in which the receiver uses a sample both in the log and
+    in the rerun.
 
     Attributes:
         link: Name of the link, for example "m1->s".
@@ -153,10 +154,10 @@ class LinkEffect(NamedTuple):
 
 
 class _CommonRecords(NamedTuple):
-    """Records of a site in a log and in its rerun, paired by their times.
+    """Records of a site (arm controller) in a log and in its rerun, paired by their times.
 
-    A rerun may have another tick rate than the log. Only records with equal times can be
-    compared.
+    A rerun may have another tick rate than the log. Only records (results of control periods)
+    with equal times can be compared.
 
     Attributes:
         before: Records of the log.
@@ -244,22 +245,24 @@ def _pair_records(
 
     Args:
         log: The log.
-        request: Sites and settings of the rerun.
+        request: Sites (arm controllers) and settings of the rerun.
         name: Name of the site.
-        executed: Executed ticks of the site.
+        executed: Executed ticks (control periods) of the site.
     """
-    before = log[name]
-    after = SiteLog(
+    log_records = log[name]
+    rerun_records = SiteLog(
         name=name,
-        peers=before.peers,
+        peers=log_records.peers,
         rate_hz=request.scenario.sites[name].rate_hz,
         payloads=[tick.payload for tick in executed],
         source="rerun",
         layout=request.scenario.layout(name),
         axes=request.scenario.arms[name].axes,
     )
-    _, before_rows, after_rows = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
-    return _CommonRecords(before, after, before_rows, after_rows)
+    _, before_rows, after_rows = np.intersect1d(
+        log_records.t_ns, rerun_records.t_ns, return_indices=True
+    )
+    return _CommonRecords(log_records, rerun_records, before_rows, after_rows)
 
 
 def _compute_rms(values: Array) -> float:
@@ -284,12 +287,12 @@ def _find_largest(values: Array) -> float:
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[LinkEffect]:
-    """Returns the effect of a rerun on the links over which a site receives.
+    """Returns the effect of a rerun on the links over which a site (arm controller) receives.
 
     Args:
         log: The log.
         request: Sites and settings of the rerun.
-        records: Paired records of the receiver.
+        records: Paired records (results of control periods) of the receiver.
     """
     effects = []
     for peer in records.before.peers:
@@ -311,7 +314,7 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and the result of executing some or all of its sites again.
+    """A log and the result of executing some or all of its sites (arm controllers) again.
 
     The function `rerun` creates it. It can be shown, written as a log of its own, or converted
     to plain values.
@@ -319,7 +322,7 @@ class Rerun(Result):
     Attributes:
         before: The log that was executed again.
         request: Executed sites and changed settings.
-        ticks: Every tick of every executed site, in the order of execution.
+        ticks: Every tick (control period) of every executed site, in the order of execution.
         sites: Effect on each executed site, by the name of the site.
         links: Effect on each link that ends at an executed site, by the name of the link.
     """
@@ -431,14 +434,17 @@ class Rerun(Result):
         """True if the rerun differs from the log although it should have the same bits.
 
         This indicates an error of the program or a damaged log. The bits should be the same
-        under three conditions: the log was made on this platform; no setting was changed; and
-        the log contains everything that its sites received. The last condition fails for a log
-        that is itself a rerun in which some sites were copied from another log.
+        under three conditions:
+
+        - The log was made on this platform.
+        - No setting was changed.
+        - The log contains everything that its sites received. This is not so if the log is
+          itself a rerun in which some sites were copied from another log.
         """
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
-        executable = set(self.request.replaced) <= set(self.before.executed_sites)
-        must_equal = same_platform and executable and not self.request.changes
-        return must_equal and not self.identical
+        are_executable = set(self.request.replaced) <= set(self.before.executed_sites)
+        must_be_equal = same_platform and are_executable and not self.request.changes
+        return must_be_equal and not self.identical
 
     @property
     def notes(self) -> list[str]:
@@ -539,14 +545,16 @@ def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
     Args:
         log: The log that was executed again.
-        request: Executed sites and changed settings of the rerun.
+        request: Executed sites (arm controllers) and changed settings of the rerun.
 
     Returns:
         Texts by key: the source log, the executed sites and the changes.
     """
-    # A log in memory has no file.
-    files = filter(Path.is_file, map(Path, log.sources))
-    digests = {path: digest_file(path) for path in files}
+    digests = {}
+    for source in log.sources:
+        path = Path(source)
+        if path.is_file():  # a log in memory has no file
+            digests[path] = digest_file(path)
     return {
         "rerun_mode": request.mode,
         "rerun_of": " ".join(path.name for path in digests),
@@ -558,17 +566,22 @@ def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields the entries of a site whose records are copied, in the order of time."""
-    part = log[name]
-    events = [event for event in log.events if event.member == name]
-    events.sort(key=lambda event: event.t_ns)  # events before the epoch come first
+    """Yields the messages of a site that a rerun copies from the source log, by time.
+
+    A rerun executes some sites (arm controllers) of a log again. The log of the rerun also
+    contains the records (results of control periods), statistics and events of the sites that
+    were not executed.
+    """
+    site_log = log[name]
+    site_events = [event for event in log.events if event.member == name]
+    site_events.sort(key=lambda event: event.t_ns)  # events before the epoch come first
     record_entries = (
         channels.make_record_entry(state, payload)
-        for state, payload in zip(part.states, part.payloads, strict=True)
+        for state, payload in zip(site_log.states, site_log.payloads, strict=True)
     )
     stats_entries = map(channels.make_stats_entry, log.link_stats(name))
     event_entries = (
-        channels.make_event_entry(event, number) for number, event in enumerate(events)
+        channels.make_event_entry(event, number) for number, event in enumerate(site_events)
     )
     return merge(record_entries, stats_entries, event_entries, key=lambda entry: entry.t_ns)
 

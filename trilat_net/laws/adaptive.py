@@ -13,7 +13,7 @@ where q and qd are positions and velocities of the joints, e is the position min
 filtered error, theta_hat the estimate, and Y the matrix for which Y theta is the torque of the
 arm's dynamics. Lambda, Kp, Kd and Gamma are gains; a prime denotes the transpose.
 
-The compiled control loop computes this law (`core.control.adaptive_torque` and
+The compiled control loop computes this law (`core.step.control.adaptive_torque` and
 `update_estimate`). `Adaptive` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
 """
@@ -139,6 +139,6 @@ class Adaptive(ControlLaw):
 
         Args:
             gains: The tuned gains by name.
-            site: The site whose table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "theta_hat0": site.estimate}

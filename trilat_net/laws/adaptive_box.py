@@ -5,7 +5,7 @@ Without bounds, an estimate may drift as long as the errors are not zero. Here t
 lowest and a highest value for each parameter (together a box), and a projection keeps the
 estimate between them. The torque is computed as in `Adaptive`, by Eq. (13) of the paper.
 
-The compiled control loop computes this law (`core.control.project_estimate`).
+The compiled control loop computes this law (`core.step.control.project_estimate`).
 `AdaptiveBox.advance_estimate` states the projection in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
 """
@@ -96,7 +96,7 @@ class AdaptiveBox(Adaptive):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         They contain the tuned gains, the estimate of the arm's parameters with which the law
@@ -104,7 +104,7 @@ class AdaptiveBox(Adaptive):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         control = Adaptive.write_control(gains, site)
         low, high = site.box

@@ -50,15 +50,15 @@ LEAST_SINE = 0.1
 
 @leaf
 def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
-    """Returns the solution y of J y = b, where J is the Jacobian of the planar arm.
+    """Returns the joint rates that move the end effector of the planar arm at a velocity.
 
-    A stretched elbow makes J singular. Then the sine of the elbow's angle is replaced by
-    `LEAST_SINE`.
+    It is the solution of J rates = b, where J is the Jacobian of the end effector. A stretched
+    elbow makes J singular. Then the sine of the elbow's angle is replaced by `LEAST_SINE`.
 
     Args:
         lengths: Lengths of the two links, m.
         q: Joint angles, rad.
-        b: The right-hand side, along x and y.
+        b: Velocity (or acceleration) of the end effector along x and y.
     """
     l1, l2 = lengths
     q1, q2 = q
@@ -79,7 +79,7 @@ def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
 
 @leaf
 def _end_effector_motion(lengths: Pair, q: Pair, qd: Pair) -> tuple[float, float, float, float]:
-    """Returns x, y, x' and y' of the end effector, m and m/s.
+    """Returns the position (x, y) of the end effector, m, and its velocity along x and y, m/s.
 
     Args:
         lengths: Lengths of the two links, m.
@@ -108,14 +108,17 @@ def _jacobian_rate_times(
     qd: Pair,
     v: Pair,
 ) -> Pair:
-    """Returns the derivative of the Jacobian times v.
+    """Returns the product of the Jacobian's time derivative and the joint velocities v.
+
+    This is the part of the end effector's acceleration that remains if v is constant. The
+    Jacobian also changes because the estimates of the link lengths do.
 
     Args:
         lengths: Estimated lengths of the links, m.
         length_rates: Derivatives of these estimates, m/s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
-        v: The vector to multiply.
+        v: Reference velocities of the joints, rad/s.
     """
     l1, l2 = lengths
     l1_rate, l2_rate = length_rates
@@ -188,7 +191,7 @@ class AdaptiveKinematics(ControlLaw):
         Both estimates start at the values that the settings state.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         self.theta_hat = list(self.theta_hat0)
         self.lengths_m = list(self.lengths0_m)
@@ -319,7 +322,7 @@ class AdaptiveKinematics(ControlLaw):
         and `most_m`.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition as a string. It is never decided (`holds` is None), because only a run
@@ -338,7 +341,7 @@ class AdaptiveKinematics(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         They contain the tuned gains and the first estimate of the arm's dynamic parameters. The
@@ -346,6 +349,6 @@ class AdaptiveKinematics(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "theta_hat0": site.estimate}

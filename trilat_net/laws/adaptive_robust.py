@@ -4,9 +4,9 @@ The law estimates the dynamic parameters of its arm within a box, as `AdaptiveBo
 additional torque opposes what no value of these parameters explains, such as friction or the
 torque of an operator. It never exceeds a bound that the user states.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.robust_torque`). `AdaptiveRobust.compute_torque` states the same law in plain
-Python, and `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
+The compiled control loop computes this law (`core.step.control.robust_torque`).
+`AdaptiveRobust.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from collections.abc import Mapping
@@ -117,7 +117,7 @@ class AdaptiveRobust(AdaptiveBox):
         the arm are within the box, the bounds in which the law searches for them.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The bound as a string. It holds if all delays are constant, and is undecided
@@ -138,7 +138,7 @@ class AdaptiveRobust(AdaptiveBox):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The robust term -rho r / sqrt(r^2 + width^2) of this law acts like a damping rho / width
@@ -147,7 +147,7 @@ class AdaptiveRobust(AdaptiveBox):
 
         Args:
             gains: Tuned gains by name, with rho as `rho_nm`.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
         control = AdaptiveBox.write_control(gains, site)

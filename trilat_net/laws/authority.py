@@ -106,7 +106,7 @@ class Authority(ControlLaw):
         """Returns the springs of this law as blocks of the linear analysis.
 
         The linear analysis considers small motions around a pose at rest. Each spring pulls the
-        arm of this site (the process of one arm) towards the arm of a user:
+        arm towards the arm of a user:
 
             tau = K sum_j alpha_j leads_j (q_j - q)
 
@@ -119,20 +119,20 @@ class Authority(ControlLaw):
         vector that peer j sends, and the row ("to", j) the vector that is sent to peer j.
 
         Args:
-            situation: The site, its peers (the other sites) and their laws.
+            situation: This arm, its peers (the other arms) and their laws.
         """
         joints = len(situation.inertia)
         form = LinearForm(joints)
         K = np.array(self.K)
         for j in situation.peers:
-            # A site with another law has no flag `leads` and is not followed.
+            # An arm with another law has no flag `leads` and is not followed.
             peer_leads = getattr(situation.laws[j], "leads", False)
-            alpha = situation.alpha[situation.site, j]  # weight with which this site follows j
+            alpha = situation.alpha[situation.site, j]  # weight with which this arm follows j
             share = alpha * float(peer_leads)
             stiffness = share * K
             form.add("tau", "q", -stiffness)
             form.add("tau", ("from", j), stiffness)
-            form.add(("to", j), "q", 1.0)  # every site sends its position
+            form.add(("to", j), "q", 1.0)  # every arm sends its position
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
@@ -143,7 +143,7 @@ class Authority(ControlLaw):
         slave is not used.
 
         Args:
-            situation: The site, and the laws of all sites.
+            situation: This arm, and the laws of all arms.
 
         Returns:
             A sentence for the user. Empty if the site is the slave, or if all sites are users.
@@ -157,14 +157,14 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         For the arm of a user, the loop is a spring with a damper between the two users, whose
         known condition is used. The slave follows the users, but nobody follows the slave. It
         closes no loop and is stable for every delay.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition. None if the law does not compensate gravity exactly, because then no
@@ -187,7 +187,7 @@ class Authority(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment. A
         site is the process that runs one arm. At the masters, which are the arms of the two
@@ -196,6 +196,6 @@ class Authority(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "leads": site.role == "master", "gravity": site.gravity}

@@ -77,7 +77,7 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """Longest delay of the links over which a site receives the sites that it follows, s.
+        """Longest delay of the links over which an arm receives the arms that it follows, s.
 
         It is NaN if any of these delays varies.
         """
@@ -86,21 +86,21 @@ class LawSituation(NamedTuple):
         return float(np.max(delays_s, initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
-        """Returns the facts about the session as if only some of the sites took part.
+        """Returns the facts about the session as if only some of the arms (sites) took part.
 
-        A law that follows only some of the other sites evaluates its stability condition for
-        these sites alone.
+        A law that follows only some of the other arms evaluates its stability condition for
+        these arms alone.
 
         Args:
             sites: Indices of the sites that remain. The site of these facts must be among them.
         """
-        part = np.ix_(sites, sites)
+        submatrix = np.ix_(sites, sites)
         return self._replace(
             site=list(sites).index(self.site),
             names=tuple(self.names[n] for n in sites),
             laws=tuple(self.laws[n] for n in sites),
-            alpha=self.alpha[part],
-            delay_s=self.delay_s[part],
+            alpha=self.alpha[submatrix],
+            delay_s=self.delay_s[submatrix],
             hands=tuple(self.hands[n] for n in sites) if self.hands else (),
         )
 
@@ -261,17 +261,24 @@ def _judge_two_sites(
 def _judge_several_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Returns the condition of more than two sites, d > share K T.
+    """Evaluates how much damping more than two arms need that springs couple with a delay.
 
-    The factor `share` is the larger one of two needs: that of the differences between the
-    sites, which is the negative of the least eigenvalue of the dominance matrix, and that of
-    the common motion of all sites.
+        d > c K T
+
+    d is the damping, K the stiffness of the springs and T the delay. The factor c is the larger
+    one of two numbers: the negative of the least eigenvalue of the dominance matrix, for
+    motions in which the arms differ, and the factor for the common motion of all arms
+    (`_find_common_motion_share`).
 
     Args:
-        situation: The situation of the site.
-        K: Stiffness of each site per joint, shape (N, n).
-        d: Damping of each site per joint, shape (N, n).
-        scope: Sentence on the arms for which the condition is sufficient.
+        situation: The laws, delays and weights of all sites.
+        K: Stiffness of each site per joint, shape (N, n), N m/rad.
+        d: Damping of each site per joint, shape (N, n), N m s/rad.
+        scope: Part of the text that says for which arms the condition is sufficient.
+
+    Returns:
+        The condition. It is undecided if the sites have different gains or delays, and not met
+        if the dominance matrix is not reversible.
     """
     T = situation.longest_s
     hold_s = situation.hold_s
@@ -286,19 +293,21 @@ def _judge_several_sites(
         text = "shares that are not reversible: some heavy arms are unstable at any d"
         return StabilityCondition(False, text)
 
-    common_share = COMMON_MOTION_SHARE
+    common_factor = COMMON_MOTION_SHARE
     if hold_s:
-        common_share = _find_common_motion_share(2.0 * T / hold_s + 1.0)
-    share = max(-least, common_share)
+        delay_in_half_periods = 2.0 * T / hold_s + 1.0
+        common_factor = _find_common_motion_share(delay_in_half_periods)
+    factor = max(-least, common_factor)
+    # A torque that is held for the period h acts h / 2 later.
     hold_term = 0.5 * hold_s * K[0]
     effective_delay_s = T + 0.5 * hold_s
-    delay_term = share * K[0] * effective_delay_s
+    delay_term = factor * K[0] * effective_delay_s
     bound = hold_term + delay_term
     holds = bool((d[0] > bound).all())
 
-    formula = f"{share:.4g} K T"
+    formula = f"{factor:.4g} K T"
     if hold_s:
-        formula = f"K h / 2 + {share:.4g} K (T + h / 2)"
+        formula = f"K h / 2 + {factor:.4g} K (T + h / 2)"
     text = f"d > {formula} = {bound.max():.4g} ({scope})"
     proves_decay = holds and not hold_s
     return StabilityCondition(holds, text, proves_decay)
@@ -408,7 +417,7 @@ class LinearForm:
         self.blocks[row, column] = previous + block
 
     def list_receivers(self) -> list[int]:
-        """Returns the peers to which the law sends signals, such as waves, as indices.
+        """Returns the other arms to which the law sends signals, such as waves, as indices.
 
         The linear analysis adds a variable for the signal to each of them. The indices ascend.
         There are none if the law exchanges nothing but the motion.

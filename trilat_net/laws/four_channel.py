@@ -41,11 +41,11 @@ _NEUTRAL = (
 
 @compiled
 def _send_acceleration(law: Any, now: LawInput) -> None:
-    """Sends the acceleration of the arm to the peers.
+    """Computes the acceleration of the arm from its torques, and sends it to the other arms.
 
-    It is the solution qdd of M qdd = tau - tau_x - bias, with tau within its limits, where M is
-    the inertia matrix, tau_x the exogenous torque and bias the torque of gravity and of
-    Coriolis forces. The method is Gaussian elimination.
+    The acceleration is not measured. It is the solution qdd of M qdd = tau - tau_x - bias, with
+    tau within its limits, where M is the inertia matrix, tau_x the exogenous torque and bias
+    the torque of gravity and of Coriolis forces. The method is Gaussian elimination.
 
     Args:
         law: The law, whose `rows` are the work space.
@@ -54,6 +54,7 @@ def _send_acceleration(law: Any, now: LawInput) -> None:
     n = now.joints
     rows = law.rows
     qdd = now.to_all.qdd
+    # Row i of the equations: n entries of M, then the torque that accelerates joint i.
     width = n + 1
     for i in range(n):
         first = i * width
@@ -64,6 +65,7 @@ def _send_acceleration(law: Any, now: LawInput) -> None:
         applied = min(bounded_below, limit)
         tau_x = now.tau_x[i]
         rows[first + n] = applied - tau_x - now.bias[i]
+
     # Gaussian elimination; M is positive definite, so pivoting is not needed.
     for column in range(n):
         pivot_row = column * width
@@ -74,6 +76,8 @@ def _send_acceleration(law: Any, now: LawInput) -> None:
             for j in range(column, width):
                 pivot_entry = rows[pivot_row + j]
                 rows[first + j] -= factor * pivot_entry
+
+    # Substitute back, from the last joint.
     for i in range(n - 1, -1, -1):
         first = i * width
         remainder = rows[first + n]
@@ -123,7 +127,7 @@ class FourChannel(ControlLaw):
         equation of motion. This computation needs the limits and the work space.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         self.needs_model = self.acceleration > 0.0
         n = facts.joints
@@ -183,6 +187,7 @@ class FourChannel(ControlLaw):
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(
             law=Law.KNOWN,

@@ -74,7 +74,7 @@ class Impedance(ControlLaw):
         The first control period stores the measured pose as the start pose.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         self.start = [0.0] * facts.joints
         self.qdd = [0.0] * facts.joints
@@ -168,7 +168,7 @@ class Impedance(ControlLaw):
         peer j.
 
         Args:
-            situation: The site, its arm, and the weights with which it follows the other sites.
+            situation: This arm, and the weights with which it follows the other arms.
         """
         n = len(situation.inertia)
         form = LinearForm(n)
@@ -231,7 +231,7 @@ class Impedance(ControlLaw):
         laws = situation.laws
         followers = []
         for n, law in enumerate(laws):
-            if getattr(law, "follows", False):
+            if getattr(law, "follows", False):  # other laws have no such setting
                 followers.append(n)
         have_this_law = all(law.kind is Impedance for law in laws)
         if len(followers) != 1 or not have_this_law:
@@ -336,7 +336,7 @@ class Impedance(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The setting `follows` is true for the slave, which follows the masters, and false for a
@@ -344,7 +344,7 @@ class Impedance(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "follows": site.role == "slave"}
 
@@ -371,7 +371,7 @@ def _find_stiffest_wall(
     A spring at a master can raise the gain, and so can a mass, even though both are passive.
 
     Args:
-        laws: Settings of the law of each site.
+        laws: Settings of the law of each arm.
         dominance_factors: a_i, those of the slave, shape (N,).
         slave: Index of the slave.
         hands: Springs and dampers that act on the arm of each site. By default, none act.
@@ -414,10 +414,14 @@ def _compute_loop_gain(
     damping: float,
     hands: Sequence[Sequence[ArmLoad]],
 ) -> Array:
-    """Returns the gain of the loop of `_find_stiffest_wall` on a grid of frequencies.
+    """Returns the gain of the loop from the slave's force to itself, for many frequencies.
+
+    The slave sends the force of its environment to the masters, whose motion it follows.
+    `_find_stiffest_wall` gives the equation of this gain. The loop is stable for constant
+    delays of any length if the gain is below 1 at every frequency.
 
     Args:
-        laws: Settings of the law of each site.
+        laws: Settings of the law of each arm.
         dominance_factors: Dominance factors of the slave, shape (N,).
         slave: Index of the slave.
         joint: Index of the joint.
@@ -428,7 +432,8 @@ def _compute_loop_gain(
     Returns:
         The gains, shape (E, F) for F frequencies.
     """
-    s = 1j * np.geomspace(1e-2, 1e4, 4000)
+    frequencies_rad_s = np.geomspace(1e-2, 1e4, 4000)
+    s = 1j * frequencies_rad_s  # the Laplace variable
     masters: Any = 0.0
     for n, law in enumerate(laws):
         if n == slave:
@@ -451,15 +456,18 @@ def _compute_loop_gain(
 def _select_master_hands(
     hands: Sequence[Sequence[ArmLoad] | None], slave: int
 ) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
-    """Returns each selection of the hands at the masters, from none to all of them.
+    """Returns each selection of the people who hold the masters, from nobody to all of them.
+
+    A person (hand) may let go of an arm at any time. Therefore stability is checked for each
+    selection.
 
     Args:
         hands: Springs and dampers that act on the arm of each site.
         slave: Index of the slave, whose hands are left out.
 
     Returns:
-        Per selection the hands of each site. None if a hand at a master is of another kind, or
-        if there are more than `MOST_HANDS` of them.
+        Per selection the hands of each site. None if a hand at a master is not a spring and a
+        damper per joint, or if there are more than `MOST_HANDS` hands.
     """
     selections_by_site: list[list[tuple[ArmLoad, ...]]] = []
     count = 0
@@ -470,8 +478,9 @@ def _select_master_hands(
         if site_hands is None:
             return None
         count += len(site_hands)
-        sizes = range(len(site_hands) + 1)
-        selections = [part for size in sizes for part in combinations(site_hands, size)]
+        selections: list[tuple[ArmLoad, ...]] = []
+        for size in range(len(site_hands) + 1):
+            selections += combinations(site_hands, size)
         selections_by_site.append(selections)
     if count > MOST_HANDS:
         return None
@@ -493,6 +502,7 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     if selections is None:
         return "no bound is known for walls, because of the hands at the masters"
     factors = situation.alpha[slave]
+    # One bound for each combination of hands at the masters; the smallest holds for all.
     stiffnesses = [
         _find_stiffest_wall(situation.laws, factors, slave, selection)
         for selection in selections
@@ -525,7 +535,13 @@ def move_impedance(law: Any, force: Array, period_s: float) -> Array:
     for joint in range(joints):
         M, B, K = (float(gain[joint]) for gain in gains)
         # The state is position, velocity and the force, which is constant over a period.
-        rates = np.array([[0.0, 1.0, 0.0], [-K / M, -B / M, 1.0 / M], [0.0, 0.0, 0.0]])
+        rates = np.array(
+            [
+                [0.0, 1.0, 0.0],
+                [-K / M, -B / M, 1.0 / M],
+                [0.0, 0.0, 0.0],
+            ]
+        )
         step = _exponentiate(rates * period_s)
         state = np.zeros(3)
         for k, held_force in enumerate(force[:, joint].tolist()):
@@ -544,12 +560,16 @@ def _exponentiate(matrix: Array) -> Array:
     Args:
         matrix: The matrix, shape (n, n).
     """
-    size = float(np.abs(matrix).sum(axis=1).max())
-    halvings = max(0, math.ceil(math.log2(size)) + 1) if size > 0.0 else 0
+    # The power series converges fast for a matrix with a norm of at most 1/2. The matrix is
+    # halved as often as needed, and its exponential squared as often.
+    norm = float(np.abs(matrix).sum(axis=1).max())
+    halvings = 0
+    if norm > 0.0:
+        halvings = max(0, math.ceil(math.log2(norm)) + 1)
     scaled = matrix / 2.0**halvings
     exponential = np.eye(len(matrix))
     term = np.eye(len(matrix))
-    for n in range(1, 19):  # the norm is at most 1/2, so that the 18th term is below 1e-21
+    for n in range(1, 19):  # the 18th term is below 1e-21
         term = term @ scaled / n
         exponential = exponential + term
     for _ in range(halvings):

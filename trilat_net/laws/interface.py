@@ -73,7 +73,7 @@ class TuningRun(NamedTuple):
     K times at equal distances.
 
     Attributes:
-        laws: Settings of the law of each site.
+        laws: Settings of the law of each arm.
         t_s: The times, shape (K,), in s.
         q: Joint angles, shape (N, K, n), in rad.
         outside_nm: Torques with which operators and environments act on the arms, shape (N, K,
@@ -134,7 +134,7 @@ class LawSettings(Frozen, frozen=True):
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses gains that contradict each other, and an unsuitable number of sites.
+        """Refuses gains that contradict each other, and an unsuitable number of arms (sites).
 
         Args:
             path: Path of the law's table in the scenario, for errors.
@@ -145,7 +145,7 @@ class LawSettings(Frozen, frozen=True):
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Finds a setting of the law that does not suit the tick rates of the sites.
+        """Finds a setting of the law that does not suit the rates of the control loops.
 
         Args:
             rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
@@ -196,7 +196,7 @@ class LawSettings(Frozen, frozen=True):
         `linear_gains`.
 
         Args:
-            situation: The site, its arm, and the weights with which it follows the other sites.
+            situation: This arm, and the weights with which it follows the other arms.
 
         Returns:
             The terms. None if `linear_gains` describes the law completely.
@@ -267,12 +267,12 @@ class LawSettings(Frozen, frozen=True):
         return self
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
-        """Explains to the user why the dominance factors of a site have no effect.
+        """Explains to the user why the dominance factors of an arm have no effect.
 
-        A dominance factor is the weight with which a site follows a peer.
+        A dominance factor is the weight with which an arm (site) follows another arm.
 
         Args:
-            situation: The site, and the laws of all sites.
+            situation: This arm, and the laws of all arms.
 
         Returns:
             A sentence. Empty if the dominance factors have an effect.
@@ -286,7 +286,7 @@ class LawSettings(Frozen, frozen=True):
         return convert_sends(sends, self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
-        """Returns a function that creates the law for one site before a run.
+        """Returns a function that creates the law for one arm (site) before a run.
 
         Args:
             sites: Number of sites in the scenario.
@@ -300,7 +300,7 @@ class LawSettings(Frozen, frozen=True):
             return None
 
         def make_law(context: LawContext) -> UserLaw:
-            """Creates the control law of one site, if its class can be used there.
+            """Creates the control law of one arm, if its class can be used there.
 
             Otherwise, the check of the class raises an error.
             """
@@ -354,10 +354,10 @@ class ControlLaw:
             cls.Settings = _derive_settings(cls, tag)
 
     def __init__(self, facts: LawContext, **gains: Any) -> None:
-        """Creates the law of a site.
+        """Creates the law of one arm.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
             gains: Gains by name. Gains that are left out keep their default.
 
         Raises:
@@ -372,18 +372,18 @@ class ControlLaw:
         self.begin(facts)
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares a law before the first tick: creates the attributes that `torque` uses.
+        """Prepares a law before the first control period: creates what `torque` uses.
 
         The gains exist already. A law that needs no other attributes does not override this
         method.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Explains to the user why the law cannot be used for the sites of a scenario.
+        """Explains to the user why the law cannot be used for the arms of a scenario.
 
         Args:
             roles: Role of each site, "master" or "slave".
@@ -399,7 +399,7 @@ class ControlLaw:
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of the law for one site, after its gains were tuned.
+        """Returns the settings of the law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         Besides the tuned gains, the table contains settings that follow from the facts about
@@ -407,9 +407,10 @@ class ControlLaw:
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
-        if "gravity" in cls.Settings.__struct_fields__:
+        compensates_gravity = "gravity" in cls.Settings.__struct_fields__
+        if compensates_gravity:
             return {**gains, "gravity": site.gravity}
         return {**gains}
 
@@ -454,7 +455,9 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
         annotations = inspect.get_annotations(base).items()
         hints |= {name: hint for name, hint in annotations if not _is_class_variable(hint)}
         attributes = vars(base).items()
-        namespace |= {key: value for key, value in attributes if _depends_on_gains(key, value)}
+        namespace |= {
+            name: value for name, value in attributes if _depends_on_gains(name, value)
+        }
     namespace["kind"] = kind  # `LawSettings.kind` refers back to the class of the law
     namespace["__doc__"] = kind.__doc__
     fields = [(name, hint, getattr(kind, name)) for name, hint in hints.items()]
@@ -515,16 +518,17 @@ def check_law_class(
     sites: int,
     scheme: str,
 ) -> None:
-    """Refuses a class that is not a control law, or that does not suit the site.
+    """Refuses a class that is not a control law, or that does not suit the arm.
 
-    A law may restrict its use: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
-    `needs_theta = True`.
+    A law may restrict its use by class attributes: the number of arms by `sites = 2` or
+    `sites = (2, 4)`, the integration scheme by `schemes = ("digital",)`, and by
+    `needs_theta = True` to arms with known dynamic parameters.
 
     Args:
         kind: The class.
         code: Name of the law for errors, as in "mylaws:Spring".
-        context: Facts about the site.
-        sites: Number of sites in the scenario.
+        context: Facts about the arm and its controller.
+        sites: Number of arms (sites) in the scenario.
         scheme: Integration scheme of the scenario.
 
     Raises:
@@ -587,7 +591,10 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
 
 
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
-    """Refuses a number of sites outside of the range that the class states in `sites`.
+    """Refuses a law that does not support the number of arms in the scenario.
+
+    The class of a law may state a number or a range in its attribute `sites`, for example
+    `sites = 2` or `sites = (2, 4)`. A site is the process that controls one arm.
 
     Args:
         kind: The class.
@@ -598,19 +605,21 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
     Raises:
         ScenarioError: The number is refused, or `sites` is not a number or a pair of numbers.
     """
-    stated = getattr(kind, "sites", None)
-    bounds: Any = stated
-    if stated is None:
+    declared = getattr(kind, "sites", None)
+    bounds: Any = declared
+    if declared is None:
         bounds = (2, sys.maxsize)
-    elif isinstance(stated, int):
-        bounds = (stated, stated)
+    elif isinstance(declared, int):
+        bounds = (declared, declared)
+
     is_sequence = isinstance(bounds, tuple | list)
-    is_pair = is_sequence and len(bounds) == 2
-    if not is_pair or not all(isinstance(bound, int) for bound in bounds):
+    is_range = is_sequence and len(bounds) == 2 and all(isinstance(n, int) for n in bounds)
+    if not is_range:
         problem = (
-            f"{code}: sites must be a number as in 2 or a range as in (2, 4), not {stated!r}"
+            f"{code}: sites must be a number as in 2 or a range as in (2, 4), not {declared!r}"
         )
         raise ScenarioError(problem, path=path)
+
     least, most = bounds
     if not least <= sites <= most:
         numbers = f"{least}" if least == most else f"{least} to {most}"
@@ -622,28 +631,28 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
 def _find_written_attributes(kind: Any) -> list[str]:
     """Returns the names of the attributes that a class assigns to itself outside of `__init__`.
 
-    An attribute that changes during a run is a memory, which the law must declare so that runs
-    can be repeated from the log. The source of each method is searched for assignments to
-    `self`. Changes by method calls, as of a list's `append`, are not found.
+    An attribute that changes during a run is a memory, which a control law must declare so that
+    runs can be repeated from the log. The source of each method is searched for assignments to
+    `self`. Changes by method calls, such as the `append` of a list, are not found.
 
     Args:
         kind: The class of a law.
     """
+    attributes = [value for base in kind.__mro__ for value in vars(base).values()]
+    functions = [value for value in attributes if inspect.isfunction(value)]
     written = []
-    for base in kind.__mro__:
-        for function in vars(base).values():
-            if not inspect.isfunction(function) or function.__name__ == "__init__":
+    for function in functions:
+        if function.__name__ == "__init__":
+            continue
+        source = textwrap.dedent(inspect.getsource(function))
+        for node in ast.walk(ast.parse(source)):
+            is_assigned = isinstance(getattr(node, "ctx", None), ast.Store)
+            if not is_assigned:
                 continue
-            source = textwrap.dedent(inspect.getsource(function))
-            tree = ast.parse(source)
-            for node in ast.walk(tree):
-                context = getattr(node, "ctx", None)
-                if not isinstance(context, ast.Store):
-                    continue
-                target = ast.unparse(node)
-                match = re.match(r"self\.(\w+)", target)
-                if match:
-                    written.append(match[1])
+            target = ast.unparse(node)
+            match = re.match(r"self\.(\w+)", target)
+            if match:
+                written.append(match[1])
     return written
 
 
@@ -668,9 +677,11 @@ def make_instance(
     Raises:
         ScenarioError: The class raised an exception. The user's code may raise any.
     """
-    takes_facts = kind.__init__ is not object.__init__ or kind.__new__ is not object.__new__
+    has_init = kind.__init__ is not object.__init__
+    has_new = kind.__new__ is not object.__new__
+    takes_arguments = has_init or has_new
     try:
-        return kind(context, **settings) if takes_facts else kind()
+        return kind(context, **settings) if takes_arguments else kind()
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
         error_path = path or f"sites.{context.site}.control"

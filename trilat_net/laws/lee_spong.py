@@ -4,7 +4,7 @@ The law PD+d couples an arm by a spring (P) and a damper (D) to the arms that it
 second damper (d) brakes the arm itself. Its damping is computed from the stiffness of the
 spring and the largest delay. Therefore the user states a delay instead of a damping.
 
-The compiled control loop computes this law (`core.control.damped_torque`).
+The compiled control loop computes this law (`core.step.control.damped_torque`).
 `LeeSpong.compute_torque` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
@@ -87,6 +87,7 @@ class LeeSpong(ControlLaw):
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(
             Law.KNOWN,
@@ -97,13 +98,13 @@ class LeeSpong(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         The known condition for a spring with a damper is used. It bounds the damping from below
         by the stiffness times the delay.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition. None if the law does not compensate gravity exactly, because then no
@@ -115,7 +116,7 @@ class LeeSpong(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The largest delay T_max, from which the law computes its damping, is set to half of the
@@ -124,7 +125,7 @@ class LeeSpong(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {
             "K": gains["K"],

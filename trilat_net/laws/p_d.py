@@ -4,8 +4,8 @@ The peers are the arms that this arm follows. The spring (P) acts on the positio
 damper (d) on the arm's own velocity. The law also adds the arm's gravity torque, which it
 computes from known masses.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.damped_torque`). `PD.compute_torque` states the same law in plain Python, and
+The compiled control loop computes this law (`core.step.control.damped_torque`).
+`PD.compute_torque` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -68,6 +68,7 @@ class PD(ControlLaw):
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 

@@ -5,8 +5,8 @@ pulled towards the master by a spring. The torque that the environment exerts on
 sent back and added to the master's torque. Both arms are damped and compensate their gravity
 torque, which is computed from known masses.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.damped_torque`). `PF.compute_torque` states the same law in plain Python, and
+The compiled control loop computes this law (`core.step.control.damped_torque`).
+`PF.compute_torque` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -89,6 +89,7 @@ class PF(ControlLaw):
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(
             Law.KNOWN,
@@ -120,10 +121,11 @@ class PF(ControlLaw):
             )
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - as the other laws
-        """Explains to the user that the dominance factors of a site have no effect.
+        """Explains to the user that the dominance factors of an arm have no effect.
 
-        That is the case if the stiffness K and the force gain k_f are both zero: the site then
-        neither follows nor feels its peers.
+        Dominance factors are the weights with which an arm follows the other arms. If the
+        stiffness K and the force gain k_f are both zero, the arm neither follows nor feels
+        them.
 
         Returns:
             A sentence. Empty if one of the gains is not zero.
@@ -145,7 +147,8 @@ class PF(ControlLaw):
         Returns:
             The sentence. Empty for one master and one slave.
         """
-        if sorted(roles) == ["master", "slave"]:
+        is_one_pair = sorted(roles) == ["master", "slave"]
+        if is_one_pair:
             return ""
         sites = count_nouns(len(roles), "site")
         masters = roles.count("master")
@@ -158,12 +161,12 @@ class PF(ControlLaw):
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the [control] table of a scenario for this law, after its gains were tuned.
 
-        The table depends on the role of the site, because only the slave has a spring and only
+        The table depends on the role of the arm, because only the slave has a spring and only
         the master feels forces.
 
         Args:
             gains: The tuned gains by name.
-            site: The site whose table is written.
+            site: Facts about the arm for which the table is written.
         """
         if site.role == "master":
             return {

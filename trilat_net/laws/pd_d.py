@@ -4,8 +4,8 @@ The peers are the arms that this arm follows. The spring (P) acts on the positio
 first damper (D) on the derivative of this error, and the second (d) on the arm's own velocity.
 The law also adds the arm's gravity torque, which it computes from known masses.
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.damped_torque`). `PdD.compute_torque` states the same law in plain Python, and
+The compiled control loop computes this law (`core.step.control.damped_torque`).
+`PdD.compute_torque` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -71,6 +71,7 @@ class PdD(ControlLaw):
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(
             Law.KNOWN,
@@ -81,10 +82,10 @@ class PdD(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
             The condition of P+d on K and d. None if the law does not compensate gravity

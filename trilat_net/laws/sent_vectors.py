@@ -22,7 +22,7 @@ from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):
-    """Declaration of a vector that a law sends at every tick, see `core.law_channel`.
+    """Declaration of a vector that a law sends at every tick, see `core.plug.law_channel`.
 
     Attributes:
         unit: Unit of its numbers, as in "J"; "" for dimensionless numbers.

@@ -70,7 +70,7 @@ class Smith(ControlLaw):
         slave without delay. The first control period sets its position.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         self.x = [0.0] * facts.joints
         self.xd = [0.0] * facts.joints
@@ -129,6 +129,7 @@ class Smith(ControlLaw):
                 their number.
         """
         K = (0.0,) if self.predicts else self.K
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=K, d=self.d, known=known)
 
@@ -141,7 +142,7 @@ class Smith(ControlLaw):
         difference between its position and x is sent to the master.
 
         Args:
-            situation: The site, its arm and its only peer.
+            situation: This arm and the only other arm.
         """
         (peer,) = situation.peers
         K = np.array(self.K)
@@ -167,13 +168,13 @@ class Smith(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the predictor removes the delay from the control loop.
 
-        Exactly one site must predict, and K, d and inertia must be equal at both sites.
+        Exactly one of the two arms must predict, and K, d and inertia must be equal at both.
         Otherwise the condition is not met. If both requirements are met, the condition is
         undecided (`holds` is None): the loop is stable while the slave moves freely, but the
         model does not include contacts.
 
         Args:
-            situation: The two sites and their laws.
+            situation: The two arms and their laws.
         """
         laws = situation.laws
         predicting = [law for law in laws if getattr(law, "predicts", False)]
@@ -193,7 +194,7 @@ class Smith(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The setting `predicts` is true for the master, which predicts the motion of the slave
@@ -201,6 +202,6 @@ class Smith(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "predicts": site.role == "master", "gravity": site.gravity}

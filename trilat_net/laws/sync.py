@@ -78,7 +78,7 @@ class Sync(ControlLaw):
         trapezoid rule.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         self.theta_hat = list(self.theta_hat0)
         self.Yr = [0.0] * len(self.theta_hat)
@@ -172,7 +172,7 @@ class Sync(ControlLaw):
         under gravity the arms end only at poses with Y_G' r = 0.
 
         Args:
-            situation: The site, its peers (the other sites) and the delays between them.
+            situation: This arm, the other arms, their laws, and the delays between them.
         """
         if np.isnan(situation.longest_s):
             text = "proved for constant delays, and a delay here varies"
@@ -205,7 +205,7 @@ class Sync(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The tuning uses one name, `Kp`, for the damping gains of all adaptive laws. In the
@@ -213,7 +213,7 @@ class Sync(ControlLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {
             "Lambda": gains["Lambda"],

@@ -206,7 +206,7 @@ class Tanks(EnergyLaw):
         environments are passive.
 
         Args:
-            situation: The site, with the rate of its control loop.
+            situation: This arm, with the rate of its control loop.
         """
         part_per_tick = self.packet_1_s / situation.rate_hz
         if part_per_tick > 1.0:

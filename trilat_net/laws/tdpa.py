@@ -124,10 +124,11 @@ def _observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
 
 @compiled
 def _invert_inertia(law: Any, now: LawInput) -> None:
-    """Writes the inverse M^-1 of the arm's inertia matrix to `law.inverse`, row by row.
+    """Computes the inverse of the arm's inertia matrix M, to predict how torques move the arm.
 
-    The method is Gauss-Jordan elimination. If the arm's parameters are unknown, M is zero,
-    and so is the result.
+    The result is written to `law.inverse`, row by row. The method is Gauss-Jordan elimination
+    in place: column p of the inverse replaces column p of M. If the arm's parameters are
+    unknown, M is zero, and so is the result.
     """
     n = now.joints
     inverse = law.inverse
@@ -154,12 +155,13 @@ def _invert_inertia(law: Any, now: LawInput) -> None:
 
 @compiled
 def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Writes the torque that the leader feels in its coupling to follower j.
+    """Limits the torque that the leader of a coupling feels, so that its energy is covered.
 
-    The controller reduces the follower's torque to a magnitude that the known energy pays for
-    during the next `AHEAD` ticks. The prediction assumes that the joint continues its motion,
-    and adds the effect of the torques that change in this tick, the coupling's own torque
-    included. An energy deficit is repaid by damping.
+    The coupling connects this arm, the leader, to follower j. The torque of the follower is
+    reduced to a magnitude that the known energy pays for during the next `AHEAD` ticks (control
+    periods). The prediction assumes that the joint continues its motion, and adds the effect of
+    the torques that change in this tick, the coupling's own torque included. An energy deficit
+    is repaid by damping.
 
     With m the magnitude of the torque, the predicted cost is
 
@@ -237,10 +239,13 @@ def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 def _find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     """Returns the energy that may still be used to move the follower in one coupling, J.
 
-    A coupling connects a leader to this arm, its follower. The known energy is the sum of three
-    parts: the energy that the leader is known to have put in, minus the energy that moved the
-    follower, plus the energy that was saved when the controller reduced the velocity. Half of
-    the initial reserve is added. The other half is kept for periods that cost more than
+    A coupling connects a leader to this arm, its follower. The known energy is
+
+        E_led + reserve / 2 - E_moved + E_yielded
+
+    E_led is the energy that the leader is known to have put in, E_moved the energy that moved
+    the follower, and E_yielded the energy that was saved when the controller reduced the
+    velocity. The other half of the initial reserve is kept for periods that cost more than
     predicted.
 
     Args:
@@ -319,10 +324,12 @@ def _compute_drift_velocity(
 ) -> float:
     """Returns the velocity that moves the goal back to the peers, as far as energy allows.
 
-    Limited velocities let the goal drift away from the peers' position. The correction moves
-    the goal for all peers together, so the work of the whole torque counts. With energies by
-    step, the reactions of the damper and the spring count too, also in connection with the
-    peers' velocities. The power of a correction with speed v is linear v + square v^2.
+    A spring and a damper pull the arm to this goal. It moves with the velocities of the peers
+    (the arms that are followed), which may have been reduced, and so drifts away from their
+    position. The correction moves the goal for all peers together, so the work of the whole
+    torque counts. If work is computed from motion (`law.by_step`), the reactions of the damper
+    and the spring count too, also in connection with the velocities of the peers. The power of
+    a correction with speed v is linear v + square v^2.
 
     Args:
         law: The law, with its energy accounts.
@@ -339,6 +346,7 @@ def _compute_drift_velocity(
     bounded_above = min(largest_velocity, error / h)
     velocity = max(-largest_velocity, bounded_above)
     sign = 1.0 if velocity > 0.0 else -1.0
+    # The coefficients of the power, and the power that the energy allows, W.
     linear = law.force[i] * sign
     square = 0.0
     magnitude = abs(velocity)
@@ -874,7 +882,7 @@ class Tdpa(EnergyLaw):
         only at its end.
 
         Args:
-            seen: Records of the site in the run, one per control period.
+            seen: Records of the arm in the run, one per control period.
         """
         gave = []
         took = []

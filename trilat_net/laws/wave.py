@@ -85,10 +85,12 @@ def _replay_wave(
 ) -> float:
     """Returns the wave to play so that lost waves are made up for, as far as energy allows.
 
-    The waves that were lost are known only by the integral of their sum, which later samples
-    contain. The line owes this integral to the arm. It is played in addition to the wave of the
-    tick, at the mean rate of the lost waves or slower. The known energy is divided evenly over
-    the owed integral: each unit of the integral may cost only its part of the energy.
+    A wave acts on the arm like a force that also carries energy. If messages are lost, the arm
+    would end at a wrong position. Later messages contain the integral of all waves, so that the
+    integral of the lost ones is known. The line owes this integral to the arm. It is played in
+    addition to the wave of this control period, at the mean rate of the lost waves or slower.
+    The known energy is divided evenly over the owed integral: each unit of the integral may
+    cost only its part of the energy.
 
     Args:
         law: The law, whose owed integral and owed time are reduced by the part that is played.
@@ -184,11 +186,12 @@ def _receive_wave(
     i: int,
     missed: float,
 ) -> float:
-    """Returns the wave of one line that an end plays in a tick, and books its energy.
+    """Chooses the wave that acts on the arm in a control period, and accounts for its energy.
 
-    The energy of a new sample is added to the line's account W of known energy, and the energy
-    of the wave that is played moves from W to the account H of the end. The setting `reception`
-    decides which wave is played if a sample is late or lost.
+    The wave comes from one peer (another arm), over a virtual line. The energy of a new sample
+    (message) is added to the line's account W of energy that has arrived. The energy of the
+    wave that acts (is played) moves from W to the account H, the energy that this arm may send.
+    The setting `reception` decides which wave is played if a sample is late or lost.
 
     Args:
         law: The law, with its energy accounts.
@@ -498,7 +501,7 @@ class Wave(EnergyLaw):
         Waves are in sqrt(W): a wave w carries the power w^2 / 2.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         n = facts.joints
         peers = len(facts.peers)
@@ -690,7 +693,8 @@ class Wave(EnergyLaw):
         lines = () if self.lines == "shares" else self.lines
         for line in lines:
             ends = line.split("-", 1)
-            if sorted(ends) not in pairs:
+            joins_two_sites = sorted(ends) in pairs
+            if not joins_two_sites:
                 names = ", ".join(rates_hz)
                 return KeyProblem(
                     f"control.lines.{line}",
@@ -939,7 +943,7 @@ class Wave(EnergyLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one site, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The damping B is set to the impedance b, with which waves travel between the sites. An
@@ -947,6 +951,6 @@ class Wave(EnergyLaw):
 
         Args:
             gains: Tuned gains by name.
-            site: Facts about the site for which the table is written.
+            site: Facts about the arm for which the table is written.
         """
         return {**gains, "B": gains["b"], "gravity": site.gravity}

@@ -27,6 +27,7 @@ __all__ = [
     "RecordScanner",
     "RecordsByTick",
     "SiteLog",
+    "UnwrittenLog",
     "Table",
     "compute_task_errors",
     "open_log",
@@ -155,6 +156,7 @@ if TYPE_CHECKING:
     from .session_check import LogCheckResult, check_file, judge_integrity
     from .session_scenario import SessionScenario
     from .site_log import LazyRecords, RecordsByTick, SiteLog, compute_task_errors
+    from .unwritten_log import UnwrittenLog
     from .view_rates import FULL_RATE_HZ, VIZ_HZ
 else:
     __getattr__ = import_on_use(
@@ -191,6 +193,7 @@ else:
             "session_check": "LogCheckResult check_file judge_integrity",
             "session_scenario": "SessionScenario",
             "site_log": "LazyRecords RecordsByTick SiteLog compute_task_errors",
+            "unwritten_log": "UnwrittenLog",
             "view_rates": "FULL_RATE_HZ VIZ_HZ",
         },
     )

@@ -80,27 +80,30 @@ class RangeSet:
         """
         del self._ranges[: -self._max_ranges]
 
-    def remove(self, number: int, last: int | None = None) -> bool:
-        """Removes a number, or the numbers from `number` to `last`.
+    def remove(self, number: int, last_to_remove: int | None = None) -> bool:
+        """Removes a number, or the numbers from `number` to `last_to_remove`.
 
         All numbers to remove must be in one range of the set. What remains of that range is one
         range, two ranges or nothing.
 
         Args:
             number: The number, or the first of several numbers.
-            last: Last number to remove. None removes only `number`.
+            last_to_remove: Last number to remove. None removes only `number`.
 
         Returns:
             False if the set does not contain `number`. Nothing is removed in this case.
         """
-        containing = self.find(number)
-        if containing is None:
+        range_with_number = self.find(number)
+        if range_with_number is None:
             return False
 
-        last_removed = number if last is None else last
-        before = (containing[0], number - 1)
-        after = (last_removed + 1, containing[1])
-        remaining = [part for part in (before, after) if part[0] <= part[1]]
+        first, last = range_with_number
+        end_removed = number if last_to_remove is None else last_to_remove
+        remaining = []
+        if first < number:
+            remaining.append((first, number - 1))
+        if end_removed < last:
+            remaining.append((end_removed + 1, last))
         index = self._count_started(number) - 1
         self._ranges[index : index + 1] = remaining
         self._forget_lowest()
@@ -291,8 +294,8 @@ class Account:
     def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
         """Finds the first missing messages that can still be requested from the sender.
 
-        Messages that no member has any more are left out, so that they are not requested again
-        and again.
+        Messages that no member (process of a session) has any more are left out, so that they
+        are not requested again and again.
 
         Args:
             number: Smallest number to consider.
@@ -384,10 +387,10 @@ class Account:
         return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Removes a number from the gaps, or extends the known numbers up to it.
+        """Marks a number as received: removes it from the gaps, or extends the known numbers.
 
         Returns:
-            False if the number had been added before.
+            False if the number had been marked as received before.
         """
         if number > self.last:
             self.add_expected(number)
@@ -397,14 +400,15 @@ class Account:
 
 
 class StartGap:
-    """Gap between the messages of two starts of a site, in one channel.
+    """Gap between the messages of two starts of a site (arm controller), in one channel.
 
     A site that is killed cannot state how many messages it published. After its next start it
-    continues at a later tick. The messages in between were either published and lost on the way
-    to the recorder, or never published. Other sites may have received samples of the earlier
-    start. In that case these sites know a number of messages that the earlier start published
-    at least. Their reports may arrive before or after the next start. A few messages were still
-    in transit to the recorder when the site was killed. These count as unpublished.
+    continues at a later tick (control period). The messages in between were either published
+    and lost on the way to the recorder, or never published. Other sites may have received
+    samples of the earlier start. In that case these sites know a number of messages that the
+    earlier start published at least. Their reports may arrive before or after the next start. A
+    few messages were still in transit to the recorder when the site was killed. These count as
+    unpublished.
 
     The numbers of the gap are divided at one point, which only moves up:
 
@@ -435,11 +439,11 @@ class StartGap:
     def begin_next_start(self, first: int, published: int) -> None:
         """Evaluates the gap before the next start of the site, once that start is known.
 
-        The site was killed and has been started again. The missing messages just before the
-        next start now count as unpublished in the account, except the messages that the site
-        itself is known to have published. Reports of other sites that arrived earlier are then
-        evaluated. They may turn some of these numbers into missing ones again. Only the first
-        call has an effect.
+        The site (arm controller) was killed and has been started again. The missing messages
+        just before the next start now count as unpublished in the account, except the messages
+        that the site itself is known to have published. Reports of other sites that arrived
+        earlier are then evaluated. They may turn some of these numbers into missing ones again.
+        Only the first call has an effect.
 
         Args:
             first: Number of the first message that belongs to the next start.
@@ -457,11 +461,12 @@ class StartGap:
     def note_published(self, published: int) -> None:
         """Takes into account how many messages the site published before it was killed.
 
-        Other sites report this number, because they received samples, the states that a site
-        sends. Missing messages before the next start first count as unpublished, because they
-        may have been in transit when the site was killed. If the reported number shows that
-        more messages were lost than can have been in transit, all lost messages count as
-        missing instead: the numbers from `_first_unpublished` to below the reported number.
+        Other sites (arm controllers) report this number, because they received samples, the
+        states that a site sends. Missing messages before the next start first count as
+        unpublished, because they may have been in transit when the site was killed. If the
+        reported number shows that more messages were lost than can have been in transit, all
+        lost messages count as missing instead: the numbers from `_first_unpublished` to below
+        the reported number.
 
         Before the next start is known, the report is only stored. `begin_next_start` evaluates
         it later.
@@ -485,8 +490,9 @@ class StartGap:
 def describe_unknown_ends(sites: Sequence[str]) -> str:
     """Returns a sentence for the user about sites of which the end is unknown.
 
-    A site publishes an "end" event when it ends. Without this event, nobody knows whether the
-    site published further records after the last record that was received.
+    A site (arm controller) publishes an "end" event when it ends. Without this event, nobody
+    knows whether the site published further records (results of control periods) after the last
+    record that was received.
 
     Args:
         sites: Names of the sites whose "end" event was not received, at least one.
@@ -563,8 +569,8 @@ class Coverage(NamedTuple):
         """Describes in words how much of the run was recorded or checked.
 
         Args:
-            least: Smallest fraction of ticks that is sufficient, from 0 to 1. The text mentions
-                it if the actual fraction is smaller.
+            least: Smallest fraction of ticks (control periods) that is sufficient, from 0 to 1.
+                The text mentions it if the actual fraction is smaller.
 
         Returns:
             The text for the user.

@@ -168,10 +168,10 @@ class ContentCheck:
         self._log_ns = 0
 
     def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
-        """Notes a message that a checksum covers, so that the next one can be compared with it.
+        """Stores a message that a checksum covers, for the check of the next message.
 
-        Messages of a channel have rising numbers and times, so that a trusted message bounds
-        those of its successor.
+        The numbers and times of the messages in a channel increase. A trusted message therefore
+        limits those of its successor.
 
         Args:
             topic: Topic of the channel.
@@ -183,9 +183,10 @@ class ContentCheck:
         self._log_ns = max(self._log_ns, log_ns)
 
     def owns_channel(self, topic: str) -> bool:
-        """Finds out whether a topic is one of a member of this session.
+        """Returns True if a topic belongs to a member of this session.
 
-        A damaged file may contain parts of another log, whose topics name another session.
+        A member is a process of the session: a site or the recorder. A damaged file may contain
+        parts of another log, whose topics name another session.
 
         Args:
             topic: Topic of a channel, such as "/trilat/paper/m1/state".
@@ -330,7 +331,8 @@ class ContentCheck:
                 f"message {identity.sequence} of {topic} is stored with the sequence number "
                 f"{sequence}"
             )
-        number = sequence if identity.number < 0 else identity.number
+        has_number = identity.number >= 0
+        number = identity.number if has_number else sequence
         self._check_number(topic, message, number)
         if isinstance(message, State):
             self._check_tick(topic, message)
@@ -363,10 +365,10 @@ class ContentCheck:
             raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the number that identifies the present start of a member.
+        """Returns the number (boot) that identifies the present start of a member's process.
 
-        In virtual time, it follows from the scenario. Otherwise it is that of the latest
-        accepted message. None if there is no such message.
+        All messages of one start contain it. In virtual time, it is computed from the scenario.
+        Otherwise it is read from the latest accepted message. None if there is no such message.
         """
         if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
@@ -400,7 +402,8 @@ class ContentCheck:
             return
 
         previous_sequence, _ = self._latest[topic]
-        rate_hz = self._scenario.sites[member].rate_hz if member in self._scenario.sites else 1
+        is_site = member in self._scenario.sites
+        rate_hz = self._scenario.sites[member].rate_hz if is_site else 1
         expected = number_message(channel, previous_sequence, rate_hz) + 1
         if isinstance(message, State):
             # The changes in a record state how many ticks the site skipped before it.
@@ -413,8 +416,8 @@ class ContentCheck:
     def _check_tick(self, topic: str, record: State) -> None:
         """Checks that the content of a record is possible in a run of the scenario.
 
-        The tick must exist and have its nominal time, the peers must exist, and the mode must
-        be known.
+        The tick (control period) must exist and have its nominal time, the peers (other sites)
+        must exist, and the mode must be known.
 
         Args:
             topic: Topic of the record, for the error message.
@@ -435,6 +438,7 @@ class ContentCheck:
                 f"the nominal time of tick {record.tick} of {topic} differs from that in the "
                 "scenario"
             )
+
         peers = self._scenario.peers(site)
         uses_known_peers = record.used.keys() <= set(peers)
         receives_from_known_peers = all(0 <= peer < len(peers) for peer, *_ in record.rx)

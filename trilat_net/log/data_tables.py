@@ -128,10 +128,10 @@ class Column(NamedTuple):
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
             return values
-        known = self.known[first:last].tolist()
-        return [
-            value if is_known else None for value, is_known in zip(values, known, strict=True)
-        ]
+        for index, is_known in enumerate(self.known[first:last].tolist()):
+            if not is_known:
+                values[index] = None
+        return values
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Table:
     """A table that is exported from a log. Its columns have equal lengths.
 
     Attributes:
-        name: Name of the site whose messages the table contains, or "events".
+        name: Name of the site (arm controller) whose messages the table contains, or "events".
         kind: What a row of a site's table is, one of `SITE_TABLE_KINDS`. Empty for other
             tables.
         about: Description of a row for the reader of the table.
@@ -236,16 +236,22 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, _FieldDoc]:
     Returns:
         The documentation by name of the field, in the order of definition.
     """
-    texts = dict(_FIELD.findall(inspect.getdoc(kind) or ""))
-    texts |= {name: _COMPLETE_TEXTS[name] for name in texts.keys() & _COMPLETE_TEXTS.keys()}
+    docstring = inspect.getdoc(kind) or ""
+    texts = dict(_FIELD.findall(docstring))
+    for name in texts.keys() & _COMPLETE_TEXTS.keys():
+        texts[name] = _COMPLETE_TEXTS[name]
+
     properties: dict[str, dict[str, Any]] = json_schema(kind)["properties"]
     docs = {}
     for name, entry in properties.items():
-        ending = name.rpartition("_")[2]
-        default_unit = _UNITS_BY_NAME.get(name, _UNITS_BY_ENDING.get(ending, ""))
+        ending = name.rpartition("_")[2]  # "us" of "late_us"
+        unit_by_ending = _UNITS_BY_ENDING.get(ending, "")
+        default_unit = _UNITS_BY_NAME.get(name, unit_by_ending)
         text = texts.get(name, entry.get("description", ""))
         one_line = " ".join(text.split()).rstrip(".")
-        docs[name] = _FieldDoc(entry.get("x-unit", default_unit), one_line, entry["type"])
+        docs[name] = _FieldDoc(
+            unit=entry.get("x-unit", default_unit), text=one_line, kind=entry["type"]
+        )
     return docs
 
 
@@ -275,7 +281,9 @@ def _to_int_array(
 def _make_time_columns(
     tick: Ints | None, t_s: NDArray[Any], log_ns: Ints, publish_ns: Ints
 ) -> Iterator[Column]:
-    """Yields the columns of the nominal time, the tick, and the arrival and sending times.
+    """Yields the first columns of a table: nominal time, tick, arrival and sending times.
+
+    A tick is the number of a period of the control loop.
 
     Args:
         tick: Ticks, shape (K,). None if the table has no column of ticks.
@@ -313,17 +321,21 @@ def _make_time_columns(
 
 
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
-    """Yields the columns of the vectors in the records: motion, torques and parameters.
+    """Yields the columns of the vectors in an arm's records, such as joint angles and torques.
+
+    Each vector has a number per joint, per coordinate of the end effector, or per parameter of
+    the dynamics. If the arms share the pose of the end effector instead of joint angles, the
+    reference and its velocity are vectors of the end effector.
 
     Args:
-        site: Records of the site.
-        arm: Model of the site's arm. It determines which coordinates the sites share.
+        site: Records (results of control periods) of the arm.
+        arm: Model of the arm.
     """
-    task = _TASK_VECTORS if arm.shares_pose else {}
+    end_effector_vectors = _TASK_VECTORS if arm.shares_pose else {}
     for field in _JOINT_VECTORS:
-        if field not in task:
+        if field not in end_effector_vectors:
             yield from _make_joint_columns(site, arm, field)
-    for field, units in task.items():
+    for field, units in end_effector_vectors.items():
         yield from _make_task_columns(site, arm, field, units)
     yield from _make_parameter_columns(site, arm)
 
@@ -347,7 +359,7 @@ def _make_task_columns(
     """Yields the columns of a vector that has a number per coordinate of the end effector.
 
     Args:
-        site: Records of the site.
+        site: Records of the site (arm controller).
         arm: Model of the site's arm.
         field: Name of the vector.
         units: Units of the position coordinates and of the other coordinates.
@@ -355,13 +367,14 @@ def _make_task_columns(
     text = read_field_docs(State)[field].text
     has_orientation = field in _POSES and arm.counts.shared == POSE
     count = POSITION if has_orientation else arm.counts.shared
+    position_unit, other_unit = units
     for n, axis in enumerate(TASK_AXES[:count]):
         yield _make_number_column(
             site=site,
             field=field,
             n=n,
             stem=f"{field}_{axis}",
-            unit=units[n >= POSITION],
+            unit=position_unit if n < POSITION else other_unit,
             text=f"{text}, along {axis}",
         )
     if has_orientation:
@@ -369,15 +382,23 @@ def _make_task_columns(
 
 
 def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
-    """Yields the columns of the estimated parameters of the arm's dynamics."""
+    """Yields the columns of the estimated parameters of the arm's dynamics.
+
+    The two-link arm of the paper has parameters with numbers, such as theta_hat3. A chain of
+    joints has the same parameters for each link, such as theta_hat2_m, the mass of the second
+    link.
+    """
     doc = read_field_docs(State)["theta_hat"]
     for n, (parameter, unit) in enumerate(arm.parameters):
-        stem = f"theta_hat{n + 1}"
-        text = f"{doc.text}, parameter {n + 1}"
-        if arm.chain is not None:
-            link, _, symbol = parameter.rpartition(".")
-            stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
-            text = f"estimate of {symbol} of link {link}, about the frame of its joint"
+        is_two_link_arm = arm.chain is None
+        if is_two_link_arm:
+            stem = f"theta_hat{n + 1}"
+            text = f"{doc.text}, parameter {n + 1}"
+        else:
+            link_name, _, symbol = parameter.rpartition(".")
+            link_number = 1 + n // LINK_PARAMETERS
+            stem = f"theta_hat{link_number}_{symbol}"
+            text = f"estimate of {symbol} of link {link_name}, about the frame of its joint"
         yield _make_number_column(
             site=site, field="theta_hat", n=n, stem=stem, unit=unit, text=text
         )
@@ -387,7 +408,7 @@ def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[
     """Yields the four columns of the orientation in a pose, as a unit quaternion.
 
     Args:
-        site: Records of the site.
+        site: Records of the site (arm controller).
         field: Name of the vector that contains the poses.
         text: Meaning of the vector.
     """
@@ -412,10 +433,10 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
-    """Returns the column of one number of a vector.
+    """Returns the column of one number of a vector, for example of joint 1 of the angles q.
 
     Args:
-        site: Records of the site.
+        site: Records of the site (arm controller).
         field: Name of the vector.
         n: Index of the number in the vector.
         stem: Name of the column without its unit.
@@ -440,6 +461,7 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
     """
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
+        # The text names the receiver and the element, if there are several.
         stem = f"ch_{name}"
         if entry.peer:
             stem += f"_{entry.peer}"
@@ -555,7 +577,7 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     """Builds the table with the records of a site, one row per tick of its control loop.
 
     Args:
-        site: Records of the site.
+        site: Records (results of control periods) of the site (arm controller).
         scenario: Scenario of the session, which names the joints and parameters.
 
     Returns:
@@ -563,7 +585,9 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     """
     docs = read_field_docs(State)
     arm = scenario.arms[site.name]
-    live = scenario.sites[site.name].find_live_hand()
+    # The person or program that moves the arm, if there is one.
+    live_operator = scenario.sites[site.name].find_live_hand()
+
     columns = list(
         _make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns)
     )
@@ -572,11 +596,13 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     )
     columns += _make_vector_columns(site, arm)
     columns += _make_sent_columns(site)
-    if live is not None:
-        columns += _make_hand_columns(site, arm, live.mode)
+    if live_operator is not None:
+        columns += _make_hand_columns(site, arm, live_operator.mode)
     columns += _make_bodies_columns(site, scenario.bodies_m(site.name))
     for peer in site.peers:
         columns += _make_sample_columns(site, peer, scenario.sites[peer].rate_hz)
+
+    # The timing of the control loop.
     for field in ("late_us", "busy_us", "sent_ns"):
         unit, text, _ = docs[field]
         columns.append(
@@ -588,20 +614,24 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
 
 
 def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Column]:
-    """Yields the columns of the peer's sample that the control law uses: its tick and age.
+    """Yields the columns that state which sample of a peer the control law used, and its age.
+
+    A sample is the state that another site (arm controller), the peer, has sent. Its age is the
+    total delay that the control law sees.
 
     Args:
-        site: Records of the site.
+        site: Records of the receiving site.
         peer: Name of the peer.
         rate_hz: Tick rate of the peer, in Hz.
     """
-    used = site.used[peer]
-    known: NDArray[np.bool_] = used >= 0
-    age_ms = (site.t_ns - used * NS_PER_S // rate_hz) / 1e6
+    used_ticks = site.used[peer]
+    known: NDArray[np.bool_] = used_ticks >= 0  # -1 before the first sample
+    stamps_ns = used_ticks * NS_PER_S // rate_hz
+    age_ms = (site.t_ns - stamps_ns) / 1e6
     source = f"used.{peer}"
     yield Column(
         name=f"used_{peer}_tick",
-        values=used,
+        values=used_ticks,
         unit="tick",
         meaning=f"tick of the sample of {peer} in use",
         source=source,
@@ -676,17 +706,17 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
 
 
 def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
-    """Builds the table of a site's statistics about its links, one row per message.
+    """Builds the table of a site's statistics about its network links, one row per message.
 
-    A field that is a map from peers to numbers becomes a column per peer.
+    A field that contains a number per peer (other site) becomes a column per peer.
 
     Args:
-        site: Records of the site.
+        site: Records of the site (arm controller).
         timed: The statistics messages, with their times of arrival and sending.
         source: Name of the file for error messages.
 
     Returns:
-        The table, in the order of the ticks.
+        The table, in the order of the ticks (control periods).
 
     Raises:
         LogError: A number is out of range.
@@ -701,7 +731,7 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
         fields = [getattr(s, field) for s in stats]
         if kind == "object":
             keys: Iterable[str] = site.peers
-            if field == "dropped":
+            if field == "dropped":  # counts by reason instead of by peer
                 keys = _list_reasons(fields)
             columns += [_make_entry_column(source, field, key, fields) for key in keys]
             continue
@@ -717,18 +747,19 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
 
 
 def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
-    """Returns the reasons why messages were dropped, in the order in which they first occur.
+    """Returns the reasons why messages were dropped, of which each becomes a column.
 
-    Reasons that lead to the same column name count once.
+    They have the order in which they first occur. Reasons that lead to the same column name
+    count once.
 
     Args:
         dropped: Numbers of dropped messages by reason, for each statistics message.
     """
-    reasons: dict[str, str] = {}
+    reason_by_column: dict[str, str] = {}
     for counts in dropped:
         for reason in sorted(counts):
-            reasons[_to_word(reason)] = reason
-    return list(reasons.values())
+            reason_by_column[_to_word(reason)] = reason
+    return list(reason_by_column.values())
 
 
 def _to_word(text: str) -> str:
@@ -764,12 +795,14 @@ def _make_entry_column(
     absent = 0 if field == "dropped" else None
     numbers = [value.get(name, absent) for value in values]
     lowest_known = 0 if field in _NONE_BELOW_0 else -math.inf
-    known = np.array([n is not None and n >= lowest_known for n in numbers], dtype=np.bool_)
+    known = np.array(
+        [number is not None and number >= lowest_known for number in numbers], dtype=np.bool_
+    )
     # The documentation of a field describes all peers. The column is that of one peer.
     meaning = meaning_of_field.removeprefix("per peer, ")
     return Column(
         name=f"{stem}_{_to_word(name)}_{ending}",
-        values=_to_int_array((n or 0 for n in numbers), source, field),
+        values=_to_int_array((number or 0 for number in numbers), source, field),
         unit=unit,
         meaning=f"{name}: {meaning}",
         source=f"{field}.{name}",
@@ -780,8 +813,8 @@ def _make_entry_column(
 def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
     """Builds a table of the events of a session, with one row per event.
 
-    An event is a message about something that happened once, for example that a site has
-    joined. The rows have the order in which the events arrived at the recorder.
+    An event is a message about something that happened once, for example that a site (arm
+    controller) has joined. The rows have the order in which the events arrived at the recorder.
 
     Args:
         timed: The events, with their times of sending and of arrival.
@@ -798,14 +831,15 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
     for field, (unit, text, kind) in read_field_docs(Event).items():
         if field in ("v", "t_ns"):
             continue
-        fields = [getattr(event, field) for event in events]
+        entries = [getattr(event, field) for event in events]
         values: NDArray[Any]
         if kind == "integer":
-            # The boot is a random number of 64 bits.
-            bits = np.uint64 if field == "boot" else np.int64
-            values = _to_int_array(fields, source, field, bits)
+            # The boot, which identifies a start of a process, is a random number of 64 bits.
+            data_type = np.uint64 if field == "boot" else np.int64
+            values = _to_int_array(entries, source, field, data_type)
         else:
-            values = np.array(list(map(_to_text, fields)), dtype=np.object_)
+            texts = [_to_text(entry) for entry in entries]
+            values = np.array(texts, dtype=np.object_)
         columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))
     return Table(EVENTS_TABLE, "", "something that happened once", tuple(columns))
 

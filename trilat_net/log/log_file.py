@@ -107,9 +107,9 @@ def _allocate(descriptor: int, begin: int, end: int) -> None:
             if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
                 raise
     os.lseek(descriptor, begin, os.SEEK_SET)
-    written = 0
-    while written < end - begin:
-        written += os.write(descriptor, bytes(end - begin - written))
+    missing_bytes = end - begin
+    while missing_bytes > 0:
+        missing_bytes -= os.write(descriptor, bytes(missing_bytes))
 
 
 SYNC_PERIOD_NS = 1_000_000_000
@@ -257,6 +257,7 @@ class LogFile:
         self.size = 0
         self.disk_error: OSError | None = None
         self._force = force
+
         try:
             refuse_existing(path, force=force, unfinished=self.working)
             if force:
@@ -266,6 +267,7 @@ class LogFile:
         except OSError as error:
             raise UsageError(str(describe_write_error(path, error))) from None
         sync_folder(path.parent)
+
         self._room = room or DiskReserve(path.parent)
         self._syncing = _FileSync(
             self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns
@@ -356,6 +358,7 @@ class LogFile:
             if not accepted:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
             self._written += accepted
+        # The last bytes show whether the file is complete: it then ends with the end mark.
         mark_bytes = len(MAGIC)
         self._tail = bytes((self._tail + self._pending[-mark_bytes:])[-mark_bytes:])
         self.size += self._written
@@ -404,6 +407,7 @@ class LogFile:
         finally:
             self._raw.close()
             self._room.release()
+
         if self.whole:
             publish_file(self.working, self.path, force=self._force)
             self._published = True

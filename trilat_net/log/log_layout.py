@@ -148,17 +148,18 @@ class ChannelFilter:
         Raises:
             UsageError: A string is not a key expression and would match no channel.
         """
-        for option, texts in (("--include", include), ("--exclude", exclude)):
-            for text in texts:
-                if not all(map(_CHUNK.fullmatch, text.strip("/").split("/"))):
+        for option, expressions in (("--include", include), ("--exclude", exclude)):
+            for expression in expressions:
+                names = expression.strip("/").split("/")
+                if not all(_CHUNK.fullmatch(name) for name in names):
                     raise UsageError(
                         f"{option} must be a key expression such as 'trilat/*/m1/**' or "
-                        f"'**/link', not {text!r}: * stands for one name, ** for any number of "
-                        "names, and $* for part of a name"
+                        f"'**/link', not {expression!r}: * stands for one name, ** for any "
+                        "number of names, and $* for part of a name"
                     )
         return ChannelFilter(
-            include=tuple(text.strip("/") for text in include),
-            exclude=tuple(text.strip("/") for text in exclude),
+            include=tuple(expression.strip("/") for expression in include),
+            exclude=tuple(expression.strip("/") for expression in exclude),
         )
 
 

@@ -117,8 +117,9 @@ class Log(Result, Mapping[str, SiteLog]):
         scenario: The scenario that ran.
         scenario_text: Text of the scenario, as stored in the file.
         scenario_sha256: SHA-256 of that text.
-        sites: Names of the sites, in the order of the scenario.
-        events: Events of all members, grouped by member, in the order of their numbers.
+        sites: Names of the sites (arm controllers), in the order of the scenario.
+        events: Events of all members (processes of a session), grouped by member, in the order
+            of their numbers.
         damaged: A sentence for each part of the file that cannot be read.
         chain: Result of the comparison with the digests that the file contains. For several
             files, the worst result.
@@ -135,6 +136,7 @@ class Log(Result, Mapping[str, SiteLog]):
         self.damaged = contents.damaged
         self.chain = contents.chain
         self.driver = self.session["driver"]
+
         self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
             self.scenario_text = contents.scenario.decode()
@@ -146,6 +148,7 @@ class Log(Result, Mapping[str, SiteLog]):
                 f"{self.source}: the scenario in this log cannot be read: {error}"
             ) from None
         self.sites = self.scenario.names
+
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
         self.unreadable: list[str] = []
@@ -156,8 +159,9 @@ class Log(Result, Mapping[str, SiteLog]):
     def headline(self) -> str:
         """Summarises the session in one line for the user.
 
-        The line says how the session ran, its sites, its length and its number of records. It
-        ends with "not finished" if the end of the log is missing.
+        The line says how the session ran, its sites (arm controllers), its length and its
+        number of records (results of control periods). It ends with "not finished" if the end
+        of the log is missing.
         """
         try:
             summary = self._describe_records()
@@ -202,8 +206,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def to_dict(self) -> dict[str, Any]:
         """Returns a summary of the session, with the keys of `trilat sim --json`.
 
-        The entry "sites" has the numbers of each site by its name. The records themselves are
-        not included.
+        The entry "sites" has the numbers of each site (arm controller) by its name. The records
+        (results of control periods) themselves are not included.
         """
         return {
             "files": list(self.sources),
@@ -219,19 +223,19 @@ class Log(Result, Mapping[str, SiteLog]):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the sites as plain values, with one row per site.
+        """Returns a table of the sites as plain values, with one row per site (arm controller).
 
         A row contains the tick rate of the site, the numbers of its recorded and missing
-        records, and the time of its last record in s.
+        records (results of control periods), and the time of its last record in s.
         """
         rows = []
-        for name, part in self.items():
+        for name, site_log in self.items():
             row = {
                 "site": name,
-                "rate_hz": part.rate_hz,
-                "records": len(part),
+                "rate_hz": site_log.rate_hz,
+                "records": len(site_log),
                 "missing": self.missing(name),
-                "last_s": float(part.t_s[-1]) if len(part) else None,
+                "last_s": float(site_log.t_s[-1]) if len(site_log) else None,
             }
             rows.append(row)
         return rows
@@ -320,32 +324,33 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
-        """Decodes the messages of a channel.
+        """Decodes the messages of a channel, and skips those that are damaged.
 
         Messages that cannot be decoded are removed from the channel, so that `unreadable`
-        reports them only once. The log then counts as incomplete.
+        reports them only once even if the channel is decoded again. The log then counts as
+        incomplete.
 
         Args:
             topic: Topic of the channel.
-            kind: Type of the messages.
+            kind: Class of the messages.
 
         Returns:
             The messages that can be decoded, in the order of the file.
         """
         channel = self._channel(topic)
         readable = ChannelMessages()
-        problem = ""
+        first_problem = ""
         messages: list[M] = []
-        for n, payload in enumerate(channel.payloads):
+        for index, payload in enumerate(channel.payloads):
             try:
                 messages.append(decode(payload, kind, READABLE))
-                readable.add(payload, channel.log_ns[n], channel.publish_ns[n])
+                readable.add(payload, channel.log_ns[index], channel.publish_ns[index])
             except WireError as error:
-                problem = problem or str(error)
-        if problem:
-            lost = count_nouns(len(channel) - len(messages), "message")
+                first_problem = first_problem or str(error)
+        if first_problem:
+            lost_count = count_nouns(len(channel) - len(messages), "message")
             self.unreadable.append(
-                f"{self.source}: {lost} on {topic} cannot be read: {problem[:200]}"
+                f"{self.source}: {lost_count} on {topic} cannot be read: {first_problem[:200]}"
             )
             self._contents.channels[topic] = readable
             self._contents.complete = False
@@ -373,19 +378,21 @@ class Log(Result, Mapping[str, SiteLog]):
         return min(known_times_s, default=None)
 
     def describe_divergence(self, site: str = "") -> str:
-        """Returns which joint exceeded its speed limit, with its speed, the limit and the time.
+        """Describes for the user which joint exceeded its speed limit, by how much, and when.
 
-        Of the joints of an arm, the one counts that exceeds its limit most.
+        If several joints of the arm exceeded their limits, the text names the joint with the
+        largest ratio of speed to limit.
 
         Args:
-            site: Name of the site whose arm diverged. Empty for the arm that diverged first.
+            site: Name of the site (arm controller) whose arm diverged. Empty for the arm that
+                diverged first.
 
         Returns:
             A clause such as "m1 joint 2 reached 21.3 rad/s (limit 20 rad/s) at 3.344 s". Empty
             if the arm did not diverge.
         """
-        first = [name for name in self if self[name].diverged_s == self.diverged_s]
-        name = site or first[0]
+        diverged_first = [name for name in self if self[name].diverged_s == self.diverged_s]
+        name = site or diverged_first[0]
         diverged_s = self[name].diverged_s
         if diverged_s is None:
             return ""
@@ -426,19 +433,19 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def complete(self) -> bool:
-        """True if the recording was finished in order, so that the file has its end.
+        """True if the recording was finished properly, so that its end cannot be missing.
 
-        A log of several files is complete if all of them were finished. It is also complete if
-        the last file was finished and no record is missing, because another recorder may have
-        recorded what an unfinished part lacks.
+        A recorder that crashes leaves an unfinished file. A log of several files is complete if
+        all of them were finished. It is also complete if the last file was finished and no
+        record is missing, because another recorder may have recorded what an unfinished file
+        lacks.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
-        stated = self._stated_ticks
-        are_sites_complete = all(
-            name in stated and not self.missing(name) for name in self.sites
+        has_all_records = all(
+            site in self._stated_ticks and not self.missing(site) for site in self.sites
         )
-        return self._contents.ended and are_sites_complete
+        return self._contents.ended and has_all_records
 
     @property
     def executed_sites(self) -> tuple[str, ...]:
@@ -472,14 +479,15 @@ class Log(Result, Mapping[str, SiteLog]):
 
         The recorder writes them at the end of a file. The dictionary is empty for a file that
         was not finished. If the log consists of several files, no file states the counts of all
-        messages. Therefore the records, statistics and events of all files are counted again.
-        The counts that belong to no topic, such as those of dropped messages, cannot be counted
-        again. They are the sums of the files, which `merge` has computed.
+        messages. Therefore the records (results of control periods), statistics and events of
+        all files are counted again. The counts that belong to no topic, such as those of
+        dropped messages, cannot be counted again. They are the sums of the files, which `merge`
+        has computed.
         """
-        written = self._contents.metadata.get(ACCOUNTS, {})
+        written_counts = self._contents.metadata.get(ACCOUNTS, {})
         has_one_file = len(self.sources) == 1
         if has_one_file:
-            return written
+            return written_counts
 
         accounts = SessionAccounts(self.session["session"], self.scenario)
         for site in self.sites:
@@ -501,8 +509,8 @@ class Log(Result, Mapping[str, SiteLog]):
         # to there are missing.
         for site, ticks in self._stated_ticks.items():
             accounts.add_expected_ticks(site, ticks)
-        other_counts = written
-        return {**accounts.format_accounts(), **other_counts}
+        # The recomputed counts precede those of no topic, such as the dropped messages.
+        return {**accounts.format_accounts(), **written_counts}
 
     def account(self, site: str) -> str:
         """Returns how many records of a site were received and how many are missing.
@@ -510,7 +518,7 @@ class Log(Result, Mapping[str, SiteLog]):
         The recorder counted them. They need not agree with the file if the file is damaged.
 
         Args:
-            site: Name of the site.
+            site: Name of the site (arm controller).
 
         Returns:
             The counts as a line of text, see `accounts`. Empty if the file was not finished.
@@ -519,26 +527,28 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """Names of the sites of which the log does not show when they ended.
+        """Names of the sites (processes that run one arm) whose end is not recorded.
 
-        A site publishes the event "end" when it ends. Without it, the site may have executed
-        more ticks than the log shows. The tuple is empty if the recorder did not record events.
-        It is also empty for a part of a log, because the events may be in a later part.
+        A site publishes the event "end" when it ends. Without this event, the site may have
+        executed more ticks (control periods) than the log shows. The tuple is empty if the
+        recorder was told not to record events.
         """
-        if self.part and len(self.sources) == 1:
-            return ()
+        is_one_of_several_parts = bool(self.part) and len(self.sources) == 1
+        if is_one_of_several_parts:
+            return ()  # the events may be in a later part
         channel_filter = parse_filter_facts(self.session)
-        ended = {event.member for event in self.events if event.kind == "end"}
-        sites = []
+        ended_sites = {event.member for event in self.events if event.kind == "end"}
+        unknown_ends = []
         for site in self.sites:
-            key = topics.key(self.session["session"], site, topics.EVENT)
-            if site not in ended and channel_filter.accepts(key):
-                sites.append(site)
-        return tuple(sites)
+            event_topic = topics.key(self.session["session"], site, topics.EVENT)
+            are_events_recorded = channel_filter.accepts(event_topic)
+            if are_events_recorded and site not in ended_sites:
+                unknown_ends.append(site)
+        return tuple(unknown_ends)
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of ticks that each site states in its "end" event, by site.
+        """Number of ticks that each site (arm controller) states in its "end" event, by site.
 
         A number above that of the scenario is reduced to it. Sites without such an event are
         missing.
@@ -552,11 +562,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Starts of each site that joined the session while it was running.
+        """Starts of each site (arm controller) that joined the session while it was running.
 
-        A start is a pair: the first tick, and a random number (boot) that identifies this start
-        of the process. Sites that were present from the beginning and were never started again
-        have no entry.
+        A start is a pair: the first tick (control period), and a random number (boot) that
+        identifies this start of the process. Sites that were present from the beginning and
+        were never started again have no entry.
         """
         starts: dict[str, list[tuple[int, int]]] = {}
         for event in self.events:
@@ -636,9 +646,10 @@ class Log(Result, Mapping[str, SiteLog]):
     def find_unexecuted_ticks(self, site: str) -> list[tuple[int, int]]:
         """Finds the ticks that a site did not execute, although the session was running.
 
-        These are the ticks between two starts of the site (`absences`), and the ticks that the
-        site skipped because it was late, as its records state. The site published nothing in
-        these ticks, so that neither records nor samples of these ticks are missing.
+        These are the ticks (control periods) between two starts of the site (`absences`), and
+        the ticks that the site (arm controller) skipped because it was late, as its records
+        state. The site published nothing in these ticks, so that neither records nor samples of
+        these ticks are missing.
 
         Args:
             site: Name of the site.
@@ -659,9 +670,10 @@ class Log(Result, Mapping[str, SiteLog]):
     def expected_ticks(self, site: str) -> int:
         """Returns the number of ticks that a site should have executed in this run.
 
-        The "end" event of the site states that number. Without this event, the ticks up to the
-        last record count if the site was lost for good. Otherwise all ticks of the scenario
-        count. Ticks that the site did not execute (`absent_ticks`) are subtracted.
+        The "end" event of the site (arm controller) states that number. Without this event, the
+        ticks (control periods) up to the last record count if the site was lost for good.
+        Otherwise all ticks of the scenario count. Ticks that the site did not execute
+        (`absent_ticks`) are subtracted.
         """
         recorded = self[site].last_tick + 1
         ticks = self._stated_ticks.get(site)
@@ -684,10 +696,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return last.kind in ("lost", "left")
 
     def missing(self, site: str) -> int:
-        """Computes how many records of a site the log lacks.
+        """Computes how many records of a site (arm controller) the log lacks.
 
-        The "end" event of the site states how many ticks it executed. If this event is not in
-        the log, only records before the last record can be known to be missing.
+        The "end" event of the site states how many ticks (control periods) it executed. If this
+        event is not in the log, only records before the last record can be known to be missing.
 
         Args:
             site: Name of the site.
@@ -695,35 +707,37 @@ class Log(Result, Mapping[str, SiteLog]):
         Returns:
             The number of missing records. It is 0 if none is known to be missing.
         """
-        part = self[site]
-        after_last = max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
-        return max(0, part.missing + after_last - self.absent_ticks(site))
+        site_log = self[site]
+        after_last = max(0, self._stated_ticks.get(site, 0) - (site_log.last_tick + 1))
+        return max(0, site_log.missing + after_last - self.absent_ticks(site))
 
     @cached_property
     def last_ticks(self) -> dict[str, int]:
         """Last tick that each site is known to have executed, by name of the site.
 
-        The "end" event of a site states that tick. Without this event, it is the tick of the
-        last record of the site, or of the last sample of the site that another site received,
-        whichever is later. It is -1 if nothing is known.
+        The "end" event of a site (arm controller) states that tick (control period). Without
+        this event, it is the tick of the last record of the site, or of the last sample of the
+        site that another site received, whichever is later. It is -1 if nothing is known.
         """
         stated = self._stated_ticks
-        last = {}
+        last_ticks = {}
         for name in self.sites:
             ticks = stated.get(name, self[name].last_tick + 1)
-            last[name] = ticks - 1
+            last_ticks[name] = ticks - 1
 
         for name in self.sites:
             peers = self[name].peers
-            unknown = {index: peer for index, peer in enumerate(peers) if peer not in stated}
-            if not unknown:
+            peers_without_end = {
+                index: peer for index, peer in enumerate(peers) if peer not in stated
+            }
+            if not peers_without_end:
                 continue  # spares the decoding of all records
             for state in self[name].states:
                 for index, tick, _ in state.rx:
-                    peer = unknown.get(index)
+                    peer = peers_without_end.get(index)
                     if peer is not None and tick < self.scenario.ticks(peer):
-                        last[peer] = max(last[peer], tick)
-        return last
+                        last_ticks[peer] = max(last_ticks[peer], tick)
+        return last_ticks
 
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
@@ -736,13 +750,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._sites[site]
 
     def _read_site(self, site: str) -> SiteLog:
-        """Returns the records of a site.
+        """Creates the view of one arm's records that `log[name]` returns.
 
         Raises:
-            LogError: A tick is beyond the length of the scenario.
+            LogError: A tick (control period) is beyond the length of the scenario.
         """
         channel = self._channel(self._topic(site, topics.STATE))
-        part = SiteLog(
+        site_log = SiteLog(
             name=site,
             peers=self.scenario.peers(site),
             rate_hz=self.scenario.sites[site].rate_hz,
@@ -754,18 +768,18 @@ class Log(Result, Mapping[str, SiteLog]):
             axes=self.scenario.arms[site].axes,
         )
         ticks = self.scenario.ticks(site)
-        last = part.last_tick
+        last_tick = site_log.last_tick
         # Counts and arrays grow with the last tick, so that a damaged tick could fill the
         # memory.
-        if last >= ticks:
+        if last_tick >= ticks:
             raise LogError(
-                f"{self.source}: {site} has a record of tick {last}, but the scenario has only "
-                f"{count_nouns(ticks, 'tick')}"
+                f"{self.source}: {site} has a record of tick {last_tick}, but the scenario has "
+                f"only {count_nouns(ticks, 'tick')}"
             )
-        return part
+        return site_log
 
     def changes(self, site: str) -> dict[int, list[str]]:
-        """Lists the changes of parameters that a site applied during the run.
+        """Lists the changes of parameters that a site (arm controller) applied during the run.
 
         The site stores its changes in its records. If a record is missing, its changes are
         taken from the "change" events of the site.
@@ -774,7 +788,7 @@ class Log(Result, Mapping[str, SiteLog]):
             site: Name of the site.
 
         Returns:
-            For each tick with changes, the changes as JSON texts.
+            For each tick (control period) with changes, the changes as JSON texts.
         """
         changes = self[site].changes()
         change_events = [event for event in self.events if event.kind == "change"]
@@ -792,10 +806,11 @@ class Log(Result, Mapping[str, SiteLog]):
         `changes` returns the same changes as JSON texts.
 
         Args:
-            site: Name of the site.
+            site: Name of the site (arm controller).
 
         Returns:
-            For each tick with changes, the changes as `Site.step` receives them.
+            For each tick (control period) with changes, the changes as `Site.step` receives
+            them.
 
         Raises:
             LogError: A text is not a valid change of the scenario.
@@ -810,25 +825,28 @@ class Log(Result, Mapping[str, SiteLog]):
         return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Finds out which samples of the other arms the user of a site saw at each record.
+        """Returns which states of the other arms the user of a site saw on the screen.
 
-        The user usually sees the sample that the control law uses. If the scenario has a table
-        `[sites.NAME.view]`, the picture has a delay of its own. Then the user sees the newest
-        sample that has arrived with that delay.
+        The user usually sees the state that the control law uses. If the scenario has a table
+        `[sites.NAME.view]`, the picture has a delay of its own, like a video that arrives later
+        than the control signals. The user then sees the newest state that has arrived with that
+        delay.
 
         Args:
-            site: Name of the site.
+            site: Name of the user's site (arm controller).
 
         Returns:
-            For each peer the ticks of the visible samples, shape (K,). They are -1 before the
-            first sample.
+            For each other arm (peer) the ticks (control periods) of the visible states, one per
+            record of the site, shape (K,). They are -1 before the first state.
         """
-        part = self[site]
-        samples = PictureDelay(self.scenario, site).list_shown_samples(part.last_tick + 1)
-        ticks = dict(part.used)
-        for peer, peer_ticks in samples.items():
-            ticks[peer] = np.minimum(peer_ticks[part.tick], self[peer].last_tick)
-        return ticks
+        site_log = self[site]
+        delayed_pictures = PictureDelay(self.scenario, site).list_shown_samples(
+            site_log.last_tick + 1
+        )
+        shown_ticks = dict(site_log.used)
+        for peer, peer_ticks in delayed_pictures.items():
+            shown_ticks[peer] = np.minimum(peer_ticks[site_log.tick], self[peer].last_tick)
+        return shown_ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Decodes the statistics that a site published about its links, such as losses.
@@ -893,9 +911,10 @@ class Log(Result, Mapping[str, SiteLog]):
         """Returns a table of the log: columns with names, units and meanings.
 
         Args:
-            name: Name of a site, or "events".
-            kind: Kind of a site's table: "state" (the default) has a row per record, "link" a
-                row per statistics message, and "arrivals" a row per sample that arrived.
+            name: Name of a site (arm controller), or "events".
+            kind: Kind of a site's table: "state" (the default) has a row per record (result of
+                a control period), "link" a row per statistics message, and "arrivals" a row per
+                sample that arrived.
 
         Raises:
             UnknownName: The log has no such table.
@@ -933,7 +952,7 @@ class Log(Result, Mapping[str, SiteLog]):
         `to_frame` returns a pandas data frame.
 
         Args:
-            name: Name of a site, or "events".
+            name: Name of a site (arm controller), or "events".
             kind: Kind of a site's table, see `table`.
 
         Raises:
@@ -1015,29 +1034,38 @@ def _read_parts(
     All files are opened before the first one is read, so that a missing file is reported at
     once.
     """
-    files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
-        for source in sources:
-            if isinstance(source, str | Path):
-                with _convert_errors(str(source)):
-                    stream = stack.enter_context(open_regular(Path(source)))
-                files.append((stream, str(source)))
-            elif hasattr(source, "seek"):
-                files.append((source, "log"))
-            else:
-                raise LogError(
-                    "a log must be given as a path or as a file opened for reading, not "
-                    f"{source!r:.80}"
-                )
+        files = [_open_source(source, stack) for source in sources]
         sizes = [_measure_size(stream) for stream, _ in files]
-        start = 0
+        bytes_before = 0
         for (stream, name), size in zip(files, sizes, strict=True):
             with _convert_errors(name):
-                shifted = shift_progress(progress, start, sum(sizes))
+                shifted = shift_progress(progress, bytes_before, sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
-            start += size
+            bytes_before += size
     return parts
+
+
+def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
+    """Opens one file of a log, unless the caller has opened the file already.
+
+    Args:
+        source: Path, or binary file opened for reading.
+        stack: Context that closes the files that are opened here.
+
+    Returns:
+        The open file, and its name for error messages.
+    """
+    if isinstance(source, str | Path):
+        with _convert_errors(str(source)):
+            stream = stack.enter_context(open_regular(Path(source)))
+        return stream, str(source)
+    if hasattr(source, "seek"):
+        return source, "log"
+    raise LogError(
+        f"a log must be given as a path or as a file opened for reading, not {source!r:.80}"
+    )
 
 
 @contextmanager
@@ -1062,11 +1090,12 @@ def _measure_size(stream: BinaryIO) -> int:
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:
     """Returns the measured delays of the samples of a link, in the order of their stamps.
 
-    The stamp of a sample is the nominal time of the tick in which the sender computed it. The
-    receiver stores the network delay of each sample in the field `rx` of its records. Delays
-    that the scenario injected are not included. A negative delay is an error of the clocks and
-    counts as 0. If a sample arrived twice, the shorter delay counts. A sample counts as sent if
-    the sender has a record of its tick. A lost sample has an infinite delay.
+    The stamp of a sample is the nominal time of the tick (control period) in which the sender
+    computed it. The receiver stores the network delay of each sample in the field `rx` of its
+    records (results of control periods). Delays that the scenario injected are not included. A
+    negative delay is an error of the clocks and counts as 0. If a sample arrived twice, the
+    shorter delay counts. A sample counts as sent if the sender has a record of its tick. A lost
+    sample has an infinite delay.
 
     Args:
         path: The log.
@@ -1091,11 +1120,11 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
 @lru_cache(maxsize=1)
 def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[TracePoint]]:  # noqa: ARG001
-    """Returns the delays of every link of a log, by the name of the link.
+    """Measures the network delays of all links of a log, by the name of the link ("m1->s").
 
     The result for the last file is cached, because a scenario reads the links of a log one
-    after the other. `modified_ns` and `size` are part of the key of the cache. They change if
-    the file is written again.
+    after the other. `modified_ns` and `size` are not used here, but they are part of the key of
+    the cache: if the file is written again, they change, and the file is read again.
     """
     delays = {}
     try:
@@ -1160,8 +1189,8 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
 def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
     """Returns the intervals in which a sample may have arrived although no record shows it.
 
-    Records are missing before the first record, between records whose ticks are not
-    consecutive, and after the last record.
+    Records (results of control periods) are missing before the first record, between records
+    whose ticks (control periods) are not consecutive, and after the last record.
 
     Args:
         states: Records of the receiver, in the order of their ticks.
@@ -1172,9 +1201,9 @@ def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
     if not states:
         return [(0, math.inf)]
     gaps: list[tuple[int, float]] = []
-    for before, after in pairwise(states):
-        if after.tick != before.tick + 1:
-            gaps.append((before.t_ns, after.t_ns))
+    for record, next_record in pairwise(states):
+        if next_record.tick != record.tick + 1:
+            gaps.append((record.t_ns, next_record.t_ns))
     if states[0].tick > 0:
         gaps.append((0, states[0].t_ns))
     gaps.append((states[-1].t_ns, math.inf))

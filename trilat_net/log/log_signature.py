@@ -87,18 +87,18 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
         raise UsageError(
             f"{path}: is not the name of a key; name the key as in: trilat keys pair lab"
         )
-    private = path.with_name(f"{path.name}.key")
-    public = path.with_name(f"{path.name}.pub")
-    for file in (private, public):
+    private_path = path.with_name(f"{path.name}.key")
+    public_path = path.with_name(f"{path.name}.pub")
+    for file in (private_path, public_path):
         refuse_existing(file, force=False)
     key = Ed25519PrivateKey.generate()
     pem = serialization.Encoding.PEM
-    plain = serialization.NoEncryption()
-    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
-    write_whole(private, secret, force=False, mode=0o600)
+    no_password = serialization.NoEncryption()
+    private_bytes = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, no_password)
+    write_whole(private_path, private_bytes, force=False, mode=0o600)
     public_format = serialization.PublicFormat.SubjectPublicKeyInfo
-    write_whole(public, key.public_key().public_bytes(pem, public_format), force=False)
-    return private, public
+    write_whole(public_path, key.public_key().public_bytes(pem, public_format), force=False)
+    return private_path, public_path
 
 
 def sign_log(
@@ -176,7 +176,8 @@ def check_signatures(
     Args:
         paths: The logs. The signature of a log is in a file beside it.
         key_file: File of the public key of a signer whom the user trusts.
-        progress: Function that is called after every record of a log.
+        progress: Function that is called after every record (result of a control period) of a
+            log.
 
     Returns:
         The result, with a problem for each log whose signature is missing or invalid.
@@ -211,28 +212,33 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
     Raises:
         LogError: The log cannot be read.
     """
-    file = path.with_name((path.name or "log") + SUFFIX)
+    signature_file = path.with_name((path.name or "log") + SUFFIX)
     try:
-        with open_regular(file) as stream:
-            stated = msgspec.json.decode(stream.read(_MAX_BYTES), type=_LogSignature)
-        signature = base64.b64decode(stated.signature, validate=True)
+        with open_regular(signature_file) as stream:
+            stated_signature = msgspec.json.decode(stream.read(_MAX_BYTES), type=_LogSignature)
+        signature = base64.b64decode(stated_signature.signature, validate=True)
     except FileNotFoundError:
-        return f"there is no signature file {file}"
+        return f"there is no signature file {signature_file}"
     except OSError as error:
-        return f"{file} cannot be read: {error.strerror}"
+        return f"{signature_file} cannot be read: {error.strerror}"
     except ValueError as error:  # msgspec and base64 raise it
-        return f"{file} is not a signature of this program: {error}"
-    if stated.format != _FORMAT:
-        return f"{file} has the format {stated.format[:40]!r}, not {_FORMAT!r}"
+        return f"{signature_file} is not a signature of this program: {error}"
+
+    if stated_signature.format != _FORMAT:
+        return (
+            f"{signature_file} has the format {stated_signature.format[:40]!r}, not {_FORMAT!r}"
+        )
     try:
-        key.verify(signature, _signed_bytes(stated.chain))
+        key.verify(signature, _signed_bytes(stated_signature.chain))
     except InvalidSignature:
-        return f"{file} was not made by the owner of this key, or was changed"
+        return f"{signature_file} was not made by the owner of this key, or was changed"
+
+    # The signature is valid for the digests that it states. Does the log have these digests?
     integrity, chain = _read_chain(path, progress)
-    if chain != stated.chain:
+    if chain != stated_signature.chain:
         return (
             "the signature belongs to other content "
-            f"({count_nouns(stated.chain.get('messages', '?'), 'message')})"
+            f"({count_nouns(stated_signature.chain.get('messages', '?'), 'message')})"
         )
     return "" if integrity.state is DigestState.INTACT else integrity.text
 

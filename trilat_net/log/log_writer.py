@@ -180,27 +180,26 @@ class LogWriter:
         Returns:
             The numbers of the channels in the file, by key. None for excluded channels.
         """
-        schemas = {
-            name: self._file.register_schema(
-                f"trilat.{kind.__name__}.v{VERSION}",
-                "jsonschema",
-                json.dumps(json_schema(kind)).encode(),
-            )
-            for name, kind in log_layout.CHANNEL_TYPES.items()
-        }
+        # A schema describes the fields of one kind of messages.
+        schemas: dict[str, int] = {}
+        for name, kind in log_layout.CHANNEL_TYPES.items():
+            schema_name = f"trilat.{kind.__name__}.v{VERSION}"
+            schema_text = json.dumps(json_schema(kind)).encode()
+            schemas[name] = self._file.register_schema(schema_name, "jsonschema", schema_text)
+
         channels: dict[str, int | None] = {}
         for member in (*scenario.names, topics.RECORDER):
             is_site = member != topics.RECORDER
             names = log_layout.SITE_CHANNELS if is_site else log_layout.RECORDER_CHANNELS
             for name in names:
                 key = topics.key(session, member, name)
-                about = {"member": member}
+                metadata = {"member": member}
                 if name == topics.STATE:
-                    about["rate_hz"] = str(scenario.sites[member].rate_hz)
+                    metadata["rate_hz"] = str(scenario.sites[member].rate_hz)
                 channels[key] = None
                 if choice.accepts(key):
                     channels[key] = self._file.register_channel(
-                        f"/{key}", "msgpack", schemas[name], about
+                        f"/{key}", "msgpack", schemas[name], metadata
                     )
         return channels
 
@@ -313,14 +312,18 @@ class LogWriter:
             return
         is_intact = not self._end_reason
         self._end_reason = _FINISHED
-        excluded = {f"/{key}" for key, channel in self._channels.items() if channel is None}
-        included = {name: text for name, text in accounts.items() if name not in excluded}
+        excluded_topics = {
+            f"/{key}" for key, channel in self._channels.items() if channel is None
+        }
+        included_accounts = {
+            name: text for name, text in accounts.items() if name not in excluded_topics
+        }
         with self._translate_disk_errors():
             try:
                 if self._views is not None and is_intact:
                     self._views.finish(self._last_log_ns)
             finally:
-                self._file.add_metadata(log_layout.ACCOUNTS, included)
+                self._file.add_metadata(log_layout.ACCOUNTS, included_accounts)
                 self.records_digest = self._file.close_digest()["records"]
                 self._file.finish()
 
@@ -461,23 +464,24 @@ class LogParts:
         self._begin_part()
 
     def _begin_part(self) -> None:
-        """Opens the file of the current part, and writes its beginning.
+        """Opens the next file of the log, and writes its beginning.
 
-        If that fails, the file is removed.
+        A log that is split has several numbered files, its parts. If the beginning cannot be
+        written, the file is removed.
 
         Raises:
             UsageError: The file cannot be created.
             LogRefused: The disk refused the data.
         """
         path = log_layout.part_path(self._storage.path, self._number)
-        part: dict[str, str] = {}
+        part_metadata: dict[str, str] = {}
         if self._number:
-            part = {"index": str(self._number), "previous": self._previous}
+            part_metadata = {"index": str(self._number), "previous": self._previous}
         if self._previous_digest:
-            part[PREVIOUS_DIGEST_KEY] = self._previous_digest
+            part_metadata[PREVIOUS_DIGEST_KEY] = self._previous_digest
         self._file = file = self._open_file(path)
         try:
-            self._writer = self._begin_writer(file, part)
+            self._writer = self._begin_writer(file, part_metadata)
         except LogRefused:
             file.discard()
             if file.disk_error is None:

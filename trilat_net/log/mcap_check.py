@@ -98,10 +98,10 @@ class FileCheck:
         self._findings[check].add(self._file, offset, text)
 
     def _check_content(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks a record according to its kind.
+        """Checks a record of the file with the method for records of its kind.
 
         Raises:
-            UnreadableRecord: The record makes no sense, or its checksum differs.
+            UnreadableRecord: The record cannot be decoded, or its checksum differs.
         """
         frame = record.frame
         content = record.content
@@ -122,11 +122,11 @@ class FileCheck:
     def _check_other(
         self, frame: mcap_records.RecordFrame, content: bytes, record: Any
     ) -> None:
-        """Notes metadata, an attachment, an index entry or another record of the file's end.
+        """Stores metadata, attachments and index entries, which are compared at the end.
 
         Metadata and attachments must appear in the index at the end of the file. The entry that
-        they must have there is noted as expected. The entries of the index that are read later
-        are noted as stated. When the whole file has been read, `_compare_index` compares both.
+        they must have there is stored as expected. The entries of the index that are read later
+        are stored as stated. When the whole file has been read, `_compare_index` compares both.
         An entry of a metadata record or an attachment is (size of the record, name). An entry
         of a chunk is (size of the record, first and last log time, offsets of the message
         indexes by channel), see `_check_chunk`. All other records are noted for `_compare_end`.
@@ -185,8 +185,10 @@ class FileCheck:
                 frame.offset,
                 f"{name} {record.id} is defined again with other values",
             )
-        schema = record.schema_id if opcode == Opcode.CHANNEL else 0
-        if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._has_unreadable:
+        if opcode == Opcode.SCHEMA or not record.schema_id or self._has_unreadable:
+            return  # an unreadable record may have defined the schema
+        schema = record.schema_id
+        if (Opcode.SCHEMA, schema) not in self._defined:
             text = f"channel {record.id} names schema {schema}, which no earlier record defines"
             self._add("records", frame.offset, text)
 
@@ -268,6 +270,9 @@ class FileCheck:
     def _check_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Compares the index of one channel's messages with the messages of the last chunk.
 
+        A chunk is a compressed block of messages. Behind it, the file has an index for each
+        channel, which states the time and the place of each message in the chunk.
+
         Raises:
             UnreadableRecord: The length of the index is wrong.
         """
@@ -312,7 +317,10 @@ class FileCheck:
             self._compare_end()
 
     def _compare_end(self) -> None:
-        """Compares the index, the statistics and the checksums at the end with the data."""
+        """Compares the end of the file, which summarises the data, with the data themselves.
+
+        The end contains an index, the statistics (numbers of records), and checksums.
+        """
         if not self._has_unreadable:
             self._compare_index()
             self._compare_statistics()

@@ -133,14 +133,18 @@ class McapMessage(NamedTuple):
 
 
 class _MessageBlock(NamedTuple):
-    """Messages of one topic that follow each other in a chunk.
+    """The messages of one topic in a part of a chunk, still in their places in the chunk.
+
+    A chunk is a block of messages of all topics, which is compressed as a whole. Messages are
+    found and copied in blocks, because compiled code does this much faster than a loop over
+    single messages in Python.
 
     Attributes:
         topic: Topic of the channel.
         chunk: The unpacked chunk, or the payload of a single message.
-        run: The messages of all channels that a walk has found in the chunk.
+        run: Places of the messages of all channels in this part of the chunk.
         listed: Number of messages in `run`.
-        slot: Slot of the channel in `run`.
+        slot: Index by which `run` identifies the channel.
     """
 
     topic: str
@@ -151,7 +155,7 @@ class _MessageBlock(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """Number of messages."""
+        """Number of messages in the block."""
         return int(self.run.counts[self.slot])
 
     @property
@@ -160,16 +164,18 @@ class _MessageBlock(NamedTuple):
         return int(self.run.lengths[self.slot])
 
     def copy_payloads(self, target: NDArray[np.uint8], offset: int) -> tuple[Ints, Ints]:
-        """Copies the payloads one after another. The reader must not have read further.
+        """Copies the payloads of the K messages one after another into an array.
+
+        It must be called before the reader continues, which reuses the memory of `run`.
 
         Args:
             target: Array that receives the payloads.
-            offset: Offset of the first byte in `target`.
+            offset: Offset in `target` at which the first payload begins.
 
         Returns:
-            The place after each payload, shape (K,), and the times of arrival and of sending,
-            in Unix time, in ns, shape (2, K). A time of 2^63 ns or later is negative: it has
-            the bits of an unsigned number.
+            The offset in `target` at which each payload ends, shape (K,), and the times of
+            arrival and of sending, in Unix time, in ns, shape (2, K). The times are unsigned
+            numbers in a signed type, so a time of 2^63 ns or later appears negative.
         """
         ends = np.zeros(self.messages, np.int64)
         times = np.zeros((2, self.messages), np.int64)
@@ -250,6 +256,7 @@ class McapReader:
         self.unpacked_bytes = 0
         self.offset = 0
         self.complete = False
+
         self._chain = RunningDigest()
         self.scanner = mcap_records.RecordScanner(stream)
         self.size = self.scanner.size
@@ -258,14 +265,19 @@ class McapReader:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._session_channels: set[int] = set()
-        # Numbers of the channels with a slot, in the order of the slots.
+
+        # Compiled code finds messages in blocks. It identifies a channel by a slot, a small
+        # number: `_slots` has the number of the channel of each slot.
         self._slots: list[int] = []
         self._slot_of_channel = np.full(chunk_walk.MOST_CHANNELS, -1, np.int32)
         self._run = chunk_walk.allocate_run(0, chunk_walk.CAPACITY)
+
         # Memory that may still be used, for all messages and for each channel, in bytes.
         self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
-        share = math.inf if self._memory_left is None else _CHANNEL_SHARE * self._memory_left
-        self._channel_memory_left: defaultdict[int, float] = defaultdict(lambda: share)
+        channel_limit = (
+            math.inf if self._memory_left is None else _CHANNEL_SHARE * self._memory_left
+        )
+        self._channel_memory_left: defaultdict[int, float] = defaultdict(lambda: channel_limit)
         self._more_damage: list[mcap_records.Damage] = []
         # True if the whole file is scanned, however damaged it is.
         self._is_scanned = False
@@ -327,10 +339,10 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def _check_begin(self) -> None:
-        """Checks that the file begins as an MCAP file.
+        """Checks that the file begins with the mark of MCAP files.
 
         Raises:
-            LogError: It does not.
+            LogError: The file does not begin with the mark.
         """
         if not self.scanner.begins:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
@@ -347,22 +359,29 @@ class McapReader:
         yield from self._walk()
 
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
-        """Yields what the scanner finds, and updates the position and the reported progress."""
+        """Yields the records and the damaged parts of the file, and reports the progress.
+
+        The progress is reported after the caller has handled a record, which is when the
+        generator continues.
+        """
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
                 yield item
                 continue
+
             frame = item.frame
             self.offset = frame.offset
             yield item
             if self._progress is not None:
                 self._progress(frame.end, self.size)
+
         self.complete = self.scanner.finished and not self._gave_up
 
     def read_record(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
-        """Yields the messages in a record, and stores what it contains besides.
+        """Yields the messages in a record, and stores its metadata, attachments or definitions.
 
-        A record that cannot be read is added to `damaged`.
+        Callers use it with `scan`, if they need the records and the messages of a file. A
+        record that cannot be read is added to `damaged`.
 
         Args:
             record: The next record of the file.
@@ -457,23 +476,27 @@ class McapReader:
             UnreadableRecord: The record makes no sense.
             LogError: The messages need too much memory.
         """
-        yield from self._read_rest(_ReadPart(record.frame, self._unpack(record)))
+        yield from self._read_remaining_messages(
+            _PartlyReadRecord(record.frame, self._unpack(record))
+        )
 
-    def _read_rest(self, part: "_ReadPart") -> Iterator[McapMessage]:
+    def _read_remaining_messages(
+        self, partly_read: "_PartlyReadRecord"
+    ) -> Iterator[McapMessage]:
         """Yields the messages of a record that have not been read yet.
 
         Messages and definitions are added to the digests. The local variables make this loop
         fast, which runs for every message of a file.
 
         Args:
-            part: The part of the record that has been read.
+            partly_read: The record, and how far it has been read.
 
         Raises:
             UnreadableRecord: The record makes no sense.
             LogError: The messages need too much memory.
         """
-        frame = part.frame
-        data = part.data
+        frame = partly_read.frame
+        data = partly_read.data
         find_topic = self._topics.get
         session_channels = self._session_channels
         memory_left = self._channel_memory_left
@@ -482,7 +505,7 @@ class McapReader:
         new = tuple.__new__  # twice as fast as calling the class `McapMessage`
         memory = 0
         messages = 0
-        for opcode, begin, end in mcap_records.iterate_records(data, part.offset):
+        for opcode, begin, end in mcap_records.iterate_records(data, partly_read.offset):
             if opcode == mcap_records.OP_MESSAGE:
                 length = end - begin
                 messages += 1
@@ -499,7 +522,7 @@ class McapReader:
                     cost = _SKIPPED_BYTES + length
                 remaining = memory_left[channel]
                 if remaining < cost:
-                    self._cut_channel(channel, frame)
+                    self._stop_reading_channel(channel, frame)
                     continue
                 memory_left[channel] = remaining - cost
                 memory += cost
@@ -508,135 +531,171 @@ class McapReader:
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in mcap_records.DEFINITIONS:
-                self._read_definition(part, opcode, begin, end)
-        self._end_part(part, part.messages + messages, part.memory + memory)
+                self._read_definition(partly_read, opcode, begin, end)
+        self._finish_record(
+            partly_read, partly_read.messages + messages, partly_read.memory + memory
+        )
 
-    def _read_definition(self, part: "_ReadPart", opcode: int, begin: int, end: int) -> None:
-        """Stores a definition in a record, and adds the messages before it to the digest.
+    def _read_definition(
+        self, partly_read: "_PartlyReadRecord", opcode: int, begin: int, end: int
+    ) -> None:
+        """Stores the definition of a schema or channel that lies between the messages.
+
+        The messages before the definition are added to the digest (checksum) of all messages,
+        which leaves out the definitions.
 
         Args:
-            part: The part of the record that has been read.
+            partly_read: The record, and how far it has been read.
             opcode: Kind of the definition.
-            begin: Place of the definition's content.
-            end: Place after its content.
+            begin: Offset at which the content of the definition begins.
+            end: Offset after its content.
 
         Raises:
             UnreadableRecord: The definition cannot be decoded.
             LogError: There is not enough memory left.
         """
-        # The digest of the messages leaves out the definitions between them.
         record_start = begin - mcap_records.RECORD_HEAD_BYTES
-        self._chain.add_records(memoryview(part.data)[part.digested : record_start], 0)
-        part.digested = end
-        self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), part.frame)
-        self._define(opcode, part.data[begin:end])
+        self._chain.add_records(
+            memoryview(partly_read.data)[partly_read.digested : record_start], 0
+        )
+        partly_read.digested = end
+        self._reserve_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), partly_read.frame)
+        self._define(opcode, partly_read.data[begin:end])
 
-    def _end_part(self, part: "_ReadPart", messages: int, memory: int) -> None:
-        """Adds the rest of a record to the digest, and subtracts the memory of its messages.
+    def _finish_record(
+        self, partly_read: "_PartlyReadRecord", messages: int, memory: int
+    ) -> None:
+        """Concludes the reading of a record, of which all messages have been read.
+
+        The messages after the last definition are added to the digest (checksum) of all
+        messages, and the memory of all messages is subtracted from the memory that may still be
+        used.
 
         Args:
-            part: The part of the record that has been read.
+            partly_read: The record, and how far it has been read.
             messages: Number of messages in the record.
             memory: Memory that the messages need, in bytes.
 
         Raises:
             LogError: There is not enough memory left.
         """
-        self._chain.add_records(memoryview(part.data)[part.digested :], messages)
-        self._take_memory(memory, part.frame)
+        self._chain.add_records(memoryview(partly_read.data)[partly_read.digested :], messages)
+        self._reserve_memory(memory, partly_read.frame)
 
     def _read_blocks(
         self, record: mcap_records.ScannedRecord, is_kept: Callable[[str], bool]
     ) -> Iterator[_MessageBlock]:
         """Yields the messages of a record in blocks, and stores its schemas and channels.
 
+        Compiled code (`walk_messages`) finds the messages up to the next definition of a schema
+        or channel. The definition is then read, and the search continues behind it. If compiled
+        code cannot continue, or if the record is short, the remaining messages are read one by
+        one.
+
         Args:
             record: The record, of a kind in `_READ`.
             is_kept: Function that decides whether the messages of a topic are yielded.
 
         Raises:
-            UnreadableRecord: The record makes no sense.
+            UnreadableRecord: The record cannot be decoded.
             LogError: The messages need too much memory.
         """
-        part = _ReadPart(record.frame, self._unpack(record))
-        data = part.data
+        partly_read = _PartlyReadRecord(record.frame, self._unpack(record))
+        data = partly_read.data
         chunk = np.frombuffer(data, np.uint8)
         is_long = len(data) >= _BLOCK_BYTES
-        while is_long and part.offset < len(data):
+        while is_long and partly_read.offset < len(data):
             run = self._clear_run()
             count, offset, reason = chunk_walk.walk_messages(
-                chunk, part.offset, self._slot_of_channel, _LONG_BYTES, run
+                chunk, partly_read.offset, self._slot_of_channel, _LONG_BYTES, run
             )
-            if reason == chunk_walk.AT_UNKNOWN or not self._take_run(part, run):
-                break  # the messages from `part.offset` on are read one by one
-            part.messages += count
-            part.offset = offset
-            yield from self._divide_run(chunk, count, run, is_kept)
+            if reason == chunk_walk.AT_UNKNOWN or not self._reserve_run_memory(
+                partly_read, run
+            ):
+                break  # the messages from `partly_read.offset` on are read one by one
+            partly_read.messages += count
+            partly_read.offset = offset
+            yield from self._split_by_channel(chunk, count, run, is_kept)
             if reason == chunk_walk.AT_DEFINITION:
                 opcode, begin, end = next(mcap_records.iterate_records(data, offset))
-                self._read_definition(part, opcode, begin, end)
-                part.offset = end
+                self._read_definition(partly_read, opcode, begin, end)
+                partly_read.offset = end
 
-        is_read = is_long and part.offset == len(data)
-        if is_read:
-            self._end_part(part, part.messages, part.memory)
+        is_completely_read = is_long and partly_read.offset == len(data)
+        if is_completely_read:
+            self._finish_record(partly_read, partly_read.messages, partly_read.memory)
             return
-        for message in self._read_rest(part):
+        for message in self._read_remaining_messages(partly_read):
             if is_kept(message.topic):
                 yield _make_single_block(message)
 
     def _clear_run(self) -> chunk_walk.MessageRun:
-        """Returns arrays for the messages of a walk, with sums of zero for every slot."""
+        """Returns the arrays that receive the next messages of a chunk, with counts of zero.
+
+        The large arrays are used again and again. There is a count for each slot, a small
+        number that stands for a channel.
+        """
         sums = np.zeros((4, len(self._slots)), np.int64)
         self._run = self._run._replace(
             counts=sums[0], lengths=sums[1], excess=sums[2], firsts=sums[3]
         )
         return self._run
 
-    def _take_run(self, part: "_ReadPart", run: chunk_walk.MessageRun) -> bool:
-        """Subtracts the memory of some messages, unless a channel needs too much of it.
+    def _reserve_run_memory(
+        self, partly_read: "_PartlyReadRecord", run: chunk_walk.MessageRun
+    ) -> bool:
+        """Reserves memory for some messages, unless a channel would exceed its limit.
+
+        The limit protects against files that were made to exhaust the memory. Messages of the
+        session need more memory than others, because they will be decoded.
 
         Args:
-            part: The part of the record that has been read. The memory is added to it.
-            run: The messages.
+            partly_read: The record that contains the messages. The memory is added to it.
+            run: The messages, counted by channel.
 
         Returns:
-            False, without a change, if a channel needs too much memory.
+            True if the memory was reserved. False, without a change, if a channel needs too
+            much memory.
         """
         counts = run.counts.tolist()
         excess = run.excess.tolist()
         lengths = run.lengths.tolist()
-        costs = {}
+        needed_bytes = {}
         for slot, channel in enumerate(self._slots):
             if channel in self._session_channels:
-                costs[channel] = _DECODED_BYTES * counts[slot] + _LONG_RATIO * excess[slot]
+                size = _DECODED_BYTES * counts[slot] + _LONG_RATIO * excess[slot]
             else:
-                costs[channel] = _SKIPPED_BYTES * counts[slot] + lengths[slot]
-        if any(cost > self._channel_memory_left[channel] for channel, cost in costs.items()):
-            return False
-        for channel, cost in costs.items():
-            self._channel_memory_left[channel] -= cost
-            part.memory += cost
+                size = _SKIPPED_BYTES * counts[slot] + lengths[slot]
+            needed_bytes[channel] = size
+
+        for channel, size in needed_bytes.items():
+            if size > self._channel_memory_left[channel]:
+                return False
+        for channel, size in needed_bytes.items():
+            self._channel_memory_left[channel] -= size
+            partly_read.memory += size
         return True
 
-    def _divide_run(
+    def _split_by_channel(
         self,
         chunk: NDArray[np.uint8],
         count: int,
         run: chunk_walk.MessageRun,
         is_kept: Callable[[str], bool],
     ) -> Iterator[_MessageBlock]:
-        """Yields messages that a walk has found, a block for each channel, without the others.
+        """Yields the messages that were found in a chunk as one block per channel.
+
+        The blocks are in the order in which the first message of each channel appears.
 
         Args:
             chunk: The unpacked chunk.
-            count: Number of messages.
-            run: The messages.
+            count: Number of messages that were found.
+            run: Places of these messages. It refers to each channel by a small index (slot).
             is_kept: Function that decides whether the messages of a topic are yielded.
         """
-        present = np.flatnonzero(run.counts)
-        # Channels in the order of their first messages.
-        for slot in present[np.argsort(run.firsts[present])].tolist():
+        used_slots = np.flatnonzero(run.counts)
+        by_first_message = np.argsort(run.firsts[used_slots])
+        for slot in used_slots[by_first_message].tolist():
             topic = self._topics[self._slots[slot]]
             if is_kept(topic):
                 yield _MessageBlock(topic, chunk, run, count, slot)
@@ -665,11 +724,10 @@ class McapReader:
         return all(stated.get(key) == computed[key] for key in ("messages", "records"))
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Stores a schema or a channel. Of repeated definitions, the first one counts.
+        """Stores the definition of a schema or a channel.
 
-        Args:
-            opcode: Kind of the definition.
-            content: Content of the definition.
+        A schema describes the fields of a kind of messages, and a channel is a sequence of such
+        messages. If the file defines the same number twice, the first definition counts.
 
         Raises:
             UnreadableRecord: The definition cannot be decoded.
@@ -678,29 +736,39 @@ class McapReader:
         record = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.SCHEMA:
             self._schemas.setdefault(record.id, (record.name, record.encoding, record.data))
-        elif record.id not in self._topics:
-            self._topics[record.id] = topic = record.topic
-            name, encoding, data = self._schemas.get(record.schema_id, ("", "", b""))
-            info = ChannelInfo(
-                topic=topic,
-                encoding=record.message_encoding,
-                schema=name,
-                schema_encoding=encoding,
-                metadata=record.metadata,
-                schema_data=data,
-            )
-            # Messages of a topic that has two channels alternate, and are read one by one.
-            if topic not in self.channels:
-                self._slot_of_channel[record.id] = len(self._slots)
-                self._slots.append(record.id)
-            else:
-                self._drop_slot(topic)
-            self.channels.setdefault(topic, info)
-            if topic.startswith("/trilat/"):
-                self._session_channels.add(record.id)
+            return
+        if record.id in self._topics:
+            return
+
+        topic = record.topic
+        self._topics[record.id] = topic
+        schema_name, schema_encoding, schema_data = self._schemas.get(
+            record.schema_id, ("", "", b"")
+        )
+        info = ChannelInfo(
+            topic=topic,
+            encoding=record.message_encoding,
+            schema=schema_name,
+            schema_encoding=schema_encoding,
+            metadata=record.metadata,
+            schema_data=schema_data,
+        )
+        # A channel with a slot is read in blocks. If a topic has two channels, their messages
+        # alternate, so that they must be read one by one.
+        if topic not in self.channels:
+            self._slot_of_channel[record.id] = len(self._slots)
+            self._slots.append(record.id)
+        else:
+            self._drop_slot(topic)
+        self.channels.setdefault(topic, info)
+        if topic.startswith("/trilat/"):
+            self._session_channels.add(record.id)
 
     def _drop_slot(self, topic: str) -> None:
-        """Makes `blocks` read the messages of a topic one by one.
+        """Makes `blocks` read the messages of a topic one by one instead of in blocks.
+
+        This keeps their order if the topic has several channels. A channel without a slot is
+        unknown to the compiled code, which then stops at its messages.
 
         Args:
             topic: The topic.
@@ -709,30 +777,35 @@ class McapReader:
             if self._topics[channel] == topic:
                 self._slot_of_channel[channel] = -1
 
-    def _cut_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
-        """Stops the reading of a channel whose messages take too much memory.
+    def _stop_reading_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
+        """Stops reading a channel because its messages need too much memory.
 
         This is reported once as a damaged part of the file.
 
         Args:
             channel: Number of the channel.
-            frame: Place of the record from which on the channel is not read.
+            frame: The first record of which the messages of the channel are not read.
         """
-        if self._channel_memory_left[channel] >= 0.0:
-            self._channel_memory_left[channel] = -math.inf
-            topic = self._topics.get(channel, f"channel {channel}")
-            text = (
-                f"{topic[:80]} needs too much memory for a file of this size; the rest of this "
-                "channel is not read"
-            )
-            self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
+        is_stopped_already = self._channel_memory_left[channel] < 0.0
+        if is_stopped_already:
+            return
+        self._channel_memory_left[channel] = -math.inf
+        topic = self._topics.get(channel, f"channel {channel}")
+        text = (
+            f"{topic[:80]} needs too much memory for a file of this size; the rest of this "
+            "channel is not read"
+        )
+        self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
-    def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
-        """Subtracts memory from the memory that may still be used.
+    def _reserve_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
+        """Subtracts an amount from the memory that the contents of this file may still use.
+
+        The limit is a multiple of the size of the file. It protects against small files that
+        were made to fill the memory when they are unpacked.
 
         Args:
             amount: Memory in bytes.
-            frame: Place of the record that needs the memory.
+            frame: The record that needs the memory.
 
         Raises:
             LogError: There is not enough memory left.
@@ -750,14 +823,14 @@ class McapReader:
 
 
 @dataclass
-class _ReadPart:
-    """Part of a record with messages and definitions that has been read.
+class _PartlyReadRecord:
+    """A record with messages and definitions, and how far it has been read.
 
     Attributes:
-        frame: Place of the record in the file.
+        frame: Kind and place of the record in the file.
         data: Messages and definitions of the record, unpacked.
         offset: Offset in `data` up to which they have been read.
-        digested: Place up to which they have been added to the digest of the messages.
+        digested: Offset in `data` up to which they have been added to the digest (checksum).
         messages: Number of messages that have been read.
         memory: Memory that these messages need, in bytes.
     """
@@ -814,16 +887,18 @@ class ChannelMessages:
         return self._data[start : self._ends[number]].tobytes()
 
     def _reserve(self, size: int) -> NDArray[np.uint8]:
-        """Makes room for further bytes, and returns the array of all bytes.
+        """Returns the array of all payloads, with space for further bytes at its end.
+
+        The array grows at least twofold, so that many small additions stay cheap.
 
         Args:
-            size: Number of bytes.
+            size: Number of further bytes.
         """
         needed = self._size + size
         if needed > len(self._data):
-            data = np.empty(max(needed, 2 * len(self._data)), np.uint8)
-            data[: self._size] = self._data[: self._size]
-            self._data = data
+            larger_array = np.empty(max(needed, 2 * len(self._data)), np.uint8)
+            larger_array[: self._size] = self._data[: self._size]
+            self._data = larger_array
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
@@ -843,14 +918,11 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def add_block(self, block: _MessageBlock) -> None:
-        """Adds the next messages of the topic.
-
-        Args:
-            block: The messages.
-        """
+        """Adds the next messages of the topic, in the order of the file."""
         data = self._reserve(block.most_bytes)
         ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
         self._size = int(ends[-1])
+        # The bytes of the NumPy arrays are appended to compact arrays of integers.
         self._ends.frombytes(ends.tobytes())
         self.log_ns.frombytes(log_ns.tobytes())
         self.publish_ns.frombytes(publish_ns.tobytes())
@@ -926,8 +998,10 @@ def read_contents(
     reader = McapReader(stream, name, progress, kept=not trusted)
     channels: dict[str, ChannelMessages] = {}
     for block in reader.blocks(_is_log_topic):
-        channels.setdefault(block.topic, ChannelMessages()).add_block(block)
+        channel = channels.setdefault(block.topic, ChannelMessages())
+        channel.add_block(block)
     _check_head(reader, name)
+
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
     return LogContents(
@@ -962,7 +1036,7 @@ def check_log(stream: BinaryIO, name: str) -> None:
         LogError: The file cannot be opened as a log. The text states the reason.
     """
     reader = McapReader(stream, name)
-    deque(reader.blocks(_is_log_topic), maxlen=0)
+    deque(reader.blocks(_is_log_topic), maxlen=0)  # reads all messages, and stores none
     _check_head(reader, name)
     try:
         parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
@@ -971,22 +1045,24 @@ def check_log(stream: BinaryIO, name: str) -> None:
 
 
 def _check_head(reader: McapReader, name: str) -> None:
-    """Checks that a file that was read describes a session.
+    """Checks that an MCAP file is a log of trilat-net: it must describe a session.
 
     Args:
-        reader: Reader that has read the file.
+        reader: Reader that has read the whole file.
         name: Name of the file for the error message.
 
     Raises:
         LogError: The file lacks the metadata of the session, or the scenario.
     """
     session = reader.metadata.get(SESSION, {})
-    missing = [key for key in ("session", "driver") if key not in session]
+    missing_parts = [key for key in ("session", "driver") if key not in session]
     if SCENARIO not in reader.attachments:
-        missing.append(SCENARIO)
-    if missing:
+        missing_parts.append(SCENARIO)
+    if missing_parts:
+        # The missing part may have been in a damaged part of the file.
         reason = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
         problem = (
-            f"{name}: is an MCAP file, but not a log of trilat-net: {missing[0]} is missing"
+            f"{name}: is an MCAP file, but not a log of trilat-net: {missing_parts[0]} is "
+            "missing"
         )
         raise LogError(f"{problem}; {reason}" if reason else problem)

@@ -117,6 +117,8 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
         compression = content[_FIXED_HEAD.size : _FIXED_HEAD.size + name_bytes].decode()
     except (struct.error, UnicodeDecodeError):
         raise UnreadableRecord("a chunk has no valid header") from None
+
+    # The compressed records, which follow the head, extend to the end of the chunk.
     data_offset = _FIXED_HEAD.size + name_bytes + _SIZE.size
     stated_length = data_offset + packed_bytes
     if stated_length != length:

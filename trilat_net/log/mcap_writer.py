@@ -231,9 +231,9 @@ class McapWriter:
         schema_id: int,
         metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Writes the definition of a channel.
+        """Writes the definition of a channel, a sequence of messages of one kind, to the file.
 
-        The messages of the open chunk follow it in the file.
+        The messages that are still in memory (the open chunk) follow it in the file.
 
         Args:
             topic: Topic of the channel.
@@ -299,7 +299,9 @@ class McapWriter:
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
-        """Writes an attachment. The messages of the open chunk follow it in the file.
+        """Writes an attachment, a small file that is stored with the messages.
+
+        The messages that are still in memory (the open chunk) follow it in the file.
 
         Args:
             create_time: Time at which the attachment was created, in ns. 0 if it is unknown.
@@ -409,6 +411,7 @@ class McapWriter:
         self._write(_pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
         self._add_to_summary(Opcode.STATISTICS, self._pack_statistics())
 
+        # The summary contains a group of records for each kind: schemas, channels, index, ...
         summary_start = self.position
         offsets = b""
         crc = 0
@@ -428,9 +431,9 @@ class McapWriter:
         self._stream.flush()
 
     def _pack_statistics(self) -> bytes:
-        """Encodes the content of the statistics record.
+        """Encodes the statistics record, from which readers learn the size of the log.
 
-        It contains the numbers of all kinds of records, and the first and last log time.
+        It contains the numbers of all kinds of records, and the first and last arrival time.
         """
         first_ns, last_ns = self._span_ns or (0, 0)
         head = _STATISTICS.pack(

@@ -74,10 +74,10 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
 
 
 def _check_same_session(first: LogContents, other: LogContents) -> None:
-    """Checks that two parts belong to the same session.
+    """Checks that two files are parts of the log of the same session.
 
     Raises:
-        LogError: They do not. The text lists the differences.
+        LogError: The files belong to different sessions. The text lists the differences.
     """
     expected = identify_session(first)
     actual = identify_session(other)
@@ -92,24 +92,24 @@ def _check_same_session(first: LogContents, other: LogContents) -> None:
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
-    """Checks that every part follows the part that it was written after.
+    """Checks that every part of a log is the continuation of the part before it.
 
-    At the end of a part, the recorder writes a digest of its messages. The next part repeats
-    this digest at its beginning.
+    At the end of a part, the recorder writes a digest (checksum) of its messages. The next part
+    repeats this digest at its beginning.
 
     Raises:
         LogError: A part states the digest of another file.
     """
-    finished = {_part_index(part): part for part in parts if DIGESTS in part.metadata}
+    finished_parts = {_part_index(part): part for part in parts if DIGESTS in part.metadata}
     for part in parts:
-        stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
-        before = finished.get(_part_index(part) - 1)
-        if not stated or before is None:
+        stated_digest = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
+        previous_part = finished_parts.get(_part_index(part) - 1)
+        if not stated_digest or previous_part is None:
             continue
-        if before.metadata[DIGESTS].get("records") != stated:
+        if previous_part.metadata[DIGESTS].get("records") != stated_digest:
             raise LogError(
-                f"{part.source}: is not the continuation of {before.source}: it was recorded "
-                "after another file"
+                f"{part.source}: is not the continuation of {previous_part.source}: it was "
+                "recorded after another file"
             )
 
 
@@ -231,7 +231,10 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
 
 
 def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[Hashable]:
-    """Returns a key for each message of a topic. Copies of a message have the same key.
+    """Returns a key for each message of a topic, by which copies of a message are recognised.
+
+    Several recorders may have recorded the same message. Its copies have the same key, and
+    different messages have different keys.
 
     Args:
         topic: The topic.
@@ -244,8 +247,8 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
     try:
         match topic.rpartition("/")[2]:
             case topics.STATE:
-                ticks: list[int] = decode_ticks(payloads).tolist()
-                return ticks
+                record_ticks: list[int] = decode_ticks(payloads).tolist()
+                return record_ticks
             case topics.LINK:
                 return [decode(payload, LinkStats, READABLE).tick for payload in payloads]
             case topics.EVENT:
@@ -264,8 +267,8 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
 def _describe_message(topic: str, key: Hashable) -> str:
     """Returns a noun phrase for the message with a key, see `_list_keys`.
 
-    For example, the key 12 on the topic of the records of "m1" is "the record of tick 12 of
-    m1".
+    For example, the key 12 on the topic of the records (results of control periods) of "m1" is
+    "the record of tick 12 of m1".
     """
     member, kind = topic.split("/")[-2:]
     match key:

@@ -30,8 +30,8 @@ class MessageIdentity(NamedTuple):
     """States who sent a message, in which channel, with which number, and when.
 
     Attributes:
-        sender: Name of the member of the session, a site or the recorder, that published the
-            message.
+        sender: Name of the member of the session, a site (arm controller) or the recorder, that
+            published the message.
         channel: Name of the channel: "state" (records), "link" (statistics), "event" or
             "stats".
         number: Number of the message in its channel. It is -1 if the message states no number.
@@ -49,7 +49,7 @@ class MessageIdentity(NamedTuple):
 
 
 def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
-    """Computes the boot of a site in a run in virtual time.
+    """Computes the boot of a site (arm controller) in a run in virtual time.
 
     The boot identifies one start of a site. It is a random number in live sessions. In virtual
     time, it is derived from the scenario, so that runs are reproducible and every message of a

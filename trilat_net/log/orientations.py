@@ -223,6 +223,7 @@ class QuaternionSigns:
         Returns:
             The quaternion or its negative, which is the same orientation.
         """
+        # Two unit quaternions are nearest to each other if their scalar product is positive.
         dot = quaternion[self._w]
         if self._last:
             dot = sum(a * b for a, b in zip(quaternion, self._last, strict=True))

@@ -63,7 +63,7 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
     """Decodes some integer fields of every record, without decoding the rest of the records.
 
     Args:
-        payloads: K encoded records.
+        payloads: K encoded records (results of control periods).
         fields: Names of F integer fields of `State`.
 
     Returns:
@@ -74,7 +74,8 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
     if len(fields) > 1:
         # Each value is a tuple with one number per field.
         values = chain.from_iterable(values)
-    return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
+    value_count = len(fields) * len(payloads)
+    return _to_array(payloads, values, np.int64, value_count)
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
@@ -127,7 +128,7 @@ def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]
     """Decodes a field of every record as Python objects, such as strings or lists.
 
     Args:
-        payloads: K encoded records.
+        payloads: K encoded records (results of control periods).
         field: Name of the field.
 
     Returns:
@@ -142,8 +143,8 @@ def decode_per_peer(
 ) -> dict[str, Ints]:
     """Decodes a field that contains an integer for each peer, such as `used`.
 
-    A peer is another site whose samples the site receives. The field of a record is a map from
-    names of peers to integers.
+    A peer is another site (arm controller) whose samples (sent states) the site receives. The
+    field of a record is a map from names of peers to integers.
 
     Args:
         payloads: K encoded records.
@@ -166,6 +167,7 @@ def decode_per_peer(
     decoder = _make_decoder({field: peer_struct})
     paths = [f"{field}.{attribute}" for attribute in attributes]
     get_numbers = attrgetter(*paths)
+    # Nothing is decoded yet: the iterators are consumed in `_to_array`.
     records = map(decoder.decode, payloads)
     values: Iterator[Any] = map(get_numbers, records)
     if len(peers) > 1:
@@ -177,15 +179,15 @@ def decode_per_peer(
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Decodes which samples of the peers arrived at the site in each tick.
+    """Decodes which samples of the peers arrived at the site (arm controller) in each tick.
 
     Args:
         payloads: K encoded records of the site.
 
     Returns:
         The number of arrivals of each record, shape (K,), and all N arrivals in order, shape
-        (N, 3). The columns are those of the field `rx` of a record: index of the peer, tick of
-        the sample, and delay in us.
+        (N, 3). The columns are those of the field `rx` of a record: index of the peer, tick
+        (control period) of the sample, and delay in us.
     """
     counts = np.zeros(len(payloads), dtype=np.int64)
 
@@ -206,7 +208,7 @@ def _decode_fields(
     """Yields the value of a field for every record, or a tuple of values for several fields.
 
     Args:
-        payloads: The encoded records.
+        payloads: The encoded records (results of control periods).
         fields: Names of the fields.
         layout: Lengths of the vectors. None accepts all lengths.
     """
@@ -220,7 +222,7 @@ def _decode_fields(
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder that decodes only some fields of a record.
+    """Returns a decoder that decodes only some fields of a record, and skips the others.
 
     Args:
         fields: Names of the fields.
@@ -258,7 +260,7 @@ def _to_array(
     count: int,
     layout: Layout | None = None,
 ) -> NDArray[Any]:
-    """Converts decoded values to an array.
+    """Decodes values while they are put into an array, and reports the first invalid record.
 
     Args:
         payloads: The encoded records, from which the error is found.
@@ -281,7 +283,10 @@ def _find_error(
     default: str = "a number is out of range",
     layout: Layout | None = None,
 ) -> WireError:
-    """Finds the first payload that is not a valid record.
+    """Finds the first payload that is not a valid record, to name the reason in an error.
+
+    The fast decoding of single fields cannot tell which record was wrong. Therefore the records
+    are decoded once more as a whole.
 
     Args:
         payloads: The encoded records.

@@ -86,10 +86,11 @@ class Recovery(Result):
         salvaged: Number of messages that were saved from a last chunk that was cut off.
         lost: A sentence for each loss.
         lost_bytes: Number of bytes that could not be read.
-        missing: A line for each site whose records are incomplete in the new file, either
-            because they were lost in the source file or because they were never recorded.
-        coverage: Numbers of records in the new file and of ticks in the run, by site. Empty if
-            the source is not a log of trilat-net.
+        missing: A line for each site (arm controller) whose records are incomplete in the new
+            file, either because they were lost in the source file or because they were never
+            recorded.
+        coverage: Numbers of records in the new file and of ticks (control periods) in the run,
+            by site. Empty if the source is not a log of trilat-net.
         chain: Result of comparing the source with its digests. Empty if the source is not a log
             of trilat-net.
     """
@@ -140,7 +141,7 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Notes that a part of the source file was lost.
+        """Adds a part of the source file that was lost to the result.
 
         Args:
             text: Sentence that describes the loss to the user.
@@ -278,11 +279,11 @@ def _recover(
 
 
 def _check_output(working: Path, result: Recovery) -> None:
-    """Adds a loss to the result if no command of trilat-net can open the new file.
+    """Opens the new file as a test, and adds a loss to the result if this fails.
 
     Args:
-        working: The new file, under its working name.
-        result: The result.
+        working: The new file, under its temporary name.
+        result: Result of the recovery.
     """
     with working.open("rb") as stream:
         try:
@@ -305,23 +306,24 @@ def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
         The text of the file. Empty if the log contains its scenario, or if there is no such
         file.
     """
-    digest = survey.metadata.get(SESSION, {}).get("scenario_sha256", "")
-    attached = survey.attachments.get(SCENARIO)
-    if not digest or attached is not None:
+    expected_sha256 = survey.metadata.get(SESSION, {}).get("scenario_sha256", "")
+    is_lost = SCENARIO not in survey.attachments
+    if not is_lost or not expected_sha256:
         return b""
     with suppress(OSError, LogError), open_regular(path.with_name(SCENARIO)) as stream:
         text: bytes = stream.read(_MAX_SCENARIO_BYTES)
-        if hashlib.sha256(text).hexdigest() == digest:
+        if hashlib.sha256(text).hexdigest() == expected_sha256:
             survey.attachments[SCENARIO] = text
             return text
     return b""
 
 
 class _FileCopy:
-    """Copy of the contents of the source file into the new file.
+    """Copies the contents of a damaged MCAP file, the source, into a new file.
 
-    If the source defines the same number of a schema or channel twice, the first definition
-    counts.
+    A schema describes the fields of a kind of messages, and a channel is a sequence of such
+    messages. If the source defines the same number of a schema or channel twice, the first
+    definition counts.
 
     Args:
         reader: Reader of the source file.
@@ -404,17 +406,21 @@ class _FileCopy:
                 data=restored,
             )
             self._is_empty = False
+
         for item in self._reader.scan():
             if isinstance(item, Damage):
                 self._report_damage(item)
             else:
                 self._copy_or_report(item)
-                # The reader computes the digests of the source.
+                # The messages are not needed here, but reading them updates the digests of the
+                # source, which are judged at the end.
                 deque(self._reader.read_record(item), maxlen=0)
+
         if self._scanner.torn is not None:
             self._copy_torn_chunk(self._scanner.torn)
         self._out.flush()
         self._report_final_losses()
+
         # This check precedes the end mark, which would make an empty file a valid one.
         if self._is_empty and self._result.lost:
             losses = [text for text in self._result.lost if _UNOPENED not in text]
@@ -443,10 +449,10 @@ class _FileCopy:
             self._result.add_loss(str(damage), damage.length)
 
     def _copy_record(self, record: ScannedRecord) -> None:
-        """Copies one record of the source.
+        """Copies one record of the damaged file, with the method for records of its kind.
 
-        Args:
-            record: The record.
+        A record is the unit of which an MCAP file consists: a chunk of messages, metadata, an
+        attachment, or a part of an index.
 
         Raises:
             UnreadableRecord: The record cannot be trusted and was not copied.
@@ -485,18 +491,18 @@ class _FileCopy:
         self._is_empty = False
 
     def _copy_attachment(self, content: bytes) -> None:
-        """Copies an attachment.
+        """Copies a file that is attached to the log, such as the scenario.
 
         A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If it kept its name,
         nobody would notice the damage, because the writer adds a valid checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
-        problem = (
-            "" if mcap_records.has_right_crc(content) else "its CRC does not match its content"
-        )
-        if name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
-            problem = problem or "it belongs to another session"
+        problem = ""
+        if not mcap_records.has_right_crc(content):
+            problem = "its CRC does not match its content"
+        elif name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
+            problem = "it belongs to another session"
         if problem:
             name = f"{name}{_DAMAGED_SUFFIX}"
             self._result.add_loss(f"attachment {entry.name}: {problem}; it is kept as {name}")
@@ -510,10 +516,11 @@ class _FileCopy:
         self._is_empty = False
 
     def _check_regenerated(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        """Checks that a record that will be left out is really part of an index.
+        """Checks that a record that is not copied is really part of an index.
 
-        If the opcode of a record is damaged, a record with data may look like one of an index,
-        and its loss would not be reported.
+        The index of the new file is computed again. If the opcode (the number of the kind) of a
+        record with data is damaged, the record may look like a part of an index, and its loss
+        would not be reported.
 
         Args:
             frame: Kind and place of the record. The kind is one of `_REGENERATED`.
@@ -558,6 +565,7 @@ class _FileCopy:
         problem = self._survey.misplaced.get(chunk.frame.offset)
         if problem:
             raise UnreadableRecord(problem)
+
         head = chunk.head()
         records = [
             (opcode, data[begin:end])
@@ -570,6 +578,7 @@ class _FileCopy:
         if not has_checksum and has_scenario:
             self._copy_unproven(records, (head.start_ns, head.end_ns))
             return
+
         if self._content is not None:
             self._content.check_origin(data)
         for opcode, content in records:
@@ -601,14 +610,17 @@ class _FileCopy:
         self._copy_chunk_record(mcap_records.OP_MESSAGE, content)
 
     def _copy_chunk_record(self, opcode: int, content: bytes) -> None:
-        """Copies a message, or notes a definition. Other records of a chunk are ignored.
+        """Copies a message of a chunk to the new file, or stores a definition for later.
+
+        Definitions are those of schemas and channels. They are written when a message needs
+        them. Other kinds of records are ignored.
 
         Args:
-            opcode: Kind of the record.
+            opcode: Number of the record's kind.
             content: Content of the record.
 
         Raises:
-            UnreadableRecord: The record makes no sense.
+            UnreadableRecord: The record cannot be decoded.
         """
         if opcode in mcap_records.DEFINITIONS:
             self._define(opcode, content)
@@ -622,6 +634,7 @@ class _FileCopy:
         if channel is None:
             self._unnamed[number] += 1
             return
+
         new_number, topic = channel
         self._out.add_message(
             channel_id=new_number,
@@ -639,14 +652,16 @@ class _FileCopy:
     def _copy_unproven(
         self, records: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]
     ) -> None:
-        """Copies records that no checksum covers, if the content of every record proves it.
+        """Copies records without a checksum, if the content of each shows that it is intact.
+
+        All records are checked before the first one is copied.
 
         Args:
             records: Kinds and contents of the records of a chunk.
             span_ns: First and last arrival time of the chunk, in Unix time, in ns.
 
         Raises:
-            UnreadableRecord: A record is not proved. No record was copied.
+            UnreadableRecord: A record may be damaged. No record was copied.
         """
         records = list(records)
         for opcode, content in records:
@@ -713,8 +728,8 @@ class _FileCopy:
             content: Content of the definition.
 
         Raises:
-            UnreadableRecord: A channel belongs to no member of this session, or to a session
-                whose scenario is missing.
+            UnreadableRecord: A channel belongs to no member (process of a session) of this
+                session, or to a session whose scenario is missing.
         """
         entry = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.CHANNEL:
@@ -728,7 +743,9 @@ class _FileCopy:
         self._define(opcode, content)
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Notes the definition of a schema or channel. The first definition of a number counts.
+        """Stores the definition of a schema or channel for the messages that need it.
+
+        If the file defines the same number twice, the first definition counts.
 
         Raises:
             UnreadableRecord: The definition cannot be decoded.
@@ -764,34 +781,39 @@ class _FileCopy:
             The channel number in the new file, and the topic. None if neither the message nor a
             definition names the channel.
         """
-        known = self._new_channels.get(number)
-        is_certain = self._content is None or number in self._identified
-        if known is not None and is_certain:
-            return known
+        known_channel = self._new_channels.get(number)
+        is_identified = self._content is None or number in self._identified
+        if known_channel is not None and is_identified:
+            return known_channel
 
+        # The content of the message names the topic, if the scenario is known.
         self._identified.add(number)
         topic = self._content.identify(payload) if self._content is not None else ""
         is_unidentified = not topic
         definition = self._definitions.get((Opcode.CHANNEL, number))
         defined_topic = definition.topic if definition is not None else ""
-        if known is not None:
-            defined_topic = known[1]
+        if known_channel is not None:
+            defined_topic = known_channel[1]
         if is_unidentified or defined_topic == topic:
-            return known or self._open_channel(number)
+            return known_channel or self._open_channel(number)
 
+        # The definition contradicts the message.
         self._misnamed.append(topic)
         channel = self._new_topics.get(topic) or self._open_session_channel(topic)
         self._new_channels[number] = channel
         return channel
 
     def _open_channel(self, number: int) -> tuple[int, str] | None:
-        """Registers a channel in the new file, with the definition of the source.
+        """Registers a channel in the new file, with the definition of the damaged file.
+
+        The schema of the channel, which describes the fields of its messages, is registered
+        before the channel.
 
         Args:
-            number: Channel number in the source.
+            number: Channel number in the damaged file.
 
         Returns:
-            The channel number in the new file, and the topic. None if the source has no
+            The channel number in the new file, and the topic. None if the damaged file has no
             plausible definition of the channel.
         """
         definition = self._definitions.get((Opcode.CHANNEL, number))
@@ -799,12 +821,14 @@ class _FileCopy:
             return None
         if not self._is_plausible(definition.topic):
             return None
+
         schema = self._definitions.get((Opcode.SCHEMA, definition.schema_id))
         if schema is not None and schema.id not in self._new_schemas:
             self._new_schemas[schema.id] = self._out.register_schema(
                 schema.name, schema.encoding, schema.data
             )
-        if schema is None and definition.schema_id:
+        needs_schema = definition.schema_id != 0  # 0: the channel has no schema
+        if schema is None and needs_schema:
             self._topics_without_schema.append(definition.topic)
         new_number = self._out.register_channel(
             definition.topic,
@@ -838,11 +862,11 @@ class _FileCopy:
     def _register_copy(
         self, number: int | None, new_number: int, topic: str
     ) -> tuple[int, str]:
-        """Notes a channel of the new file, so that the messages of the source find it.
+        """Stores which channel of the new file receives the messages of a damaged channel.
 
-        A message is assigned to its channel in one of two ways: by the channel number that is
-        stored with it in the source, or, if that is wrong, by the topic that its content
-        reveals. Only messages of the session's members reveal their topic.
+        A message is assigned to its channel by the channel number that is stored with it in the
+        damaged file. If that number is wrong, it is assigned by its topic, which follows from
+        the sender and the kind that are stated in the message itself.
 
         Args:
             number: Channel number in the source. None if the source does not define the
@@ -882,6 +906,7 @@ class _FileCopy:
         if opcode != Opcode.CHUNK:
             self._result.add_loss(str(torn), torn.length)
             return
+
         messages_before = self._out.messages
         problem = self._salvage(torn.offset)
         self._result.salvaged = self._out.messages - messages_before
@@ -941,6 +966,9 @@ class _FileCopy:
                 f"the meaning of channel or schema {number}: the file defines it in two ways"
             )
         self._report_missing_head()
+
+        # The file states how many messages it contains. A difference is a loss of its own only
+        # if no other loss explains it.
         stated = self._survey.count
         if stated is not None and self._out.messages < stated and result.lossless:
             missing = stated - self._out.messages
@@ -987,6 +1015,7 @@ class _FileCopy:
         result.duration_s = self._out.duration_s
         if SESSION in source_metadata:
             result.chain = self._judge_source_chain()
+
         if accounts is not None:
             result.missing = list(accounts.describe_missing())
             # If a log is divided into parts, the sites may end in a later part.
@@ -1004,6 +1033,7 @@ class _FileCopy:
                 name: text for name, text in source_accounts.items() if not name.startswith("/")
             }
             self._out.add_metadata(ACCOUNTS, {**accounts.format_accounts(), **other_counts})
+
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
             # Without accounts, the digests of the source were copied, if there are any.
@@ -1079,7 +1109,7 @@ def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
 def _create_content_check(
     survey: RecoverySurvey, accounts: SessionAccounts | None
 ) -> ContentCheck | None:
-    """Creates the check that proves messages by their content.
+    """Creates the check that recognises intact messages by their content, without a checksum.
 
     Args:
         survey: Survey of the source file.

@@ -116,7 +116,7 @@ class RecoverySurvey:
         scanner = self._scanner
         summary_offset = _find_intact_summary(scanner)
         # Schemas and channels, by (True in the summary, opcode).
-        defined: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
+        definitions_by_kind: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
         has_messages = False
         for record in scanner.scan():
             if isinstance(record, mcap_records.Damage):
@@ -126,7 +126,7 @@ class RecoverySurvey:
             if frame.opcode in mcap_records.DEFINITIONS:
                 entry = frame.opcode, record.content
                 is_in_summary = frame.offset >= summary_offset
-                defined[is_in_summary, frame.opcode].append(entry)
+                definitions_by_kind[is_in_summary, frame.opcode].append(entry)
                 if not is_in_summary:
                     self._uncovered_offsets.setdefault(entry, frame.offset)
             elif frame.opcode == Opcode.CHUNK:
@@ -134,7 +134,7 @@ class RecoverySurvey:
             elif frame.opcode in _DESCRIBING:
                 with suppress(UnreadableRecord):
                     self._read_description(frame, record.content)
-        self._choose_definitions(defined)
+        self._choose_definitions(definitions_by_kind)
 
         if summary_offset == scanner.size:
             # The summary is missing or damaged, so that its statements are not used.
@@ -142,18 +142,20 @@ class RecoverySurvey:
             self._chunk_indexes = {}
         return has_messages
 
-    def _choose_definitions(self, defined: dict[tuple[bool, int], list[Definition]]) -> None:
+    def _choose_definitions(
+        self, definitions_by_kind: dict[tuple[bool, int], list[Definition]]
+    ) -> None:
         """Chooses between the definitions in the summary and those among the data.
 
         A checksum covers the definitions in the summary. Therefore they are preferred.
 
         Args:
-            defined: Definitions, by (True in the summary, opcode).
+            definitions_by_kind: Definitions, by (True in the summary, opcode).
         """
         self.is_redefined = False
         for kind in mcap_records.DEFINITIONS:
-            in_summary = defined[True, kind]
-            among_data = defined[False, kind]
+            in_summary = definitions_by_kind[True, kind]
+            among_data = definitions_by_kind[False, kind]
             self.definitions += in_summary or among_data
             for entry in in_summary:
                 self._uncovered_offsets.pop(entry, None)
@@ -169,19 +171,19 @@ class RecoverySurvey:
         return "it does not begin with the mark of MCAP"
 
     def _read_description(self, frame: RecordFrame, content: bytes) -> None:
-        """Reads a record that describes the file.
+        """Stores the content of a record that describes the file.
 
-        It is a header, metadata, an attachment, the statistics or an entry of the chunk index.
-        A damaged file may contain several sessions and scenarios, of which `_choose_session`
-        chooses later. Therefore all of them are collected. Of other attachments with the same
-        name, the first one counts.
+        Such a record is a header, metadata, an attachment, the statistics or an entry of the
+        chunk index. A damaged file may contain several sessions and scenarios. All of them are
+        collected, and `_choose_session` chooses later. Of other attachments with the same name,
+        the first one counts.
 
         Args:
             frame: Place of the record.
             content: Content of the record.
 
         Raises:
-            UnreadableRecord: The content makes no sense.
+            UnreadableRecord: The content cannot be decoded.
         """
         record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
@@ -326,30 +328,33 @@ class RecoverySurvey:
         }
 
     def _find_unnamed_chunks(self) -> dict[int, str]:
-        """Finds the chunks that the index of the file does not name.
+        """Finds the chunks (blocks of messages) that the index of the file does not name.
 
-        If bytes were inserted or removed, chunks have other offsets than the index states.
-        Therefore a chunk is also accepted if the index names a missing chunk with the same
-        sizes and times at another offset.
+        Such a chunk may come from an older file at the same place of the disk. If bytes were
+        inserted or removed, chunks have other offsets than the index states. Therefore a chunk
+        is also accepted if the index names a missing chunk with the same sizes and times at
+        another offset.
 
         Returns:
             A description of the problem for each of these chunks, by the offset of the chunk.
         """
-        unmatched = Counter(_chunk_measures(index) for index in self._chunk_indexes.values())
-        unnamed = []
+        unmatched_entries = Counter(
+            _chunk_measures(index) for index in self._chunk_indexes.values()
+        )
+        candidates = []
         for frame, head in self._chunks:
             index = self._chunk_indexes.get(frame.offset)
             sizes = frame.size, head.size
             if index is not None and sizes == (index.chunk_length, index.uncompressed_size):
-                unmatched[_chunk_measures(index)] -= 1
+                unmatched_entries[_chunk_measures(index)] -= 1
             else:
-                unnamed.append((frame, head))
+                candidates.append((frame, head))
 
         misplaced = {}
-        for frame, head in unnamed:
+        for frame, head in candidates:
             measures = frame.size, head.size, head.start_ns, head.end_ns
-            if unmatched[measures] > 0:
-                unmatched[measures] -= 1
+            if unmatched_entries[measures] > 0:
+                unmatched_entries[measures] -= 1
             else:
                 misplaced[frame.offset] = "the index of the file does not name this chunk"
         return misplaced
@@ -394,8 +399,10 @@ def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
 def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
     """Finds the longest increasing sequence in a list of time spans.
 
-    The method is patience sorting, with O(K log K) comparisons for K spans. The sequence
-    increases strictly, because equal spans belong to a chunk that the file contains twice.
+    The chunks of a log are in the order of time, so a chunk outside of the sequence is probably
+    in the wrong place. The method is patience sorting, with O(K log K) comparisons for K spans.
+    The sequence increases strictly, because equal spans belong to a chunk that the file
+    contains twice.
 
     Args:
         spans_ns: First and last time of each chunk, in ns.
@@ -414,9 +421,9 @@ def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
         last_spans[length : length + 1] = [span_ns]
         last_indices[length : length + 1] = [index]
 
-    ordered = set()
+    indices_in_sequence = set()
     index = last_indices[-1] if last_indices else -1
     while index >= 0:
-        ordered.add(index)
+        indices_in_sequence.add(index)
         index = predecessors[index]
-    return ordered
+    return indices_in_sequence

@@ -65,8 +65,11 @@ class SessionAccounts:
         if scenario:
             self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
             self._ticks = {name: scenario.ticks(name) for name in scenario.names}
+        # Number of ticks that a site executed, as its event "end" states.
         self._end_ticks: dict[str, int] = {}
         self._numbered_channels = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
+
+        # Counts of the messages, by topic. That of events is the one of the newest start.
         self._accounts: dict[str, Account] = {}
         # Accounts of events, by topic and by the boot, a random number that identifies a start
         # of the member. Every start numbers its events from 0.
@@ -104,37 +107,38 @@ class SessionAccounts:
 
         Args:
             topic: Topic of the message.
-            sequence: Sequence number of the message in the file. For records and statistics, it
-                is the number of their tick, the period of the control loop.
+            sequence: Sequence number of the message in the file. For records (results of
+                control periods) and statistics, it is the number of their tick, the period of
+                the control loop.
             payload: Bytes of the message. Only the bytes of events are used, because events
-                state how many ticks a site executed or skipped.
+                state how many ticks a site (arm controller) executed or skipped.
         """
         if topic not in self._accounts:
             return
 
-        member, channel = topic.split("/")[-2:]
+        site, channel = topic.split("/")[-2:]
         event: Event | None = None
         if channel == topics.EVENT and payload:
             with suppress(WireError):  # an unreadable event counts like any other message
                 event = decode(payload, Event, READABLE)
-        number = number_message(channel, sequence, self._rates_hz.get(member, 0))
+        number = number_message(channel, sequence, self._rates_hz.get(site, 0))
         if event is None:
             self.count_message(topic, number)
         else:
             self.receive_event(topic, number, event)
         if channel == topics.LINK:
             # The statistics of a tick show that the record of this tick exists.
-            self._add_expected(member, topics.STATE, sequence + 1)
+            self._add_expected(site, topics.STATE, sequence + 1)
 
     def receive_event(self, topic: str, number: int, event: Event) -> bool:
         """Counts an event, and evaluates what it states about the ticks of a site.
 
-        Each start of a site numbers its events from 0. Therefore each start has an account of
-        its own, the object that counts its events. The boot in the event, a random number,
-        identifies the start. The first start uses the account that `open_channel` created, and
-        `_accounts` refers to that of the newest start. If there are more than `_MAX_STARTS`
-        starts, which only a faulty sender causes, the newest account counts the events of all
-        further ones.
+        Each start of a site (arm controller) numbers its events from 0. Therefore each start
+        has an account of its own, the object that counts its events. The boot in the event, a
+        random number, identifies the start. The first start uses the account that
+        `open_channel` created, and `_accounts` refers to that of the newest start. If there are
+        more than `_MAX_STARTS` starts, which only a faulty sender causes, the newest account
+        counts the events of all further ones.
 
         Args:
             topic: Topic of the event.
@@ -165,7 +169,7 @@ class SessionAccounts:
         return is_new
 
     def apply_event(self, event: Event) -> None:
-        """Learns from an event how many ticks the sites executed or skipped.
+        """Learns from an event how many ticks the sites (arm controllers) executed or skipped.
 
         These kinds of events state something about ticks, the periods of the control loop:
 
@@ -177,7 +181,8 @@ class SessionAccounts:
         - `LAST`: number of ticks of another site that the sender received before that site was
           started again.
 
-        Other events are ignored, and so are events of members that are not sites.
+        Other events are ignored, and so are events of members (processes of a session) that are
+        not sites.
 
         Args:
             event: The event.
@@ -196,27 +201,28 @@ class SessionAccounts:
             self._apply_last(event)
 
     def _apply_join(self, event: Event) -> None:
-        """Handles the event of a site that joins the running session at a stated tick.
+        """Handles the event "join" of a site that joins the running session at a stated tick.
 
-        The site publishes nothing for the ticks before, so that these must not count as
-        missing.
+        The site (arm controller) published no messages for the ticks (periods of the control
+        loop) before, or none since its previous start ended. These must not count as missing.
         """
         site = event.member
         published_ticks = self._end_ticks.pop(site, 0)
         rate_hz = self._rates_hz[site]
         for channel, gap in self._find_start_gaps(site, event.boot):
-            base = self._bases.get(self._topic(site, channel), 0)
-            first = count_messages(channel, event.ticks, rate_hz) - base
-            published = count_messages(channel, published_ticks, rate_hz) - base
+            first_number = self._bases.get(self._topic(site, channel), 0)
+            first = count_messages(channel, event.ticks, rate_hz) - first_number
+            published = count_messages(channel, published_ticks, rate_hz) - first_number
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
         """Counts the ticks that a site skipped as unpublished, as its event lists them.
 
         Args:
-            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks in
-                the form "first-last", and its ticks are the number of ticks that have passed.
-                Ranges that are not below this number are not valid, and are ignored.
+            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks
+                (control periods) in the form "first-last", and its ticks are the number of
+                ticks that have passed. Ranges that are not below this number are not valid, and
+                are ignored.
         """
         # More than 12 digits are no number of a tick.
         ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
@@ -256,9 +262,10 @@ class SessionAccounts:
             account = self._accounts.get(topic)
             if account is None:
                 continue
-            base = self._bases.get(topic, 0)
             first, published = skipped_numbers(channel, tick, skipped, self._rates_hz[site])
-            account.mark_unpublished(first - base, published - base)
+            # An account counts from 0, the first message of this part of the log.
+            first_number = self._bases.get(topic, 0)
+            account.mark_unpublished(first - first_number, published - first_number)
 
     def count_message(self, topic: str, number: int, account: Account | None = None) -> bool:
         """Counts a message as received, by its number in its channel.
@@ -276,17 +283,18 @@ class SessionAccounts:
             False if a message with this number had been received before. True otherwise, also
             for a message that is ignored.
         """
-        base = self._bases.setdefault(topic, number if self._continued else 0)
-        if number < base:
+        first_number = self._bases.setdefault(topic, number if self._continued else 0)
+        if number < first_number:
             return True
         account = account or self._accounts[topic]
-        return account.receive(number - base)
+        return account.receive(number - first_number)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
-        """Yields the numbered channels of a site, with the gap before one of its starts.
+        """Yields, for each numbered channel of a site, the gap in its numbers before a start.
 
-        The gaps are created when they are needed first. Their number is limited, so that events
-        with invented boots cannot fill the memory.
+        While a site (arm controller) was away, it published nothing. The gap keeps these
+        numbers from counting as missing. It is created when it is needed first. The number of
+        gaps is limited, so that forged events with invented starts cannot fill the memory.
 
         Args:
             site: Name of the site.
@@ -297,10 +305,10 @@ class SessionAccounts:
             if topic not in self._accounts:
                 continue
             gap = self._start_gaps.get((topic, boot))
-            has_room = len(self._start_gaps) < _MAX_STARTS * len(self._rates_hz)
-            if gap is None and has_room:
-                under_way = count_under_way(channel, self._rates_hz[site])
-                gap = StartGap(self._accounts[topic], under_way)
+            has_space = len(self._start_gaps) < _MAX_STARTS * len(self._rates_hz)
+            if gap is None and has_space:
+                samples_under_way = count_under_way(channel, self._rates_hz[site])
+                gap = StartGap(self._accounts[topic], samples_under_way)
                 self._start_gaps[topic, boot] = gap
             if gap is not None:
                 yield channel, gap
@@ -308,11 +316,11 @@ class SessionAccounts:
     def add_expected_ticks(self, site: str, ticks: int) -> None:
         """Takes into account that a site executed at least a given number of ticks.
 
-        Records and statistics of these ticks that have not been received count as missing from
-        now on.
+        Records and statistics of these ticks (control periods) that have not been received
+        count as missing from now on.
 
         Args:
-            site: Name of the site.
+            site: Name of the site (arm controller).
             ticks: Number of executed ticks, counted from the start of the session.
         """
         for channel in (topics.STATE, topics.LINK):
@@ -336,8 +344,9 @@ class SessionAccounts:
 
         Returns:
             A line of text for each topic, such as "/trilat/paper/m1/state", whose last two
-            parts are the member and the channel. A member that is not a site, such as a
-            recorder, has no line if no message is expected of it.
+            parts are the member (process of a session) and the channel. A member that is not a
+            site (arm controller), such as a recorder, has no line if no message is expected of
+            it.
         """
         texts = {}
         for topic, account in self._accounts.items():
@@ -379,16 +388,19 @@ class SessionAccounts:
         Returns:
             The first and the last number of each range. Empty if no message is missing.
         """
-        base = self._bases.get(topic, 0)
+        first_number = self._bases.get(topic, 0)
         gaps = []
         for account in self.list_starts(topic):
-            gaps += [(base + first, base + last) for first, last in account.gaps]
+            gaps += [
+                (first_number + first, first_number + last) for first, last in account.gaps
+            ]
         return gaps
 
     def coverage(self) -> Coverage:
         """Computes how many ticks of every site were executed, and how many were recorded.
 
-        If it is unknown when a site ended, all ticks of the scenario count as executed.
+        If it is unknown when a site (arm controller) ended, all ticks (control periods) of the
+        scenario count as executed.
 
         Returns:
             Both numbers for every site.
@@ -409,8 +421,9 @@ class SessionAccounts:
         """Describes the missing records for the user, one line for each site that lacks some.
 
         Yields:
-            A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks.
-                Sites without missing records have no line.
+            A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks
+            (control periods).
+                Sites (arm controllers) without missing records have no line.
         """
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)
@@ -434,8 +447,8 @@ class SessionAccounts:
     def describe_unfinished_sites(self) -> Iterator[str]:
         """Describes for the user which sites may have executed more ticks than were recorded.
 
-        These are the sites that never published the event "end", and whose last recorded tick
-        is not the last tick of the scenario.
+        These are the sites (arm controllers) that never published the event "end", and whose
+        last recorded tick (control period) is not the last tick of the scenario.
 
         Yields:
             A line for each of these sites.
@@ -455,7 +468,7 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Creates the counters of a session, before the messages of a file are read.
+    """Creates the counters of a session's messages, before the messages of a file are read.
 
     Args:
         metadata: Metadata of the file, by name. They state the session.
@@ -472,9 +485,11 @@ def open_session_accounts(
         version = int(session_facts["schema_version"])
     except (KeyError, ValueError, ScenarioError):
         return None
+
+    part_number = metadata.get(PART, {}).get("index", "1")
     return SessionAccounts(
         session,
         scenario,
-        continued=metadata.get(PART, {}).get("index", "1") != "1",
+        continued=part_number != "1",
         events=version >= _EVENTS_NUMBERED_SINCE,
     )

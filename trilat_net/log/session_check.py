@@ -132,11 +132,11 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     paths = [Path(file) for file in files]
     try:
         total = sum(path.stat().st_size for path in paths)
-        before = 0
+        bytes_before = 0  # size of the parts that have been read, for the progress
         for path in sorted(paths, key=lambda path: path.name):
             with open_regular(path) as stream:
-                check.read(str(path), stream, shift_progress(progress, before, total))
-            before += path.stat().st_size
+                check.read(str(path), stream, shift_progress(progress, bytes_before, total))
+            bytes_before += path.stat().st_size
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         hint = describe_unfinished(Path(name))
@@ -186,10 +186,12 @@ class _ChannelCheck:
         if scenario is not None and key.member in scenario.sites:
             self.rate_hz = scenario.sites[key.member].rate_hz
             self._layout = scenario.layout(key.member)
+
         self.received = 0
         self.boots = set[int]()
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
+
         self._findings = findings
         self._accounts = accounts
         self._epoch_ns = _parse_number(about, "epoch_unix_ns")
@@ -225,29 +227,37 @@ class _ChannelCheck:
             self._add("schema", None, fault)
 
     def _find_schema_fault(self, channel: ChannelInfo) -> str:
-        """Returns the first fault in the description of the channel. Empty if there is none."""
+        """Returns the first fault in a file's description of the channel, as text.
+
+        The description must name the schema (the fields of the messages) that this version of
+        the log uses, its encoding, and the tick rate of the site (arm controller). The text is
+        empty if there is no fault.
+        """
         kind = CHANNEL_TYPES[self.kind]
         if not channel.schema:
             return "has no schema"
-        encodings = (channel.encoding, channel.schema_encoding)
-        if encodings != ("msgpack", "jsonschema"):
-            return f"must be msgpack with jsonschema, not {encodings[0]} with {encodings[1]}"
-        name = f"trilat.{kind.__name__}.v{self._version}"
-        if channel.schema != name:
-            return f"has the schema {channel.schema}, not {name}"
+        if channel.encoding != "msgpack" or channel.schema_encoding != "jsonschema":
+            return (
+                f"must be msgpack with jsonschema, not {channel.encoding} with "
+                f"{channel.schema_encoding}"
+            )
+        expected_schema = f"trilat.{kind.__name__}.v{self._version}"
+        if channel.schema != expected_schema:
+            return f"has the schema {channel.schema}, not {expected_schema}"
         if self._version == messages.VERSION:
-            released = json.dumps(messages.json_schema(kind)).encode()
-            if channel.schema_data != released:
+            released_schema = json.dumps(messages.json_schema(kind)).encode()
+            if channel.schema_data != released_schema:
                 return f"the schema {channel.schema} differs from its released version"
-        rate = channel.metadata.get("rate_hz", str(self.rate_hz))
-        if self.kind == topics.STATE and rate != str(self.rate_hz):
-            return f"states {rate} Hz, but the scenario states {self.rate_hz}"
+        stated_rate = channel.metadata.get("rate_hz", str(self.rate_hz))
+        if self.kind == topics.STATE and stated_rate != str(self.rate_hz):
+            return f"states {stated_rate} Hz, but the scenario states {self.rate_hz}"
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
         """Checks one message: that it can be decoded, is in its place, and has a possible time.
 
-        Problems are added to the findings.
+        A message states its sender, its number and its sending time. They must agree with those
+        that the file states for the message. Problems are added to the findings.
 
         Args:
             stored: The message, with its times and its sequence number in the file.
@@ -291,11 +301,15 @@ class _ChannelCheck:
         self._findings[check].add(self._file, offset, f"{self.name}: {text}")
 
     def _count(self, message: AnyMessage, number: int, publish_ns: int, offset: int) -> None:
-        """Counts a numbered message, and reports a number that occurs twice in the file.
+        """Counts a numbered message, so that missing and repeated messages are noticed.
+
+        A number that occurs twice in one file is reported as a problem. Numbers are counted
+        separately for each start of the sender, which is identified by the random number
+        `boot`.
 
         Args:
             message: The message.
-            number: Number of the message.
+            number: Number of the message in its channel.
             publish_ns: Sending time of the message, in Unix time, in ns.
             offset: Offset of the message in the file.
         """
@@ -347,8 +361,10 @@ class _ChannelCheck:
             text = f"log_time goes back by {self._log_ns - log_ns} ns at message {number}"
             self._add("times", offset, text)
         self._log_ns = log_ns
+
         sent_ns = publish_ns
         if stated_ns is not None:
+            # The file stores the time as an unsigned number of 64 bits.
             sent_ns = min(max(0, self._epoch_ns + stated_ns), MAX_TIME_NS)
         if publish_ns != sent_ns:
             text = (
@@ -419,7 +435,7 @@ class _SessionCheck:
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
         """Checks every byte of one file of the log, and its messages.
 
-        The problems are noted for `findings`.
+        The problems are collected, and `findings` returns them after the last file.
 
         Args:
             file: Name of the file.
@@ -534,10 +550,10 @@ class _SessionCheck:
             self._open_accounts(about["session"])
 
     def _open_accounts(self, session: str) -> None:
-        """Opens the accounts of the session's sites.
+        """Prepares the counting of the messages that the sites of the session have published.
 
-        They are opened before the first record arrives, because an event or statistics may
-        state how many records there are.
+        This happens before the first record is read, because an event or statistics may state
+        how many records there must be, even if the file contains none.
         """
         continued = not self._first_part
         self._counted = SessionAccounts(session, self._scenario, continued=continued)
@@ -547,30 +563,39 @@ class _SessionCheck:
                 self._counted.open_channel("/" + topics.key(session, name, channel))
 
     def _check_scenario(self, text: bytes) -> None:
-        """Checks the text of the scenario, and compares it with the metadata of the session."""
+        """Checks the scenario in the log, and compares it with the metadata of the session.
+
+        The scenario is the description of the experiment. The metadata contain its SHA-256, its
+        name, its seed and its sites (arm controllers).
+
+        Args:
+            text: Text of the scenario, encoded.
+        """
         finding = self._findings["scenario"]
-        about = self._about
-        digest = hashlib.sha256(text).hexdigest()
-        stated = about.get("scenario_sha256", "")
-        if digest != stated:
+        metadata = self._about
+        actual_sha256 = hashlib.sha256(text).hexdigest()
+        stated_sha256 = metadata.get("scenario_sha256", "")
+        if actual_sha256 != stated_sha256:
             finding.add(
                 self._file,
                 None,
-                f"its SHA-256 is {digest[:16]}, but the session names {stated[:16]}",
+                f"its SHA-256 is {actual_sha256[:16]}, but the session names "
+                f"{stated_sha256[:16]}",
             )
         try:
             self._scenario = scenario = parse_embedded(text.decode(), "scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
             finding.add(self._file, None, f"cannot be read: {error}")
             return
+
         facts = {
             "scenario": scenario.name,
             "seed": str(scenario.seed),
             "sites": " ".join(scenario.names),
         }
         for key, value in facts.items():
-            if about.get(key) != value:
-                stated_value = about.get(key, "")[:40]
+            if metadata.get(key) != value:
+                stated_value = metadata.get(key, "")[:40]
                 finding.add(
                     self._file,
                     None,
@@ -675,55 +700,57 @@ class _SessionCheck:
         yield findings["scenario"].conclude(text)
 
     def _check_sequence(self) -> Finding:
-        """Returns the finding on missing and repeated messages.
+        """Returns the finding on missing and repeated messages, as the numbers show them.
 
         The recorder's statistics are not counted, because they are not numbered.
         """
         finding = self._findings["sequence"]
         missing = 0
         reordered = 0
-        gaps = []
+        missing_ranges = []
         for topic, check in self.channels.items():
             if check.kind == topics.STATS:
                 continue
             for first, last in self._counted.list_gaps(topic):
                 missing += last - first + 1
-                gaps.append(
-                    f"{check.name} {first}-{last}" if last > first else f"{check.name} {first}"
-                )
+                numbers = f"{first}-{last}" if last > first else f"{first}"
+                missing_ranges.append(f"{check.name} {numbers}")
             reordered += sum(account.reordered for account in self._counted.list_starts(topic))
 
+        # The text of the finding, and a problem for each range.
         received = sum(check.received for check in self.channels.values())
         channels = count_nouns(len(self.channels), "channel")
-        text = f"{count_nouns(received, 'message')} of {channels}"
+        summary = f"{count_nouns(received, 'message')} of {channels}"
         if missing:
-            text += f", {missing} missing in {len(gaps)} range{'s' * (len(gaps) > 1)}"
+            plural = "s" if len(missing_ranges) > 1 else ""
+            summary += f", {missing} missing in {len(missing_ranges)} range{plural}"
         elif finding.passed:
-            text += ", none missing, none twice"
+            summary += ", none missing, none twice"
         if not finding.passed:
-            text += f"; {finding.summary()}"
+            summary += f"; {finding.summary()}"
         if reordered:
-            text += f"; {reordered} came late"
+            summary += f"; {reordered} came late"
         if self._needs_end_events and self._counted.unknown_ends:
-            text += f"; {describe_unknown_ends(self._counted.unknown_ends)}"
-        for gap in gaps:
-            finding.add("", None, f"missing {gap}")
-        finding.text = text
+            summary += f"; {describe_unknown_ends(self._counted.unknown_ends)}"
+        for missing_range in missing_ranges:
+            finding.add("", None, f"missing {missing_range}")  # concerns the whole log
+        finding.text = summary
         return finding
 
     @property
     def _needs_end_events(self) -> bool:
-        """True if the files must contain the "end" event of every site.
+        """True if the files must contain the event "end" of every site (arm controller).
 
-        They need not if they are a single part of a log, or if the recorder left out the
-        events.
+        A site publishes this event at its end. It may be missing if only one of several parts
+        of a log is checked, or if the recorder was told not to record events.
         """
         session = self._about["session"]
         channel_filter = parse_filter_facts(self._about)
         names = self._scenario.names if self._scenario else ()
-        keys = [topics.key(session, name, topics.EVENT) for name in names]
+        event_topics = [topics.key(session, name, topics.EVENT) for name in names]
+        are_events_recorded = all(channel_filter.accepts(topic) for topic in event_topics)
         is_single_part = self._files == self._parts == 1
-        return all(map(channel_filter.accepts, keys)) and not is_single_part
+        return are_events_recorded and not is_single_part
 
     def _check_accounts(self) -> Finding:
         """Compares the accounts, the recorder's counts of messages, with the messages.
@@ -745,7 +772,8 @@ class _SessionCheck:
         for check in self.channels.values():
             if check.member == topics.RECORDER:
                 recorder_boots |= check.boots
-        if not self._first_part or len(recorder_boots) > 1:
+        had_several_recorders = len(recorder_boots) > 1
+        if not self._first_part or had_several_recorders:
             return finding.conclude("include other parts of the log, and were not compared")
 
         for topic, check in self.channels.items():
@@ -766,13 +794,13 @@ class _SessionCheck:
     def _check_rates(self) -> Finding:
         """Compares the rates at which the sites sent records with the rates of the scenario.
 
-        The number of a record is its tick. The mean rate is therefore the difference between
-        the numbers of the first and the last record, divided by the time between them. It may
-        deviate by the fraction `_RATE_TOLERANCE`. Records over less than `_RATE_SPAN_NS` are
-        not judged.
+        The number of a record is its tick (control period). The mean rate is therefore the
+        difference between the numbers of the first and the last record, divided by the time
+        between them. It may deviate by the fraction `_RATE_TOLERANCE`. Records over less than
+        `_RATE_SPAN_NS` are not judged.
 
         Returns:
-            The finding, with a problem for each site whose rate is wrong.
+            The finding, with a problem for each site (arm controller) whose rate is wrong.
         """
         finding = self._findings["rates"]
         texts = []
@@ -799,8 +827,9 @@ def judge_integrity(log: Log) -> Integrity:
     """Finds out whether a log was changed after it was recorded.
 
     The contents are compared with the digests, the checksums that the log contains. In
-    addition, the records are compared with the message counts and the statistics of the
-    recorder. This also reveals changes to a log that was written anew with new digests.
+    addition, the records (results of control periods) are compared with the message counts and
+    the statistics of the recorder. This also reveals changes to a log that was written anew
+    with new digests.
 
     Args:
         log: The log.

@@ -82,10 +82,10 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
     Args:
         x: Positions x, y, z in m, or poses, which are positions and rotation vectors in rad,
-            shape (K, m), for K records.
+            shape (K, m), for K records (results of control periods).
         x_des: Their references, in the same form, shape (K, m).
-        axes: For each of the m coordinates, 1 if the site follows its reference along that
-            axis. For the other axes it is 0, and the error is set to 0.
+        axes: For each of the m coordinates, 1 if the site (arm controller) follows its
+            reference along that axis. For the other axes it is 0, and the error is set to 0.
 
     Returns:
         The errors, shape (K, m), in m and rad.
@@ -151,20 +151,20 @@ class LazyRecords(Sequence[State]):
     def __init__(
         self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
     ) -> None:
-        size = _HEAVY_BLOCK if heavy else BLOCK_RECORDS
-        blocks = _HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // size
+        block_size = _HEAVY_BLOCK if heavy else BLOCK_RECORDS
+        block_count = _HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // block_size
         self._payloads = payloads
-        self._size = size
+        self._size = block_size
 
-        @lru_cache(maxsize=blocks)
+        @lru_cache(maxsize=block_count)
         def get_block(number: int) -> list[State]:
             """Returns a block of consecutive records, decoded unless it is in memory.
 
             Args:
                 number: Number of the block, counted from 0.
             """
-            first = number * size
-            return decode_block(payloads[first : first + size])
+            first = number * block_size
+            return decode_block(payloads[first : first + block_size])
 
         self._get_block = get_block
 
@@ -193,11 +193,11 @@ class LazyRecords(Sequence[State]):
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Decodes the records of a site, at once or when they are accessed.
+    """Decodes the records of a site (arm controller), at once or when they are accessed.
 
-    A list is faster to use, but keeps all decoded records in memory. Therefore records are
-    decoded at once only if there are at most `MAX_DECODED_RECORDS` of them, and if they are not
-    heavy (see `HEAVY_BYTES`).
+    A list is faster to use, but keeps all decoded records (results of control periods) in
+    memory. Therefore records are decoded at once only if there are at most
+    `MAX_DECODED_RECORDS` of them, and if they are not heavy (see `HEAVY_BYTES`).
 
     Args:
         payloads: The encoded records.
@@ -231,7 +231,7 @@ def _estimate_bytes(state: State) -> int:
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Read-only mapping from ticks to the records of a site.
+    """Read-only mapping from ticks (control periods) to the records of a site (arm controller).
 
     It is used for long logs: a record is decoded only when it is accessed. If several records
     have the same tick, the mapping contains the last of them.
@@ -285,7 +285,8 @@ class _RecordField(cached_property[T]):
     property is the name of the field.
 
     Args:
-        read_column: Function that returns the field of all records, by its name.
+        read_column: Function that returns the field of all records (results of control
+            periods), by its name.
         meaning: Docstring of the property.
     """
 
@@ -321,11 +322,12 @@ def _read_objects(site: "SiteLog", field: str) -> NDArray[np.object_]:
 
 
 class SiteLog:
-    """Records of one site, in the order of their ticks.
+    """Records of one site, in the order of their ticks (control periods).
 
-    `Log` creates this object for each site of a log. K is the number of records below, n the
-    number of joints, m the number of coordinates that the sites share (the joints, or the
-    coordinates of the end effector in task space), and P the number of parameters.
+    `Log` creates this object for each site of a log. K is the number of records (results of
+    control periods) below, n the number of joints, m the number of coordinates that the sites
+    share (the joints, or the coordinates of the end effector in task space), and P the number
+    of parameters.
 
     Args:
         name: Name of the site.
@@ -374,6 +376,8 @@ class SiteLog:
         self.layout = layout
         self.axes = axes
         self._source = source
+
+        # If all records have the usual layout, their fields are read without decoding them.
         self.payloads = PackedMessages.pack(payloads)
         self.indexed = index_records(self.payloads, name, peers, layout)
         if self.indexed is None:
@@ -382,7 +386,9 @@ class SiteLog:
             self.tick = self.indexed.ticks
         zeros = np.zeros(len(payloads), dtype=np.int64)
         self.log_time_ns, self.publish_time_ns = times or (zeros, zeros)
-        if (self.tick[1:] < self.tick[:-1]).any():
+
+        is_unordered = (self.tick[1:] < self.tick[:-1]).any()
+        if is_unordered:  # late records are stored behind later ones
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
             self.payloads = self.payloads.select(order)
@@ -425,12 +431,12 @@ class SiteLog:
     def _read_from(
         self, payloads: Sequence[bytes], decode_column: Callable[..., T], *arguments: Any
     ) -> T:
-        """Decodes columns of some records, see `_read`.
+        """Decodes a field of some records into an array that cannot be changed.
 
         Args:
-            payloads: The encoded records.
-            decode_column: Function that decodes them.
-            *arguments: Further arguments of that function.
+            payloads: The encoded records (results of control periods).
+            decode_column: Function that decodes the field of all given records.
+            *arguments: Further arguments of that function, such as the name of the field.
 
         Raises:
             LogError: A record cannot be decoded.
@@ -474,8 +480,9 @@ class SiteLog:
     def memory(self, first: int, count: int) -> Array:
         """Returns a part of the internal state of the site's control law in all records.
 
-        The field `mem` of a record contains every number that the site and its control law need
-        to continue from this tick, and that no other field contains. The numbers have no names.
+        The field `mem` of a record contains every number that the site (arm controller) and its
+        control law need to continue from this tick (control period), and that no other field
+        contains. The numbers have no names.
 
         Args:
             first: Index of the first wanted number in `mem`.
@@ -487,11 +494,11 @@ class SiteLog:
         Raises:
             LogError: The field of a record contains too few numbers.
         """
-        parts = [row[first : first + count] for row in self.mem]
+        wanted_numbers = [row[first : first + count] for row in self.mem]
         try:
-            return np.array(parts, dtype=np.float64).reshape(len(self), count)
+            return np.array(wanted_numbers, dtype=np.float64).reshape(len(self), count)
         except ValueError:
-            # The parts have different lengths, or all of them are too short.
+            # The lists have different lengths, or all of them are too short.
             needed = f"{count_nouns(first + count, 'number')} in `mem`"
             raise LogError(
                 f"{self._source}: a record of {self.name} does not have {needed}"
@@ -509,10 +516,10 @@ class SiteLog:
         return self.decode([self.payloads[n]])[0]
 
     def decode(self, payloads: Sequence[bytes]) -> list[State]:
-        """Decodes whole records and checks them.
+        """Decodes whole records, and checks that their vectors have the lengths of this arm.
 
         Args:
-            payloads: Encoded records of the site.
+            payloads: Encoded records (results of control periods) of the site (arm controller).
 
         Raises:
             LogError: A record cannot be decoded.
@@ -791,16 +798,17 @@ class SiteLog:
         """Computes how old the sample of a peer is that the control law uses at each record.
 
         The age is the time of the record minus the stamp of the sample. The stamp is the
-        nominal time of the tick in which the peer computed the sample.
+        nominal time of the tick (control period) in which the peer computed the sample.
 
         Args:
-            peer: Name of the peer, another site whose samples this site receives.
+            peer: Name of the peer, another site (arm controller) whose samples this site
+                receives.
             rate_hz: Tick rate of the peer, in Hz.
 
         Returns:
             The ages, shape (K,), in s. NaN before the first sample.
         """
-        used = self.used[peer]
-        stamp_ns = used * NS_PER_S // rate_hz
-        age_ns = self.t_ns - stamp_ns
-        return np.where(used >= 0, age_ns / NS_PER_S, np.nan)
+        used_ticks = self.used[peer]
+        stamps_ns = used_ticks * NS_PER_S // rate_hz
+        age_ns = self.t_ns - stamps_ns
+        return np.where(used_ticks >= 0, age_ns / NS_PER_S, np.nan)

@@ -105,7 +105,7 @@ class SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a new message with the next number to the site.
+        """Sends a new message with the next number to the site (arm controller).
 
         Args:
             kind: Class of the message.
@@ -141,13 +141,12 @@ class SiteSender:
         session: str,
         site: str,
     ) -> "SiteSender":
-        """Returns an object that sends the messages of an operator to a site.
+        """Returns an object that sends the messages of an operator to the site of an arm.
 
-        The operator is identified by a random number in 1 ... 2^32 - 1. Records store the
-        number as a float, which represents these numbers exactly. In a record, the number 0
-        means that no operator moves the arm.
-
-        The operator is the person or program that moves an arm.
+        The operator is the person or program that moves the arm. A random number in 1 ... 2^32
+        - 1 identifies the operator's program. The records of the site store this number as a
+        float, which represents such numbers exactly. In a record, the number 0 means that no
+        operator moves the arm.
 
         Args:
             bus: Network connection of the operator's program.
@@ -194,6 +193,7 @@ class SiteClient:
         self._received_ns = 0
         self._was_present = False
         self._is_over = False
+
         self._records = bus.stamped_inbox(
             topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64
         )
@@ -243,29 +243,31 @@ class SiteClient:
         """Returns True if a record may follow the newest known one.
 
         It must come from the same process of the site and be newer. Its time must not be more
-        than `AHEAD_NS` later than the time of the newest record plus the time since that record
-        arrived. A forged record with a time far in the future would otherwise make the client
-        ignore all correct records.
+        than `AHEAD_NS` later than the time of the newest record (result of a control period)
+        plus the time since that record arrived. A forged record with a time far in the future
+        would otherwise make the client ignore all correct records.
 
         Args:
             record: The record.
             received_ns: Time of its arrival on the local clock, in ns.
         """
-        last = self._record
-        if last is None:
+        newest = self._record
+        if newest is None:
             return True
         is_newer = (
-            record.boot == last.boot and record.tick > last.tick and record.t_ns > last.t_ns
+            record.boot == newest.boot
+            and record.tick > newest.tick
+            and record.t_ns > newest.t_ns
         )
         elapsed_ns = received_ns - self._received_ns
-        is_plausible = record.t_ns - last.t_ns <= elapsed_ns + AHEAD_NS
+        is_plausible = record.t_ns - newest.t_ns <= elapsed_ns + AHEAD_NS
         return is_newer and is_plausible
 
     def _read_messages(self) -> None:
         """Receives all waiting messages, and updates the newest record and the end of the run.
 
-        The run of the site has ended if the site has published its end, or if its liveliness
-        token, which exists as long as its process is connected, has disappeared.
+        The run of the site (arm controller) has ended if the site has published its end, or if
+        its liveliness token, which exists as long as its process is connected, has disappeared.
         """
         while (message := self._records.poll()) is not None:
             block, received_ns = message
@@ -280,8 +282,10 @@ class SiteClient:
                 self._received_ns = received_ns
 
         for event in read_messages(self._events, Event):
-            known = self._record
-            if event.kind == "end" and known is not None and event.boot == known.boot:
+            # Only the process that sent the records can end the run, not another one of the
+            # same name.
+            newest = self._record
+            if event.kind == "end" and newest is not None and event.boot == newest.boot:
                 self._is_over = True
 
         for _, is_alive in topics.read_presence(self._presence):
@@ -424,15 +428,17 @@ class ArmClient(_OutsideClient):
             ValueError: `tau_x` is not as long as `q`, or a number is not finite.
         """
         vectors = {"q": q, "qd": qd, "tau_x": tau_x}
-        numbers = {name: [*map(float, vector)] for name, vector in vectors.items()}
-        stamp = {} if stamp_ns is None else {"sent_ns": stamp_ns}
-        self._sender.send(ArmMeasurement, **numbers, **stamp)
+        vectors_by_name = {
+            name: [float(number) for number in vector] for name, vector in vectors.items()
+        }
+        optional_stamp = {} if stamp_ns is None else {"sent_ns": stamp_ns}
+        self._sender.send(ArmMeasurement, **vectors_by_name, **optional_stamp)
 
     def torque(self) -> tuple[float, ...] | None:
         """Returns the torque to apply now, or None if the arm must brake.
 
         The torque is that of the newest record, the result of one tick (period of the control
-        loop) of the site. The arm must brake
+        loop) of the site (arm controller). The arm must brake
 
         - before the first tick and after the run,
         - if the newest record is older than `FRESH_NS`,
@@ -505,7 +511,10 @@ class Hand(SiteClient):
         self._operator = operator
         self._compute_pose = compute_pose
         self._source = source
+
         self._sender = SiteSender.for_hand(bus, clock, session, site)
+        # The newest message, which a thread repeats, so that the site knows that this program
+        # still runs. The lock keeps the two threads from sending at the same time.
         self._message: HandMessage | None = None
         self._lock = threading.Lock()
         self._ended = threading.Event()
@@ -515,8 +524,8 @@ class Hand(SiteClient):
     def __exit__(self, *_: object) -> None:
         """Releases the arm, and waits until its record shows that nobody holds it any more.
 
-        The wait takes at most twice the time in which the grip fades, also if no record
-        arrives. The bus stays open, because the caller opened it.
+        The wait takes at most twice the time in which the grip fades, also if no record (result
+        of a control period) arrives. The bus stays open, because the caller opened it.
         """
         try:
             self.release()
@@ -533,8 +542,8 @@ class Hand(SiteClient):
             *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
 
         Returns:
-            The number of the message. The property `number` has this value once the site
-            follows the message.
+            The number of the message. The property `number` has this value once the site (arm
+            controller) follows the message.
 
         Raises:
             UsageError: The scenario's operator is not moved in this way, or a number is not
@@ -664,11 +673,13 @@ class Hand(SiteClient):
     def _compute_pose_rate(self, record: State) -> list[float]:
         """Returns the velocity of the end effector, or of the angles that the operator turns.
 
-        The pose has no closed derivative here: it is evaluated a little ahead and behind along
-        the measured joint velocities, and the difference is divided by the time between.
+        It is computed as a central difference, because only a function for the pose is known:
+        the pose is evaluated a little later and a little earlier along the measured joint
+        velocities, and the difference is divided by the time between the two.
 
         Args:
-            record: Record of the site, with angles and velocities of the joints.
+            record: Record (result of a control period) of the site (arm controller), with
+                angles and velocities of the joints.
 
         Returns:
             The rate of each coordinate of the pose, m/s or rad/s.
@@ -678,7 +689,7 @@ class Hand(SiteClient):
         pose_after = self._compute_pose([q + step_s * qd for q, qd in joints])
         pose_before = self._compute_pose([q - step_s * qd for q, qd in joints])
         pairs = zip(pose_after, pose_before, strict=True)
-        return [(after - before) / (2.0 * step_s) for after, before in pairs]
+        return [(later - earlier) / (2.0 * step_s) for later, earlier in pairs]
 
     def _wait_for_record(self) -> State:
         """Returns the newest record of the site, and waits if none has arrived yet.
@@ -702,18 +713,20 @@ class Hand(SiteClient):
         Raises:
             UsageError: The scenario's operator has another kind, or a number is not finite.
         """
-        allowed = _ACTIONS[self._operator.kind]
-        if action != allowed:
+        permitted_action = _ACTIONS[self._operator.kind]
+        if action != permitted_action:
             raise UsageError(
-                f"the hand of {self._site} can {allowed}, not {action}: "
+                f"the hand of {self._site} can {permitted_action}, not {action}: "
                 "see the mode of the hand in the scenario"
             )
-        goal = [float(number) for number in numbers]
-        if not all(map(math.isfinite, goal)):
-            raise UsageError(f"the numbers of {action} must be finite, not {goal}")
-        key = "force" if allowed == "push" else "target"
+        coordinates = [float(number) for number in numbers]
+        if not all(map(math.isfinite, coordinates)):
+            raise UsageError(f"the numbers of {action} must be finite, not {coordinates}")
+        field = "force" if permitted_action == "push" else "target"
         with self._lock:
-            self._message = self._sender.send(HandMessage, source=self._source, **{key: goal})
+            self._message = self._sender.send(
+                HandMessage, source=self._source, **{field: coordinates}
+            )
             return self._sender.number
 
     def _repeat_messages(self) -> None:

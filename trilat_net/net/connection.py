@@ -50,7 +50,7 @@ _BLOCK = 64
 
 
 def default_endpoint(session: str, index: int) -> str:
-    """Returns the network endpoint at which a site listens by default.
+    """Returns the network endpoint at which a site (arm controller) listens by default.
 
     The port is computed from the name of the session and the index, so that every process finds
     the endpoint without any configuration.
@@ -62,7 +62,10 @@ def default_endpoint(session: str, index: int) -> str:
     Returns:
         The endpoint on this machine, as in "tcp/127.0.0.1:10241".
     """
-    port = _FIRST_PORT + zlib.crc32(session.encode()) % _BLOCKS * _BLOCK + index % _BLOCK
+    # A checksum of the name selects one of `_BLOCKS` blocks of consecutive ports, so that two
+    # sessions on one machine rarely get the same ports.
+    block = zlib.crc32(session.encode()) % _BLOCKS
+    port = _FIRST_PORT + block * _BLOCK + index % _BLOCK
     return f"tcp/127.0.0.1:{port}"
 
 
@@ -73,7 +76,7 @@ def default_endpoints(
 
     Args:
         session: Name of the session.
-        sites: Names of the sites, in the order of the scenario.
+        sites: Names of the sites (arm controllers), in the order of the scenario.
         encrypted: True for endpoints of TLS instead of TCP.
     """
     endpoints = {}
@@ -93,7 +96,7 @@ def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[li
 
     Args:
         session: Name of the session.
-        sites: Names of the sites, in the order of the scenario.
+        sites: Names of the sites (arm controllers), in the order of the scenario.
 
     Yields:
         The endpoints, in the order of the sites.
@@ -124,7 +127,7 @@ def find_free_endpoints(count: int) -> list[str]:
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Reserves ports of this machine for sites that will listen at them.
+    """Reserves ports of this machine for sites (arm controllers) that will listen at them.
 
     A port is reserved by a socket that is bound to it but does not listen. The operating system
     then gives the port to nobody who asks for any free port.
@@ -227,7 +230,8 @@ class Connection:
         """Checks that the keys of the member stay valid until the planned end of a session.
 
         An open connection continues after its certificate has expired, but no new connection
-        can be opened. After a short interruption of the network, a member could not return.
+        can be opened. After a short interruption of the network, a member (process of a
+        session) could not return.
 
         Args:
             left_s: Remaining duration of the session, in s.
@@ -383,7 +387,8 @@ class Connection:
         """Adds a member's keys to a connection, or checks that it is safe without keys.
 
         Args:
-            keys: Keys of a member, or the folder that contains them. None if there are no keys.
+            keys: Keys of a member (process of a session), or the folder that contains them.
+                None if there are no keys.
             insecure: True to permit endpoints that other machines can reach without keys.
 
         Returns:
@@ -398,6 +403,7 @@ class Connection:
             from .member_keys import read_member_keys  # loads the cryptography package
 
             keys = read_member_keys(keys)
+
         endpoints = (*self.listen, *(self.connect or ()))
         addresses = find_endpoint_addresses(endpoints)
         for address in addresses:
@@ -409,6 +415,7 @@ class Connection:
         if keys is None:
             _check_open_endpoints(self, insecure=insecure)
             return self
+
         for address in addresses:
             _check_encrypted_endpoint(address)
         _refuse_settings_of_keys(self.settings)
@@ -563,8 +570,8 @@ def is_loopback(address: str) -> bool:
     Args:
         address: Address of an endpoint, as in "tcp/127.0.0.1:7447".
     """
-    protocol, _, rest = address.partition("/")
-    host_and_port = re.split(r"[?#]", rest)[0]  # without Zenoh's settings
+    protocol, _, address_part = address.partition("/")
+    host_and_port = re.split(r"[?#]", address_part)[0]  # without Zenoh's settings
     host = host_and_port.rpartition(":")[0].strip("[]")
     if protocol.startswith("unix") or host == "localhost":
         return True
@@ -596,37 +603,39 @@ def _join_options(
             "endpoints in only one place"
         )
 
-    listening: Sequence[Endpoint] = listen_else
+    listen_endpoints: Sequence[Endpoint] = listen_else
     if listen is not None:
-        listening = listen
+        listen_endpoints = listen
     elif file_listen is not None:
-        listening = file_listen
-    connected = _merge_endpoints(connect, file, mode, connect_else)
-    return Connection(listening, connected, mode, file.settings)
+        listen_endpoints = file_listen
+    connect_endpoints = _merge_endpoints(connect, file, mode, connect_else)
+    return Connection(listen_endpoints, connect_endpoints, mode, file.settings)
 
 
 def _merge_endpoints(
-    named: Sequence[str] | None,
+    named_endpoints: Sequence[str] | None,
     file: ZenohFile,
     mode: ZenohMode,
-    otherwise: Sequence[str] | None,
+    fallback_endpoints: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
-    """Joins the endpoints of the command line and of a Zenoh file to which to connect.
+    """Returns the endpoints to which a process connects, from the command line and a file.
 
-    The endpoints of the command line come first. Each endpoint occurs once.
+    The endpoints of the command line come first, then further ones of the user's Zenoh file.
 
     Args:
-        named: Endpoints of the option. None if the option is absent.
+        named_endpoints: Endpoints of the option. None if the option is absent.
         file: The user's Zenoh file.
         mode: Mode of the process.
-        otherwise: Endpoints to use if neither the option nor the file names any.
+        fallback_endpoints: Endpoints to use if neither the option nor the file names any.
     """
     file_endpoints = file.endpoints("connect", mode)
-    if named is None and file_endpoints is None:
-        return otherwise
-    endpoints: list[Endpoint] = list(named or ())
-    further = [endpoint for endpoint in file_endpoints or () if endpoint not in endpoints]
-    return endpoints + further
+    if named_endpoints is None and file_endpoints is None:
+        return fallback_endpoints
+    endpoints: list[Endpoint] = list(named_endpoints or ())
+    further_endpoints = [
+        endpoint for endpoint in file_endpoints or () if endpoint not in endpoints
+    ]
+    return endpoints + further_endpoints
 
 
 ROUTER_POLL_NS = 50_000_000

@@ -64,7 +64,7 @@ def find_members(
     """Queries the members of a session, and yields their identities as they arrive.
 
     The query is repeated until the search ends, because a reply may be lost. The identity of a
-    member is therefore yielded repeatedly.
+    member (process of a session) is therefore yielded repeatedly.
 
     Args:
         bus: Network connection that reaches the session.
@@ -292,7 +292,8 @@ def _query_once(
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         reply = replies.poll()
         if reply is not None:
-            return reply[1]
+            _key, payload = reply
+            return payload
     return None
 
 
@@ -304,8 +305,8 @@ def list_past_events(
 ) -> Iterator[Event]:
     """Queries a running site for the events that it has published, and yields them in order.
 
-    The first event is the oldest one that the site still stores. The iteration ends early if
-    the site does not reply.
+    The first event is the oldest one that the site (arm controller) still stores. The iteration
+    ends early if the site does not reply.
 
     Args:
         bus: Network connection that reaches the site.
@@ -386,7 +387,7 @@ def refuse_running_session(
         stopped: Function that returns True to end the check early.
 
     Raises:
-        SessionError: A site of that session replies.
+        SessionError: A site (arm controller) of that session replies.
     """
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=_NAME_CHECK_S):
         if info.member == topics.RECORDER:

@@ -141,7 +141,7 @@ def make_site_known(
 
 
 def find_known_sites(session: str) -> list[_KnownSite]:
-    """Lists the sites of a session that run on this machine.
+    """Lists the sites (arm controllers) of a session that run on this machine.
 
     The files of sites whose process is gone are removed.
 
@@ -166,9 +166,10 @@ def find_known_sites(session: str) -> list[_KnownSite]:
 
 
 def _is_alive(pid: int) -> bool:
-    """Returns True if a process with this number exists, so that its file is not a leftover.
+    """Returns True if a process with this number exists.
 
-    On other systems than POSIX, where it cannot be asked without harm, it is assumed to exist.
+    The file of a site (arm controller) without a process is left over from a crash. On other
+    systems than POSIX, the process is assumed to exist, because asking for it could end it.
     """
     with suppress(PermissionError):
         try:
@@ -183,7 +184,7 @@ def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
     """Returns the network endpoints at which some sites can be reached, each endpoint once.
 
     Args:
-        known_sites: The sites, as `find_known_sites` returns them.
+        known_sites: The sites (arm controllers), as `find_known_sites` returns them.
     """
     endpoints: list[Endpoint] = []
     for known in known_sites:
@@ -194,7 +195,7 @@ def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
 
 
 def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Finds the endpoints of a session whose sites all run on this machine.
+    """Finds the endpoints of a session whose sites (arm controllers) all run on this machine.
 
     Every running site stores its endpoints in a file, so that no search in the network is
     needed.
@@ -218,7 +219,8 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 
     known_names = {known.site for known in known_sites}
     all_names = set(known_sites[0].sites)
-    return _list_endpoints(known_sites) if known_names == all_names else None
+    is_complete = known_names == all_names
+    return _list_endpoints(known_sites) if is_complete else None
 
 
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
@@ -284,11 +286,11 @@ def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str
     options = {"--session": "", "--keys": ""}
     others: list[str] = []
     is_simple = True
-    rest = iter(arguments)
-    for argument in rest:
+    remaining_arguments = iter(arguments)
+    for argument in remaining_arguments:
         name, equals, value = argument.partition("=")
         if name in options:
-            options[name] = value if equals else next(rest, "")
+            options[name] = value if equals else next(remaining_arguments, "")
         else:
             is_simple = is_simple and not argument.startswith("-")
             others.append(argument)

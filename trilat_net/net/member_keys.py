@@ -149,7 +149,7 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Checks names of members, and returns what is wrong with them.
+    """Checks names of members (processes of a session), and returns what is wrong with them.
 
     Args:
         members: The names.
@@ -160,17 +160,16 @@ def _find_name_fault(members: Sequence[Any]) -> str:
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
         if not has_valid_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
-            hint = (
-                ""
-                if str(name).isascii()
-                else "; only the letters a to z and A to Z are allowed"
-            )
+            hint = ""
+            if not str(name).isascii():
+                hint = "; only the letters a to z and A to Z are allowed"
             return (
                 f"a member's name must have 1 to {MOST_LETTERS} characters (letters, digits, _ "
                 f"and -) and must not be {_AUTHORITY_FOLDER}; this name is refused: "
                 f"{ascii(name)[:80]}{hint}"
             )
-    if not members or len(members) > len(set(members)):
+    has_duplicates = len(members) > len(set(members))
+    if not members or has_duplicates:
         return "name at least one member, and each member once"
     return ""
 
@@ -354,7 +353,7 @@ def add_keys(
 
 
 def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
-    """Reads the lists of members in the folders of all members.
+    """Reads the lists of members (processes of a session) in the folders of all members.
 
     Args:
         folder: Folder of the keys of all members.
@@ -366,35 +365,56 @@ def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
         UsageError: A list is missing or damaged, or two lists have different members.
     """
     lists: dict[str, dict[str, Any]] = {}
-    waiting = sorted(path.parent.name for path in folder.glob(f"*/{MEMBERS}"))
-    if not waiting:
+    unread_members = sorted(path.parent.name for path in folder.glob(f"*/{MEMBERS}"))
+    if not unread_members:
         raise UsageError(f"{folder}: has no keys made by `trilat keys new`")
-    while waiting:
-        name = waiting.pop(0)
-        path = folder / name / MEMBERS
-        try:
-            entry = json.loads(_read_trusted(path))
-            names = entry["members"]
-            is_valid = entry["member"] == name and not _find_name_fault(names)
-        except OSError:
-            raise UsageError(
-                f"{folder}: has no folder of the member {name}, whose list of members must "
-                f"change too: copy {name}/{MEMBERS} back from its machine"
-            ) from None
-        except (ValueError, TypeError, KeyError):
-            is_valid = False
-        if not is_valid:
-            raise UsageError(f"{path}: is damaged, or was not made by `trilat keys new`")
+
+    while unread_members:
+        name = unread_members.pop(0)
+        entry = _read_member_list(folder, name)
         lists[name] = entry
-        waiting += [other for other in names if other not in lists and other not in waiting]
-    first = next(iter(lists.values()))["members"]
+        # A list may name members without a folder here. They must be found as well.
+        for other in entry["members"]:
+            if other not in lists and other not in unread_members:
+                unread_members.append(other)
+
+    first_list = next(iter(lists.values()))["members"]
     for name, entry in lists.items():
-        if set(entry["members"]) != set(first):
+        if set(entry["members"]) != set(first_list):
             raise UsageError(
                 f"{folder / name / MEMBERS}: lists other members than the other folders: copy "
                 "the newest folder of each member here"
             )
     return lists
+
+
+def _read_member_list(folder: Path, name: str) -> dict[str, Any]:
+    """Reads the list of members (processes of a session) in the folder of one member.
+
+    Args:
+        folder: Folder of the keys of all members.
+        name: Name of the member.
+
+    Returns:
+        The content of the file `MEMBERS`: the name of the member, and the names of all members.
+
+    Raises:
+        UsageError: The list is missing or damaged.
+    """
+    path = folder / name / MEMBERS
+    try:
+        entry: dict[str, Any] = json.loads(_read_trusted(path))
+        is_valid = entry["member"] == name and not _find_name_fault(entry["members"])
+    except OSError:
+        raise UsageError(
+            f"{folder}: has no folder of the member {name}, whose list of members must "
+            f"change too: copy {name}/{MEMBERS} back from its machine"
+        ) from None
+    except (ValueError, TypeError, KeyError):
+        is_valid = False
+    if not is_valid:
+        raise UsageError(f"{path}: is damaged, or was not made by `trilat keys new`")
+    return entry
 
 
 def _add_folders(
@@ -403,7 +423,7 @@ def _add_folders(
     files: dict[Path, str],
     write: Callable[[Path], None],
 ) -> None:
-    """Adds folders of members and replaces files, all of them or none.
+    """Adds folders of members (processes of a session) and replaces files, all of them or none.
 
     Args:
         folder: Folder of the keys of all members.
@@ -414,9 +434,10 @@ def _add_folders(
     Raises:
         LogRefused: The disk refused to write. The folder is as it was before.
     """
-    before = {path: path.read_text(encoding="utf-8") for path in files}
+    old_contents = {path: path.read_text(encoding="utf-8") for path in files}
     try:
-        # The scratch is on the same disk, so that folders can be moved out of it at once.
+        # The scratch folder is on the same disk, so that moving a folder out of it cannot fail
+        # halfway.
         with tempfile.TemporaryDirectory(prefix=".add-", dir=folder) as scratch:
             write(Path(scratch))
             for member in members:
@@ -424,7 +445,8 @@ def _add_folders(
         for path, content in files.items():
             write_whole(path, content, mode=0o600)
     except BaseException as error:
-        for path, content in before.items():
+        # Restores the previous state: the old files, and no new folders.
+        for path, content in old_contents.items():
             with suppress(OSError, LogRefused):
                 if path.read_text(encoding="utf-8") != content:
                     write_whole(path, content, mode=0o600)
@@ -457,14 +479,16 @@ def _renew_member(
         UsageError: A file is damaged, or the authority has not signed the previous certificate.
     """
     try:
-        old = x509.load_pem_x509_certificate(_read_trusted(folder / CERTIFICATE))
-        old.verify_directly_issued_by(authority)
+        old_certificate = x509.load_pem_x509_certificate(_read_trusted(folder / CERTIFICATE))
+        old_certificate.verify_directly_issued_by(authority)
         member_list = json.loads(_read_trusted(folder / MEMBERS))
-        names = old.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        host_names = old_certificate.extensions.get_extension_for_class(
+            x509.SubjectAlternativeName
+        ).value
         certificate = _sign_member(
-            subject=old.subject,
-            public_key=old.public_key(),
-            names=names,
+            subject=old_certificate.subject,
+            public_key=old_certificate.public_key(),
+            names=host_names,
             authority_key=authority_key,
             ends=ends,
         )
@@ -485,7 +509,7 @@ def _write_all_keys(
     hosts: Sequence[str],
     days: int,
 ) -> None:
-    """Creates the folders of the authority and of all members.
+    """Creates the folders of the authority and of all members (processes of a session).
 
     Args:
         folder: Folder in which they are created.
@@ -510,7 +534,7 @@ def _write_member_keys(
     authority_key: Any,
     ends: datetime.datetime,
 ) -> None:
-    """Creates the folders of members, with a new private key for each.
+    """Creates the folders of members (processes of a session), with a new private key for each.
 
     Args:
         folder: Folder in which they are created.
@@ -571,7 +595,7 @@ def _sign_member(
     """Returns a certificate for the public key of a member, signed by the authority.
 
     Args:
-        subject: Name of the member.
+        subject: Name of the member (process of a session).
         public_key: Public key of the member.
         names: Host names and addresses at which the member may listen.
         authority_key: Private key of the authority.
@@ -601,7 +625,7 @@ def _start_certificate(
     """Returns an unsigned certificate with the fields that all certificates have.
 
     Args:
-        subject: Name of the member, or of the authority.
+        subject: Name of the member (process of a session), or of the authority.
         public_key: Its public key.
         ends: Time at which the keys expire. The certificate expires `STOPPING_TIME` later.
     """
@@ -639,8 +663,8 @@ def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName
 def _list_hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     """Returns the host names and addresses for which the certificate of a member is valid.
 
-    A connection to a member is refused if the endpoint names another host. The result is empty
-    if the certificate states no hosts or cannot be read.
+    A connection to a member (process of a session) is refused if the endpoint names another
+    host. The result is empty if the certificate states no hosts or cannot be read.
     """
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -659,7 +683,7 @@ def _write_folder(
     certificate: x509.Certificate,
     key: ec.EllipticCurvePrivateKey,
 ) -> None:
-    """Creates the folder of a member, or that of the authority.
+    """Creates the folder of a member (process of a session), or that of the authority.
 
     Args:
         folder: The folder.
@@ -874,7 +898,7 @@ def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
     """Returns the Zenoh settings of a member that uses the keys in a folder.
 
     Args:
-        folder: Folder of the member.
+        folder: Folder of the member (process of a session).
         members: Names of all members, whose access rules are part of the settings.
     """
     tls = {

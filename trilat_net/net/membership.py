@@ -114,26 +114,28 @@ def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
         The decoded messages, in the order of their arrival.
     """
     while (message := inbox.poll()) is not None:
+        _key, payload = message
         # Sites and recorders count the payloads that they cannot decode.
         with suppress(WireError):
-            yield decode(message[1], kind)
+            yield decode(payload, kind)
 
 
 def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
     """Removes all waiting messages from an inbox, and yields the records that they contain.
 
-    A record is the result of one tick of a site's control loop. Sites publish their records in
-    blocks. If a record of a block cannot be decoded, that record and the rest of the block are
-    skipped without an error.
+    A record is the result of one tick of a site's control loop. Sites (arm controllers) publish
+    their records in blocks. If a record of a block cannot be decoded, that record and the rest
+    of the block are skipped without an error.
 
     Args:
         inbox: Inbox of the records of one site.
-        layout: Expected numbers of joints and peers. A record that differs counts as
-            undecodable. None accepts all numbers.
+        layout: Expected numbers of joints and peers (other sites). A record that differs counts
+            as undecodable. None accepts all numbers.
     """
     while (message := inbox.poll()) is not None:
+        _key, block = message
         with suppress(WireError):
-            for payload in split_states(message[1]):
+            for payload in split_states(block):
                 yield decode(payload, State, layout=layout)
 
 
@@ -141,7 +143,7 @@ class EventPublisher:
     """Publishes the events of one member, and replies to queries for the member's identity.
 
     Events are numbered messages such as "start", "mode" or "end". The recorder stores them, and
-    the other members react to them.
+    the other members (processes of a session) react to them.
 
     Args:
         bus: Network connection of the member.
@@ -180,14 +182,14 @@ class EventPublisher:
         Returns:
             The event.
         """
-        basic_fields = {
+        default_fields = {
             "member": self.info.member,
             "boot": self.info.boot,
             "n": self.published,
             "kind": kind,
             "text": text,
         }
-        event = msgspec.convert({**basic_fields, **fields}, Event)
+        event = msgspec.convert({**default_fields, **fields}, Event)
         self.published += 1
         payload = encode(event)
         self._keep(payload)
@@ -214,8 +216,8 @@ class EventPublisher:
 class MemberQuery:
     """Queries the members of a session repeatedly for their identities.
 
-    A query may be lost, and members may start at any time. Therefore the query is repeated as
-    long as the owner of this object calls `poll`.
+    A query may be lost, and members (processes of a session) may start at any time. Therefore
+    the query is repeated as long as the owner of this object calls `poll`.
 
     Args:
         bus: Network connection of the member that sends the query.
@@ -263,9 +265,9 @@ class LateSites(NamedTuple):
     """Settings of one site: whether it may join a running session, and whom a start awaits.
 
     Attributes:
-        may_join_late: True if this site may join a running session. The caller sets it only if
-            every site of the scenario waits for the other sites and aligns its arm with them
-            before it moves, because the arms would otherwise jump.
+        may_join_late: True if this site (arm controller) may join a running session. The caller
+            sets it only if every site of the scenario waits for the other sites and aligns its
+            arm with them before it moves, because the arms would otherwise jump.
         not_awaited: Names of the sites that the session does not wait for at its start. Only
             the leader, the first site of the scenario, uses this field.
         rate_hz: Tick rate of this site: periods of its control loop per second.
@@ -279,8 +281,8 @@ class LateSites(NamedTuple):
 class Membership:
     """List of the other members of a session, kept up to date by one member.
 
-    A site uses this list to decide when the session can start. A recorder uses it to learn the
-    sites, and to join a running session.
+    A site (arm controller) uses this list to decide when the session can start. A recorder uses
+    it to learn the sites, and to join a running session.
 
     Args:
         bus: Network connection of this member.
@@ -310,10 +312,13 @@ class Membership:
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
+
         self._session = session
         self._publisher = publisher
         self._sites = tuple(sites)
         self._late = late
+
+        # Liveliness tokens show who is present, and replies to queries show who they are.
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)
         self._refused_boots: set[int] = set()  # members whose refusal was published
@@ -336,8 +341,8 @@ class Membership:
     def unreadable(self) -> dict[str, str]:
         """Reasons why the replies of members could not be decoded, by the name of the member.
 
-        For example, a member may run another version of the program. Empty if all replies could
-        be decoded.
+        For example, a member (process of a session) may run another version of the program.
+        Empty if all replies could be decoded.
         """
         expected_members = (*self._sites, topics.RECORDER)
         return {
@@ -372,21 +377,22 @@ class Membership:
     def list_missing(self) -> list[str]:
         """Lists the members that must still appear before the session can start.
 
-        These are the sites of the scenario that are not known yet, except those that need not
-        be awaited. The recorder is listed if it is not known yet, and either a member needs it
-        or its liveliness token shows that it is about to join.
+        These are the sites (arm controllers) of the scenario that are not known yet, except
+        those that need not be awaited. The recorder is listed if it is not known yet, and
+        either a member (process of a session) needs it or its liveliness token shows that it is
+        about to join.
 
         Returns:
             The names. Empty if the session can start.
         """
         members = [self.local_info, *self.others.values()]
         needs_recorder = any(info.needs_recorder for info in members)
-        awaited = [*self._sites]
+        awaited_members = [*self._sites]
         if needs_recorder or self._recorder_boots:
-            awaited.append(topics.RECORDER)
+            awaited_members.append(topics.RECORDER)
 
-        not_missing = {self.local_info.member, *self.others, *self._late.not_awaited}
-        return [name for name in awaited if name not in not_missing]
+        known_members = {self.local_info.member, *self.others, *self._late.not_awaited}
+        return [name for name in awaited_members if name not in known_members]
 
     def has_restarted(self, name: str, boot: int) -> bool:
         """Returns True if a process of a member is gone, and another process has replaced it.
@@ -401,10 +407,10 @@ class Membership:
     def list_running(self) -> list[Info]:
         """Lists the running sites that agree on who takes part in the session.
 
-        Every running site states the members that it has admitted, each with its boot, the
-        number that identifies one start of a process. Two sites agree if they state the same
-        boots. The boot of this member is ignored in the comparison, because some sites may have
-        admitted this member already while others have not.
+        Every running site (arm controller) states the members that it has admitted, each with
+        its boot, the number that identifies one start of a process. Two sites agree if they
+        state the same boots. The boot of this member is ignored in the comparison, because some
+        sites may have admitted this member already while others have not.
 
         Returns:
             The identities of the sites that agree with the first running site, sorted by name.
@@ -425,13 +431,13 @@ class Membership:
     def poll(self, *, may_have_started: bool) -> None:
         """Updates the list of members: adds those that reply, and removes those that are gone.
 
-        The query for the identities of the members is repeated when it is due. The method does
-        not wait.
+        The query for the identities of the members (processes of a session) is repeated when it
+        is due. The method does not wait.
 
         Args:
             may_have_started: True if this member has published that it is ready. From then on
                 the session may start before this member knows. Therefore the identity of a
-                running site is no reason to refuse the session.
+                running site (arm controller) is no reason to refuse the session.
 
         Raises:
             SessionError: This member cannot be part of the session.
@@ -445,7 +451,7 @@ class Membership:
         """Updates the lists after the token of a member has appeared or disappeared.
 
         Args:
-            member: Name of the member.
+            member: Name of the member (process of a session).
             boot: Number of the member's start, as text, as in the key of the token.
             is_alive: True if the token has appeared.
         """
@@ -526,9 +532,10 @@ class Membership:
     def _refuse(self, info: Info) -> None:
         """Refuses a member whose scenario differs, or gives up if that member is the leader.
 
-        The scenario of the leader, the first site, is that of the session. If this member is
-        the leader, it publishes once that the other member is refused. If the other member is
-        the leader, this member gives up. If neither is the leader, nothing happens here.
+        The scenario of the leader, the first site (arm controller), is that of the session. If
+        this member (process of a session) is the leader, it publishes once that the other
+        member is refused. If the other member is the leader, this member gives up. If neither
+        is the leader, nothing happens here.
 
         Args:
             info: Identity of the other member.
@@ -565,10 +572,11 @@ class Epoch(NamedTuple):
         boots: Number that identifies the start of each member's process, by name.
         epochs: The epoch on each member's own monotonic clock, by name. Empty for a recorder
             that joins late, which needs only its own clock.
-        first: First tick that this site executes. It is 0 unless the site joins late.
+        first: First tick that this site (arm controller) executes. It is 0 unless the site
+            joins late.
         coming: Event with which this site requested to join the running session. The site
-            publishes the event again until all peers confirm that they receive its samples.
-            None if the site was present from the start.
+            publishes the event again until all peers confirm that they receive its samples
+            (sent states). None if the site was present from the start.
     """
 
     mono_ns: int

@@ -35,7 +35,7 @@ class RepeatedQuery:
     of the query that it answers, which gives the round trip time.
 
     Args:
-        bus: Network connection of the member that sends the query.
+        bus: Network connection of the member (process of a session) that sends the query.
         clock: Clock of that member.
         key: Key of the query. Every member that serves a matching key replies.
     """
@@ -56,10 +56,12 @@ class RepeatedQuery:
             True if the query was sent.
         """
         now_ns = self._clock.monotonic_ns()
-        is_due = not self._pending or now_ns - self._pending[-1][0] >= period_ns
-        if is_due:
-            self._pending.append((now_ns, self._bus.query(self._key)))
-        return is_due
+        if self._pending:
+            last_queried_ns, _inbox = self._pending[-1]
+            if now_ns - last_queried_ns < period_ns:
+                return False
+        self._pending.append((now_ns, self._bus.query(self._key)))
+        return True
 
     def poll(self) -> tuple[int, str, bytes] | None:
         """Returns the next reply that has arrived. The method does not wait.
@@ -103,8 +105,9 @@ def answer_pings(
 ) -> None:
     """Replies to pings in a network thread, until the network connection is closed.
 
-    A ping is a query to which a member replies at once with two time stamps (`Pong`). From the
-    replies, the sender computes round trip times and the offset between the clocks.
+    A ping is a query to which a member (process of a session) replies at once with two time
+    stamps (`Pong`). From the replies, the sender computes round trip times and the offset
+    between the clocks.
 
     Args:
         bus: Network connection of the member.
@@ -142,7 +145,7 @@ def answer_backfill(
 
     Args:
         query: The query as it has arrived from the recorder.
-        member: Name of the member that replies.
+        member: Name of the member (process of a session) that replies.
         boot: Random number that identifies this start of the member.
         find: Function that looks up the requested messages among those that the member still
             stores. It returns the number of the first message, the payloads of consecutive
@@ -210,12 +213,13 @@ class RoundTrips:
 
         Args:
             pinged_ns: Time at which the ping was sent, on the local clock, in ns.
-            pong: The reply of the member, with the times at which the ping arrived and the
-                reply left.
+            pong: The reply of the member (process of a session), with the times at which the
+                ping arrived and the reply left.
             now_ns: Time at which the reply arrived, on the local clock, in ns.
         """
-        rtt_ns = now_ns - pinged_ns - (pong.left_ns - pong.came_ns)
-        if rtt_ns < 0 or pong.left_ns < pong.came_ns:
+        reply_time_ns = pong.left_ns - pong.came_ns
+        rtt_ns = now_ns - pinged_ns - reply_time_ns
+        if rtt_ns < 0 or reply_time_ns < 0:
             return
         self.shortest_ns = min(self.shortest_ns, rtt_ns) if self.rtts_ns else rtt_ns
         self.rtts_ns.append(rtt_ns)

@@ -468,7 +468,8 @@ class Ros2Graph:
             silent="no router of ROS answers at {}",
         )
 
-        if not self.connected and self._session.info.peers_zid():
+        is_peer_instead_of_router = not self.connected and self._session.info.peers_zid()
+        if is_peer_instead_of_router:
             self._session.close()
             endpoints = ", ".join(map(str, routers))
             raise UsageError(

@@ -62,7 +62,8 @@ class SessionJoin:
     it as soon as they know it. It then creates this object, which announces the process, and
     calls `poll` regularly until the epoch is returned.
 
-    The first site of the scenario is the leader, which decides when the session starts.
+    The first site (arm controller) of the scenario is the leader, which decides when the
+    session starts.
 
     Args:
         bus: Network connection of this member.
@@ -126,8 +127,8 @@ class SessionJoin:
     def reason(self) -> str:
         """Why this site could not join a running session, as text for an error message.
 
-        The reason is the text with which a running site has refused it, or the names of the
-        running sites that have not admitted it. Empty if the reason is not known.
+        The reason is the text with which a running site (arm controller) has refused it, or the
+        names of the running sites that have not admitted it. Empty if the reason is not known.
         """
         running = {info.member for info in self.membership.list_running()}
         silent_sites = sorted(running - self._admitted_by)
@@ -253,8 +254,8 @@ class SessionJoin:
     def _awaits_sites(self, running: Sequence[Info]) -> bool:
         """Returns True if further sites of the running session are expected to reply.
 
-        The running sites state the members of the session. Those that have disappeared or were
-        started again are not expected to reply.
+        The running sites (arm controllers) state the members (processes of a session) of the
+        session. Those that have disappeared or were started again are not expected to reply.
 
         Args:
             running: Identities of the running sites that have replied.
@@ -270,7 +271,7 @@ class SessionJoin:
         return known_sites < expected_sites  # a proper subset
 
     def _select_epoch_source(self, running: Sequence[Info]) -> Info | None:
-        """Selects the running site from which this member takes the epoch.
+        """Selects the running site (arm controller) from which this member takes the epoch.
 
         A site on this machine is best, because its epoch needs no conversion between clocks.
         The next best is the first site of the scenario, whose schedule the others follow.
@@ -346,8 +347,9 @@ class SessionJoin:
         """Returns the description of a running session, with this site among the members.
 
         Args:
-            coming: Request of this site (event `coming`) that all running sites have granted.
-                It states the first tick of this site.
+            coming: Request of this site (event `coming`) that all running sites (arm
+                controllers) have granted. It states the first tick (control period) of this
+                site.
             epoch: Start of the session on the clock of this site.
             running: Identities of the running sites.
 
@@ -377,7 +379,7 @@ class SessionJoin:
             clocks: Identity of each member's clock, by name.
 
         Returns:
-            The boots of these sites.
+            The boots of these sites (arm controllers).
         """
         return {
             boot
@@ -434,10 +436,10 @@ class SessionJoin:
     def _receive_admission(self, event: Event) -> None:
         """Stores whether a running site admits this site, refuses it, or admits another site.
 
-        A site that wants to join the running session publishes the request `coming`. Each
-        running site replies with the event `admit` or `refused`. The event states which site it
-        is about, the boot of that site (the number that identifies the start of its process),
-        and the number of the request, because a request may be repeated.
+        A site (arm controller) that wants to join the running session publishes the request
+        `coming`. Each running site replies with the event `admit` or `refused`. The event
+        states which site it is about, the boot of that site (the number that identifies the
+        start of its process), and the number of the request, because a request may be repeated.
 
         Other sites may be admitted while this site waits. Their boots are noted in any case,
         because they become members of the session.
@@ -529,7 +531,7 @@ class SessionJoin:
 
         Without a waiting proposal, or while the offset of a clock is still unknown, nothing
         happens, and the caller tries again later. The reply, the event `ready`, states the
-        proposed epoch on the clock of this member.
+        proposed epoch on the clock of this member (process of a session).
         """
         proposal = self._waiting_proposal
         if proposal is None:
@@ -629,7 +631,8 @@ class SessionJoin:
         """Returns the epoch that the leader has confirmed.
 
         Args:
-            start: The leader's event `start`, which states the members and their epochs.
+            start: The leader's event `start`, which states the members (processes of a session)
+                and their epochs.
         """
         assert self._agreed_proposal is not None
         return Epoch(

@@ -58,11 +58,11 @@ It is long compared with the noise of an offset estimate, so that the noise is a
 
 
 class TickSchedule:
-    """Times at which the ticks of one site are due, on the clock of that site.
+    """Times at which the ticks of one site (arm controller) are due, on the clock of that site.
 
     Tick k is due at a time that grows linearly with k. The rate of growth can be adjusted from
-    any tick on, so that the site keeps the same schedule as the leader, the first site of the
-    scenario, although their clocks differ.
+    any tick (control period) on, so that the site keeps the same schedule as the leader, the
+    first site of the scenario, although their clocks differ.
 
     Args:
         epoch_ns: Time of tick 0 on the site's clock, in ns.
@@ -127,7 +127,8 @@ class SentStamps:
     When a peer's echo of a sample arrives, its sending time is looked up here. The capacity of
     16 384 ticks is enough for round trips of several seconds.
 
-    A sample is the state that a site publishes in one tick, a period of its control loop.
+    A sample is the state that a site (arm controller) publishes in one tick, a period of its
+    control loop.
     """
 
     def __init__(self, capacity: int = 1 << 14) -> None:
@@ -160,7 +161,7 @@ class SentStamps:
 class PeerClock(NamedTuple):
     """Clock of a peer, as known when the session starts or when the peer joins.
 
-    A peer is another site whose samples (states) this site receives.
+    A peer is another site (arm controller) whose samples (states) this site receives.
 
     Attributes:
         name: Name of the peer.
@@ -186,9 +187,9 @@ class PeerClock(NamedTuple):
 class LinkTimingMonitor:
     """Measures the delay of one link, and the offset between the clocks of its two sites.
 
-    The site at the receiving end of the link creates the monitor, and passes every sample of
-    the peer to `receive`. Offsets are estimated from windows of time stamps. An impossible
-    combination of stamps is a fault: it shows that a clock has stepped.
+    The site (arm controller) at the receiving end of the link creates the monitor, and passes
+    every sample of the peer to `receive`. Offsets are estimated from windows of time stamps. An
+    impossible combination of stamps is a fault: it shows that a clock has stepped.
 
     A link is the directed connection from one site to another. A sample is the state that a
     site publishes in each period of its control loop.
@@ -317,7 +318,7 @@ class LinkTimingMonitor:
         return self._received_ns >= 0 and now_ns - self._received_ns <= _UNHEARD_NS
 
     def is_acknowledged(self, now_ns: int) -> bool | None:
-        """Determines whether the peer still receives the samples of this site.
+        """Determines whether the peer still receives the samples of this site (arm controller).
 
         The samples of the peer (their published states) confirm which samples of this site it
         has received. If they arrive, but have confirmed nothing new for _UNHEARD_NS, the peer
@@ -352,7 +353,8 @@ class LinkTimingMonitor:
 
         Returns:
             The new estimate. None if the window is not long enough yet. Also None if the peer,
-            the site that sends, runs on this machine, where both sites use the same clock.
+            the site (arm controller) that sends, runs on this machine, where both sites use the
+            same clock.
         """
         estimator = self.peer.estimator
         if estimator is None:
@@ -431,9 +433,9 @@ ClockNotice = dict[str, Any]
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
     """Returns by how much a site wakes up after the start of a control period, in ns.
 
-    If all sites of a machine woke up at the same time, they would compete for its processors.
-    The sites are spread over half of a period. A sample of the last site thus still arrives
-    well before the next tick of the first site.
+    If all sites (arm controllers) of a machine woke up at the same time, they would compete for
+    its processors. The sites are spread over half of a period. A sample (sent state) of the
+    last site thus still arrives well before the next tick of the first site.
 
     Args:
         index: Index of the site among the sites on its machine.
@@ -446,8 +448,8 @@ def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
 class SiteTiming:
     """Schedule of a site's ticks, and timing of the links from its peers.
 
-    The site asks for the time of its next wake-up, reports each sample that it sends, and calls
-    `update_clocks` ten times a second.
+    The site (arm controller) asks for the time of its next wake-up, reports each sample that it
+    sends, and calls `update_clocks` ten times a second.
 
     A tick is one period of the control loop. A sample is the state that a site publishes in a
     tick, and a link is the directed connection from one site to another.
@@ -478,6 +480,7 @@ class SiteTiming:
         self._epoch_ns = epoch_ns
         self._rate_hz = rate_hz
         self._sent = SentStamps()
+
         self.monitors = [LinkTimingMonitor(peer, self._sent) for peer in peers]
         for monitor in self.monitors:
             monitor.offset.slew_to(epoch_ns, monitor.peer.estimate)
@@ -498,7 +501,7 @@ class SiteTiming:
     def list_initial_notices(self) -> list[ClockNotice]:
         """Lists the events that state the offsets of the peers' clocks at tick 0.
 
-        Peers on this machine have no offset and are left out.
+        Peers (other sites) on this machine have no offset and are left out.
 
         Returns:
             One event per peer on another machine. Empty if there are no such peers.
@@ -574,9 +577,10 @@ class SiteTiming:
     def pop_echo(self) -> list[tuple[int, int, int]]:
         """Returns the confirmations of received samples that this site sends to its peers.
 
-        Every sample that a site publishes contains, for each peer, the tick and the time of
-        arrival of the newest sample received from that peer (an "echo"). From it, the peer
-        computes the delay of the link to this site. Each arrival is confirmed only once.
+        Every sample that a site (arm controller) publishes contains, for each peer, the tick
+        (control period) and the time of arrival of the newest sample received from that peer
+        (an "echo"). From it, the peer computes the delay of the link to this site. Each arrival
+        is confirmed only once.
 
         Returns:
             For each peer from which a sample has arrived since the last call: the index of the
@@ -594,11 +598,12 @@ class SiteTiming:
     def update_clocks(self, k: int, now_ns: int) -> list[ClockNotice]:
         """Updates the clock offset of one peer, and adjusts the schedule to the leader's.
 
-        The leader is the first site of the scenario. All sites follow its schedule. If it runs
-        on another machine, the error of the local schedule is computed with the smoothed offset
-        of the leader's clock: the time on the leader's clock when tick k is due at this site,
-        minus the nominal time k / rate of this tick, both since the epoch, the start of the
-        session. The error is positive if the tick is late compared with the leader's schedule.
+        The leader is the first site (arm controller) of the scenario. All sites follow its
+        schedule. If it runs on another machine, the error of the local schedule is computed
+        with the smoothed offset of the leader's clock: the time on the leader's clock when tick
+        k is due at this site, minus the nominal time k / rate of this tick, both since the
+        epoch, the start of the session. The error is positive if the tick is late compared with
+        the leader's schedule.
 
         An estimate of an offset takes a considerable part of a period. Therefore each call
         estimates that of at most one peer.
@@ -652,11 +657,12 @@ class SiteTiming:
         """Returns the events about a peer's clock faults and about its acknowledgements.
 
         Clock faults are reported at most once per `FAULT_EVERY_NS`. If the peer no longer
-        confirms the samples of this site, this is reported once, and again when it has ended.
+        confirms the samples of this site (arm controller), this is reported once, and again
+        when it has ended.
 
         Args:
             index: Index of the peer.
-            k: Next tick.
+            k: Next tick (control period).
             now_ns: Present time on the site's clock, in ns.
         """
         monitor = self.monitors[index]
@@ -685,9 +691,9 @@ class SiteTiming:
 
         Returns:
             The timing fields of `LinkStats`. The first fields are the lateness of this site
-            compared with the leader's schedule of ticks, and the correction of its own rate.
-            Each other field is a dictionary of a measured quantity, by the name of the site at
-            the other end of the link.
+            (arm controller) compared with the leader's schedule of ticks (control periods), and
+            the correction of its own rate. Each other field is a dictionary of a measured
+            quantity, by the name of the site at the other end of the link.
         """
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
@@ -703,8 +709,8 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
     """Returns the event that states the offset and the drift of a peer's clock.
 
     Args:
-        monitor: Timing of the link from the peer.
-        k: Tick from which on the offset applies.
+        monitor: Timing of the link from the peer (other site).
+        k: Tick (control period) from which on the offset applies.
         local_ns: Time of that tick on the local clock, in ns.
     """
     offset = monitor.offset
@@ -731,8 +737,8 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
 def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
     """Returns the event that a peer's clock, or the local clock, has stepped.
 
-    The evidence is a sample that seems to have arrived before it was sent, or a window of time
-    stamps that contradicts earlier windows.
+    The evidence is a sample (sent state) that seems to have arrived before it was sent, or a
+    window of time stamps that contradicts earlier windows.
     """
     name = monitor.peer.name
 
@@ -757,11 +763,11 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
     """Returns the event that a peer no longer receives this site, or receives it again.
 
     Samples of the peer arrive in both cases. The event tells users that the connection is
-    interrupted in the other direction only, from this site to the peer.
+    interrupted in the other direction only, from this site (arm controller) to the peer.
 
     Args:
         monitor: Timing of the link from the peer.
-        k: Present tick, which the event states in its field `ticks`.
+        k: Present tick (control period), which the event states in its field `ticks`.
     """
     name = monitor.peer.name
     if monitor.is_unacknowledged:
@@ -782,8 +788,8 @@ class LoopStats:
     """Statistics of a site's control loop and its links, published ten times a second.
 
     Args:
-        site: The site in the simulation kernel, which counts the samples that arrive on each
-            link.
+        site: The site (arm controller) in the simulation kernel, which counts the samples (sent
+            states) that arrive on each link.
         boot: Random number that identifies this start of the site's process.
 
     Attributes:
@@ -831,7 +837,7 @@ class LoopStats:
         self.overruns += late_us >= self._period_us
 
     def is_due(self, k: int, skipped: int = 0) -> bool:
-        """Returns True if the site publishes its statistics after tick `k`.
+        """Returns True if the site (arm controller) publishes its statistics after tick `k`.
 
         Statistics are published every `ticks_per_stats` ticks. If such a tick was skipped, they
         are published after the next tick that was executed.

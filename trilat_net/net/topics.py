@@ -149,7 +149,7 @@ def ticks_per_stats(rate_hz: int) -> int:
 
 
 def number_message(channel: str, tick: int, rate_hz: int) -> int:
-    """Returns the number of the message that a site publishes after a tick.
+    """Returns the number of the message that a site (arm controller) publishes after a tick.
 
     Records, the results of ticks, have the number of their tick. Statistics, which are
     published less often, are numbered from 0.
@@ -165,8 +165,8 @@ def number_message(channel: str, tick: int, rate_hz: int) -> int:
 def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     """Returns how many messages of a channel a site publishes in its first `ticks` ticks.
 
-    A tick is one period of the control loop. A site publishes a record in each tick, and
-    statistics ten times a second.
+    A tick is one period of the control loop. A site (arm controller) publishes a record (result
+    of a control period) in each tick, and statistics ten times a second.
 
     Args:
         channel: `STATE` for the records, or `LINK` for the statistics.
@@ -180,13 +180,13 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
 
 
 def count_under_way(channel: str, rate_hz: int) -> int:
-    """Returns how many published messages may be lost if a site is killed.
+    """Returns how many published messages may be lost if a site (arm controller) is killed.
 
     These are the messages of the last 20 ms, which may not have left the machine yet.
 
     Args:
-        channel: `STATE` for the records, of which a site publishes one in each tick. `LINK` for
-            its statistics, which it publishes ten times a second.
+        channel: `STATE` for the records (results of control periods), of which a site publishes
+            one in each tick. `LINK` for its statistics, which it publishes ten times a second.
         rate_hz: Tick rate of the site: periods of its control loop per second.
     """
     ticks_in_20_ms = rate_hz // 50
@@ -201,11 +201,12 @@ def skipped_numbers(
 ) -> tuple[int, int]:
     """Returns which numbers the messages of skipped ticks would have had.
 
-    A site that is late may skip ticks, periods of its control loop, and then publishes no
-    messages for them. Their numbers remain unused, and must not count as lost messages.
+    A site (arm controller) that is late may skip ticks, periods of its control loop, and then
+    publishes no messages for them. Their numbers remain unused, and must not count as lost
+    messages.
 
     Args:
-        channel: `STATE` for records, or `LINK` for statistics.
+        channel: `STATE` for records (results of control periods), or `LINK` for statistics.
         tick: First tick after the skipped ones.
         skipped: Number of skipped ticks.
         rate_hz: Tick rate of the site.

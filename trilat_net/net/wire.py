@@ -78,7 +78,8 @@ def _list_vector_lengths(kind: type[msgspec.Struct], layout: Layout) -> dict[str
 
     Args:
         kind: The message type.
-        layout: Numbers of joints, peers and parameters of the site that sends the message.
+        layout: Numbers of joints, peers and parameters of the site (arm controller) that sends
+            the message.
     """
     if kind is State:
         # Vectors that the layout does not mention must be absent.
@@ -268,7 +269,8 @@ def split_states(block: bytes) -> Iterator[bytes]:
     """Splits a block into the payloads of its records, without decoding them.
 
     Args:
-        block: One or more encoded records, as `join_states` joins them.
+        block: One or more encoded records (results of control periods), as `join_states` joins
+            them.
 
     Yields:
         The payload of each record.
@@ -299,8 +301,8 @@ def split_states(block: bytes) -> Iterator[bytes]:
 def encode(message: _Sendable) -> bytes:
     """Encodes a message as the payload that is sent over the network.
 
-    Records (`State`) and samples (`PeerSample`), which are sent in every tick, are encoded by
-    faster functions instead: `encode_state` and `encode_sample`.
+    Records (`State`) and samples (`PeerSample`), which are sent in every tick (control period),
+    are encoded by faster functions instead: `encode_state` and `encode_sample`.
 
     Args:
         message: The message.

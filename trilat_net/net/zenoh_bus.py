@@ -61,7 +61,7 @@ def share_threads() -> None:
     With several pools, their threads wake each other for each message, which costs time. The
     pool has four threads although one is enough for the work: closing a connection whose peer
     never received its last bytes blocks a thread for up to 10 s (eclipse-zenoh/zenoh#1101). The
-    other threads then continue to serve the other members.
+    other threads then continue to serve the other members (processes of a session).
 
     A router must not call this function. A router that waits for room in its output queue
     blocks the thread that reads, and needs another pool to empty the queue.
@@ -180,8 +180,8 @@ def open_zenoh(
     Args:
         listen: Endpoints at which the session listens.
         connect: Endpoints to which the session connects.
-        mode: "peer" to connect to members directly, "client" to connect to a router, or
-            "router" to be a router itself.
+        mode: "peer" to connect to members (processes of a session) directly, "client" to
+            connect to a router, or "router" to be a router itself.
         settings: Settings that replace those of this program, from a user's file or from keys.
         silent: Text of the error if no router answers, with {} in place of the endpoints.
 
@@ -214,10 +214,10 @@ def open_zenoh(
 class ZenohBus:
     """Network connection of a member over a Zenoh session of its own, see `Bus`.
 
-    A peer or a router keeps trying until all endpoints answer. A client connects to the first
-    endpoint that answers at once, and connects again when the connection is lost. A peer
-    reaches the members to which it is connected. A client or a router reaches all members that
-    the router reaches.
+    A peer (other site) or a router keeps trying until all endpoints answer. A client connects
+    to the first endpoint that answers at once, and connects again when the connection is lost.
+    A peer reaches the members (processes of a session) to which it is connected. A client or a
+    router reaches all members that the router reaches.
 
     Args:
         listen: Endpoints at which the session listens.
@@ -238,13 +238,13 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        or_refused = ", or no router accepts this member" if settings else ""
+        other_reason = ", or no router accepts this member" if settings else ""
         self._session = open_zenoh(
             listen=listen,
             connect=connect,
             mode=mode,
             settings=settings,
-            silent=f"no router answers at {{}}{or_refused}",
+            silent=f"no router answers at {{}}{other_reason}",
         )
         self._declarations: list[Any] = []  # Zenoh undeclares an object that is not referenced
         self._tokens: set[str] = set()
@@ -374,7 +374,8 @@ class ZenohBus:
         """Sends a query, and returns a queue for the replies.
 
         Args:
-            key: Key of the query. Every member that serves a matching key replies.
+            key: Key of the query. Every member (process of a session) that serves a matching
+                key replies.
             payload: Payload of the query.
         """
         # Not a ring channel: it loses its replies when the last one has arrived.
@@ -406,9 +407,10 @@ class ZenohBus:
     def presence(self, key: str) -> PresenceInbox:
         """Returns a queue that tells which other members have appeared or disappeared.
 
-        An entry is the key of a liveliness token, by which a member shows that it is present,
-        and True if the token has appeared, or False if it has disappeared. The first entries
-        are the tokens that exist already. The tokens of this session are left out.
+        An entry is the key of a liveliness token, by which a member (process of a session)
+        shows that it is present, and True if the token has appeared, or False if it has
+        disappeared. The first entries are the tokens that exist already. The tokens of this
+        session are left out.
 
         Args:
             key: Key of the tokens, which may contain wildcards.
@@ -485,11 +487,14 @@ def _parse_json5(source: str, text: str) -> object:
     try:
         config = zenoh.Config.from_json5(f"{{metadata: [\n{text}\n]}}")
     except zenoh.ZError as error:
-        match = re.search(r"--> (\d+):(\d+)", str(error))
-        expected = re.search(r"= (expected .*)", str(error))
-        # The text begins in the second line of what Zenoh parses.
-        position = f"line {int(match[1]) - 1}, column {match[2]}: " if match else ""
-        reason = expected[1] if expected else _first_line(error)
+        position = ""
+        position_match = re.search(r"--> (\d+):(\d+)", str(error))
+        if position_match:
+            line, column = position_match.groups()
+            # The text begins in the second line of what Zenoh parses.
+            position = f"line {int(line) - 1}, column {column}: "
+        reason_match = re.search(r"= (expected .*)", str(error))
+        reason = reason_match[1] if reason_match else _first_line(error)
         raise UsageError(f"{source}: {position}not valid JSON5: {reason}") from None
 
     objects: list[object] = json.loads(config.get_json("metadata"))

@@ -92,7 +92,8 @@ _LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
 def _limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
     """Returns a Zenoh filter that drops incoming messages above a size.
 
-    Without the filter, another program could occupy the memory of a member with huge messages.
+    Without the filter, another program could occupy the memory of a member (process of a
+    session) with huge messages.
 
     Args:
         name: Name of the filter.
@@ -245,8 +246,10 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
             return False
         return all(equals_session_value(mode, value) for mode, value in values.items())
 
-    listed = ", ".join(f"{mode} {json.dumps(value)}" for mode, value in session_values.items())
-    return are_session_values, f"left out, or as a session sets it itself: {listed}"
+    listed_values = ", ".join(
+        f"{mode} {json.dumps(value)}" for mode, value in session_values.items()
+    )
+    return are_session_values, f"left out, or as a session sets it itself: {listed_values}"
 
 
 _MUST_BE_OFF = _require_value(False, "false: members connect only at named endpoints")
@@ -323,8 +326,8 @@ class ZenohFile:
         """Returns the endpoints that the file names.
 
         Args:
-            side: "listen" for the endpoints at which the member listens, or "connect" for those
-                to which it connects.
+            side: "listen" for the endpoints at which the member (process of a session) listens,
+                or "connect" for those to which it connects.
             mode: Mode of the member, as the file may name other endpoints for each mode.
 
         Returns:
@@ -407,13 +410,13 @@ def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
         A string for each problem, which begins with the key.
     """
     for key, value in _iterate_leaves(settings, ()):
-        compared = _expand_mode(settings, value) if key in _SET_BY_MODE else value
+        checked_value = _expand_mode(settings, value) if key in _SET_BY_MODE else value
         if key in REQUIREMENTS:
             is_met, requirement_text = REQUIREMENTS[key]
-            if not is_met(compared):
+            if not is_met(checked_value):
                 text = json.dumps(value)
-                shortened = text if len(text) <= 60 else f"{text[:57]}..."
-                yield f"{key}: {shortened} must be {requirement_text}"
+                short_text = text if len(text) <= 60 else f"{text[:57]}..."
+                yield f"{key}: {short_text} must be {requirement_text}"
         if re.fullmatch(_FILE_KEYS, key):
             try:
                 open_regular(Path(str(value))).close()
@@ -514,10 +517,10 @@ def _find_refused_keys(
         reason = refusal(single_setting)
         if not reason:
             continue
-        deeper: list[tuple[tuple[str, ...], str]] = []
+        refused_within: list[tuple[tuple[str, ...], str]] = []
         if isinstance(value, dict):
-            deeper = list(_find_refused_keys(value, refusal, key_path))
-        yield from deeper or [(key_path, reason)]
+            refused_within = list(_find_refused_keys(value, refusal, key_path))
+        yield from refused_within or [(key_path, reason)]
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
@@ -527,10 +530,10 @@ def _suggest_key(path: Sequence[str], reason: str) -> str:
         path: Path of the key.
         reason: Reason of Zenoh.
     """
-    match = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
-    if match is None or not path or match[1] != path[-1]:
+    unknown_field = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
+    if unknown_field is None or not path or unknown_field[1] != path[-1]:
         return reason
-    unknown_key, valid_text = match.groups()
+    unknown_key, valid_text = unknown_field.groups()
     valid_keys = re.findall(r"`([^`]*)`", valid_text)
     hint = suggest_nearest(unknown_key, valid_keys)
     hint = hint or f"; the possible keys are {valid_text.replace('`', '')}"
@@ -551,7 +554,7 @@ MOST_SESSIONS = 64
 
 
 class _Role(NamedTuple):
-    """The channels that a kind of member may use.
+    """The channels that a kind of member (process of a session) may use.
 
     A channel is a kind of messages, see `topics`.
 
@@ -631,35 +634,40 @@ _CHANNEL_WORDS = {
 
 
 def describe_role(member: str) -> list[str]:
-    """Describes what a member with keys may send, a line for each kind of receiver.
+    """Describes for the user what a member with keys may send, one line per kind of receiver.
 
-    Answers, queries for information and signs of presence are left out.
+    A member is a process of a session. Replies, queries for information and signs of presence
+    are left out, because every member may send them.
 
     Args:
         member: Name of the member. It determines the role.
     """
     if member == ROUTER:
         return ["forwards the messages of all members, whatever they contain"]
-    role = ROLES.get(member, _SITE_ROLE)
-    orders = [channel for channel in role.queries if channel in (topics.SET, topics.STOP)]
-    to_others = [_CHANNEL_WORDS[channel] for channel in (*role.publishes_to, *orders)]
-    lines = []
-    if role.publishes:
-        published = [_CHANNEL_WORDS[channel] for channel in role.publishes]
-        lines.append(f"may send in its own name: {', '.join(published)}")
+    permissions = ROLES.get(member, _SITE_ROLE)
+    request_channels = [
+        channel for channel in permissions.queries if channel in (topics.SET, topics.STOP)
+    ]
+    to_others = [
+        _CHANNEL_WORDS[channel] for channel in (*permissions.publishes_to, *request_channels)
+    ]
+    descriptions = []
+    if permissions.publishes:
+        published = [_CHANNEL_WORDS[channel] for channel in permissions.publishes]
+        descriptions.append(f"may send in its own name: {', '.join(published)}")
     if to_others:
-        lines.append(f"may send to every site: {', '.join(to_others)}")
-    return lines
+        descriptions.append(f"may send to every site: {', '.join(to_others)}")
+    return descriptions
 
 
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     """Returns the Zenoh settings that let each member send only what its role requires.
 
-    A member proves its role by the name in its certificate.
+    A member (process of a session) proves its role by the name in its certificate.
 
     Args:
         members: Names of all members of the session. Members other than the recorder, the
-            operator and the router are sites.
+            operator and the router are sites (arm controllers).
     """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []

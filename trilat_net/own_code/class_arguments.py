@@ -32,7 +32,7 @@ def make_own_instance(
     Args:
         kind: The class.
         code: Module and class, for example "mylaws:Spring", for errors.
-        context: First argument of the class: the facts about the site.
+        context: First argument of the class: the facts about the site (arm controller).
         settings: Keyword arguments of the class.
         path: Path of the table with the arguments in the scenario, for errors.
 
@@ -98,7 +98,7 @@ def _describe_class(kind: Any, code: str) -> str:
 
 
 def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
-    """Refuses a value that differs from the type of an argument.
+    """Checks that a value in a scenario has the type of an argument of a user's class.
 
     The type is that of the annotation. Without an annotation, it is the type of the default,
     and only a text in place of a number, or the reverse, is refused: the class may accept lists
@@ -112,7 +112,8 @@ def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: st
     """
     annotation = parameter.annotation
     if isinstance(annotation, str):  # a module with `from __future__ import annotations`
-        annotation = {kind.__name__: kind for kind in _TYPE_NAMES}.get(annotation)
+        types_by_name = {kind.__name__: kind for kind in _TYPE_NAMES}
+        annotation = types_by_name.get(annotation)
     if parameter.annotation is parameter.empty:
         annotation = type(parameter.default)
         if not isinstance(value, str | int | float):

@@ -59,7 +59,9 @@ def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[NamedCode]
     for scenario in scenarios:
         for site in scenario.sites.values():
             candidates = (site.control, *site.hands, site.plant)
-            imported += [part for part in candidates if isinstance(part, NamedCode)]
+            imported += [
+                candidate for candidate in candidates if isinstance(candidate, NamedCode)
+            ]
     return imported
 
 
@@ -170,7 +172,7 @@ def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None
     for sha256, entry in remembered.items():
         for name, settings in entry.classes.items():
             remembered_settings[sha256, name] = [
-                json.dumps(values, sort_keys=True, default=str) for values in settings
+                json.dumps(arguments, sort_keys=True, default=str) for arguments in settings
             ]
 
 
@@ -234,12 +236,12 @@ def _allow_file(
     """
     source = read_code("", "--law", file.resolve())
     sha256 = source.sha256
-    # A package is named by its folder.
-    module = (source.file.parent if file.stem == "__init__" else file).stem
+    is_package = file.stem == "__init__"
+    module_name = source.file.parent.stem if is_package else file.stem
     keys = [key for key in logged if key.sha256 == sha256]
     if not keys:
         # The last part of "package.module:Law" before the class is the name of the file.
-        keys = [key for key in logged if re.split(r"[.:]", key.code)[-2] == module]
+        keys = [key for key in logged if re.split(r"[.:]", key.code)[-2] == module_name]
     if not keys:
         names = ", ".join(sorted({key.code for key in logged})) or "no external code"
         raise UsageError(
@@ -265,7 +267,7 @@ class _LoggedUserLaw(NamedTuple):
 
     Attributes:
         code: Class of the law, for example "package.module:Law".
-        sites: Names of the sites that the law controls.
+        sites: Names of the sites (arm controllers) that the law controls.
         settings: Arguments of the class, as a string for people.
         allowed: True if the file may run with these arguments.
         file: The file that a person permitted, or else the file that Python's import finds for
@@ -288,13 +290,16 @@ class _LoggedUserLaw(NamedTuple):
         """Returns a sentence about the law, with the option that allows it to run."""
         law = f"{self.code} of {', '.join(self.sites)}"
         settings = f" with {self.settings}" if self.settings else ""
-        state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
+        file_state = "is the one that ran"
+        if self.changed:
+            file_state = f"was changed, {self.changed}"
         if self.allowed:
-            return f"{law}{settings}; its file {state}"
+            return f"{law}{settings}; its file {file_state}"
+
         option = "FILE"
         if self.file:
             version = " --other-version" if self.changed else ""
-            option = f"{self.file}{version} (it {state})"
+            option = f"{self.file}{version} (it {file_state})"
         difference = f" ({self.other_settings})" if self.other_settings else ""
         problem = f"{law} is external code, which may not run{settings}{difference}"
         return f"{problem}; if you trust it: --law {option}"
@@ -311,11 +316,11 @@ def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
     """
     sites: dict[CodeKey, tuple[str, ...]] = {}
     laws: dict[CodeKey, ImportedLaw] = {}
-    for name, spec in scenario.sites.items():
-        if isinstance(spec.control, ImportedLaw):
-            key = CodeKey.of(spec.control)
+    for name, settings in scenario.sites.items():
+        if isinstance(settings.control, ImportedLaw):
+            key = CodeKey.of(settings.control)
             sites[key] = (*sites.get(key, ()), name)
-            laws[key] = spec.control
+            laws[key] = settings.control
     return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
 
 
@@ -339,7 +344,7 @@ def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) ->
     Args:
         key: Class, hash and arguments.
         law: The law in the scenario.
-        sites: Names of the sites that it controls.
+        sites: Names of the sites (arm controllers) that it controls.
     """
     consent = find_consent(key)
     sha256 = ""

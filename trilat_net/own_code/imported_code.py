@@ -94,7 +94,7 @@ class NamedCode(Protocol):
 
 
 class _SiteWithCode(Protocol):
-    """Interface of a site of a scenario whose parts may be classes of users.
+    """Interface of a site (arm controller) of a scenario whose parts may be classes of users.
 
     These parts are its control law, its operators and its plant. The checks of permissions look
     for users' classes here, without importing the types of scenarios.
@@ -206,13 +206,17 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
     Args:
         allowed: Permissions of the code that is studied.
     """
-    widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
-    added = {key: consent for key, consent in widened.items() if key not in allowed_code}
-    allowed_code.update(added)
+    widened_permissions = {
+        key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()
+    }
+    added_permissions = {
+        key: consent for key, consent in widened_permissions.items() if key not in allowed_code
+    }
+    allowed_code.update(added_permissions)
     try:
         yield
     finally:
-        for key in added:
+        for key in added_permissions:
             allowed_code.pop(key, None)
 
 
@@ -235,6 +239,7 @@ def describe_new_settings(key: CodeKey) -> str:
         if (allowed.code, allowed.sha256) == (key.code, key.sha256)
         and allowed.settings != ANY_SETTINGS
     }
+    # Permissions that a person has stored permanently count as well.
     class_name = key.code.partition(":")[2]
     allowed_settings |= set(remembered_settings.get((key.sha256, class_name), ()))
 
@@ -248,19 +253,21 @@ def describe_new_settings(key: CodeKey) -> str:
     return f"it was allowed with other settings, but here {', '.join(smallest_difference)}"
 
 
-def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def _list_differences(
+    old_settings: Mapping[str, Any], new_settings: Mapping[str, Any]
+) -> list[str]:
     """Returns a string for each argument whose value differs, such as "gain = 5 (was 3)".
 
     An argument that is missing on one side has its default there.
     """
-    old_texts = {key: describe_setting(value) for key, value in before.items()}
-    new_texts = {key: describe_setting(value) for key, value in now.items()}
+    old_texts = {key: describe_setting(value) for key, value in old_settings.items()}
+    new_texts = {key: describe_setting(value) for key, value in new_settings.items()}
     differences = []
     for key in sorted({*old_texts, *new_texts}):
-        old = old_texts.get(key, "its default")
-        new = new_texts.get(key, "its default")
+        old_text = old_texts.get(key, "its default")
+        new_text = new_texts.get(key, "its default")
         if old_texts.get(key) != new_texts.get(key):
-            differences.append(f"{key} = {new} (was {old})")
+            differences.append(f"{key} = {new_text} (was {old_text})")
     return differences
 
 
@@ -306,7 +313,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns a function that creates the control law for a site.
+        """Returns a function that creates the control law for a site (arm controller).
 
         The user's class is imported only when the returned function is called.
 
@@ -418,6 +425,8 @@ def _find_spec(module: str) -> ModuleSpec | None:
         for finder in sys.meta_path
         if finder is PathFinder or finder.__module__.startswith("__editable__")
     ]
+
+    # The packages around the module are looked up first, from the outermost one on.
     spec = None
     search_folders = None
     parts = module.split(".")
@@ -529,10 +538,13 @@ def check_class(source: _CodeSource, code: str, path: str, method: str = "torque
     if name not in classes:
         hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
         raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
-    node = classes[name]
-    identifiers = {getattr(part, "name", getattr(part, "id", "")) for part in ast.walk(node)}
-    may_inherit_method = node.bases or node.keywords or node.decorator_list
-    if not may_inherit_method and method not in identifiers:
+    class_node = classes[name]
+    used_names = {
+        getattr(syntax_node, "name", getattr(syntax_node, "id", ""))
+        for syntax_node in ast.walk(class_node)
+    }
+    may_inherit_method = class_node.bases or class_node.keywords or class_node.decorator_list
+    if not may_inherit_method and method not in used_names:
         raise ScenarioError(
             f"{code} is not a {kind}: the class has no {method}; see {find_page(page)}",
             path=path,
@@ -542,9 +554,11 @@ def check_class(source: _CodeSource, code: str, path: str, method: str = "torque
 def _import(module: str, sha256: str) -> Any:
     """Imports a module in Python's usual way, and reloads it if its file has changed.
 
+    In a notebook, for example, a user may edit a control law and simulate it again.
+
     Args:
         module: Name of the module.
-        sha256: Hash of its file now.
+        sha256: Present hash of its file.
     """
     imported = importlib.import_module(module)
     if _imported.setdefault(module, sha256) != sha256:

@@ -48,7 +48,7 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
     """Checks the names and the total length of the vectors that a control law sends.
 
     Args:
-        channel: All vectors that the law sends to other sites.
+        channel: All vectors that the law sends to other sites (arm controllers).
         joints: Number of joints of the site's arm.
         path: Path of the law's settings in the scenario file, for error messages.
 
@@ -61,6 +61,7 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
         problem = _find_name_problem(vector.name)
         if problem:
             raise ScenarioError(problem, path=f"{sends_path}.{vector.name}")
+
     largest_count = MAX_SENT * joints
     if channel.received_size > largest_count:
         count = count_nouns(channel.received_size, "number")
@@ -69,6 +70,7 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
             f"{MAX_SENT} per joint"
         )
         raise ScenarioError(problem, path=sends_path)
+
     if channel.record_size > MAX_RECORD_SENT:
         count = count_nouns(channel.record_size, "number")
         receivers = count_nouns(channel.peers, "peer")
@@ -119,7 +121,11 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError) as error:
         raise ScenarioError(f"{file} is not valid Python: {error}", path=path) from None
-    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    return {
+        statement.name: statement
+        for statement in tree.body
+        if isinstance(statement, ast.ClassDef)
+    }
 
 
 def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
@@ -139,18 +145,18 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
     """
     sends: Any = {}
     class_name = code.partition(":")[2]
-    law = parse_classes(source, file, path).get(class_name)
-    statements = law.body if law else []
-    for node in statements:
-        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+    class_node = parse_classes(source, file, path).get(class_name)
+    statements = class_node.body if class_node else []
+    for statement in statements:
+        if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
             continue
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
         names = {target.id for target in targets if isinstance(target, ast.Name)}
         if "sends" not in names:
             continue
 
-        value = node.value
-        location = f"{code}: sends in line {node.lineno} of {file.name}"
+        value = statement.value
+        location = f"{code}: sends in line {statement.lineno} of {file.name}"
         try:
             sends = ast.literal_eval(value)
         except (ValueError, TypeError, RecursionError):

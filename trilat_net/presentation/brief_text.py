@@ -56,25 +56,28 @@ _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
 
 
 def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
-    """Yields the judgement of a certificate and its most important reasons.
+    """Yields the judgement whether a run was stable, and its most important reasons.
 
-    `trilat certify` prints these lines, unless --all asks for all of them.
+    `trilat certify` prints these lines by default, and all reasons with the option --all.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """
     lines = describe_certificate(certificate)
-    judgement, *chosen = _choose_lines(lines)
-    for line in (judgement, *describe_in_words(certificate), *chosen):
+    judgement, *reasons = _choose_lines(lines)
+    explanations = describe_in_words(certificate)
+    for line in (judgement, *explanations, *reasons):
         yield line.print_form
-    premises = len(select_premises(certificate))
-    counts = {"more line": max(0, len(lines) - MOST_LINES), "premise": premises}
-    parts = [count_nouns(count, noun) for noun, count in counts.items() if count]
+
+    # A last line tells the user what this short text leaves out.
+    premise_count = len(select_premises(certificate))
+    counts = {"more line": max(0, len(lines) - MOST_LINES), "premise": premise_count}
+    omitted = [count_nouns(count, noun) for noun, count in counts.items() if count]
     if certificate.balance is not None:
-        parts.append("the energies")
-    if parts:
-        more = f"--all prints {' and '.join(parts)} too"
-        yield f"{more}; {_PREMISES}" if premises else more
+        omitted.append("the energies")
+    if omitted:
+        hint = f"--all prints {' and '.join(omitted)} too"
+        yield f"{hint}; {_PREMISES}" if premise_count else hint
 
 
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
@@ -110,41 +113,53 @@ def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
-    """Returns the cells of a quantity: its name, its number, its unit and its subject.
+    """Returns the row of a quantity in the short table of a run's most important numbers.
+
+    The row has the name of the quantity, its number, its unit, and the subject (such as a site)
+    to which the number belongs. If the number is unknown, the row has the reason instead of the
+    subject.
 
     Returns:
-        The cells. If the number of a subject is missing, they have the reason. Empty if the run
-        cannot have the quantity.
+        The four texts of the row. Empty if the run cannot have the quantity, or if a missing
+        number needs no explanation.
     """
     applicable = {
         subject: metric
         for subject, metric in metrics.values_of(quantity).items()
         if metric.applies
     }
+
     if not applicable:
         return []
+
     run_metric = metrics.run_value(quantity)
     if run_metric.value is None:
-        is_number_of_some = any(metric.value is not None for metric in applicable.values())
-        is_expected = quantity.key == "settle_s" or is_number_of_some
+        is_known_for_some = any(metric.value is not None for metric in applicable.values())
+        # A run that never settles is worth a line, although no site has a settling time.
+        needs_reason = quantity.key == "settle_s" or is_known_for_some
+        if not needs_reason:
+            return []
         reason = sanitize(run_metric.why)
-        return [quantity.name, "–", quantity.unit, reason] if is_expected else []
+        return [quantity.name, "–", quantity.unit, reason]
+
     subject = _name_subject(quantity, applicable)
     return [quantity.name, f"{run_metric.value:.4g}", quantity.unit, subject]
 
 
 def _name_subject(quantity: Quantity, values: dict[str, Metric]) -> str:
-    """Returns whose number the table of key numbers shows for a quantity.
+    """Returns the name of the subject to which a number in the table of key numbers belongs.
 
-    This is the subject with the largest number, such as "m1". For a sum it is "all sites
-    together", and for equal numbers "every site".
+    A quantity has a number per site, for example, and the table shows only the largest. The
+    name is then that of the site, such as "m1". It is "all sites together" for a sum, and
+    "every site" if all numbers are equal.
     """
     numbers = {subject: metric.value for subject, metric in values.items()}
-    known = {subject: value for subject, value in numbers.items() if value is not None}
+    known_values = {subject: value for subject, value in numbers.items() if value is not None}
     if quantity.of == "run":
         return "run"
     if quantity.reduction == "sum":
         return f"all {quantity.of}s together"
-    if len(known) > 1 and len(set(known.values())) == 1:
+    are_all_equal = len(set(known_values.values())) == 1
+    if len(known_values) > 1 and are_all_equal:
         return f"every {quantity.of}"
-    return max(known, key=lambda subject: known[subject])
+    return max(known_values, key=lambda subject: known_values[subject])

@@ -99,10 +99,11 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
 
 
 def select_premises(certificate: Certificate) -> list[premise_quantities.Premise]:
-    """Returns the premises that apply to the control laws of a run.
+    """Returns the conditions (premises) of stability that apply to the control laws of a run.
 
-    The premises of the stability theorem concern its energy function V. They are left out for
-    laws for which V does not exist; only the walls, and the law's own premises, remain.
+    Most of them belong to the stability theorem of the paper, which is about an energy function
+    V. For control laws without such a function, only the condition about walls applies, and the
+    conditions that the law itself declares.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -178,11 +179,14 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
         mark = _BALANCE_MARKS.get(certificate.verdict.finding, "ok")
         balance = _describe_balance(certificate.balance)
         lines.append(CertificateLine(mark, f"energy balance: {balance}"))
+
+    # Energies that the control laws record themselves, for example in an energy tank.
     observed = certificate.observed
     if observed is not None:
         lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
         if observed.finding is ObservedFinding.NEGATIVE:
             lines.append(CertificateLine("note", NEGATIVE_ENERGY_MEANING))
+
     roots = certificate.roots
     if roots is not None:
         # Roots of an approximation cannot show stability.
@@ -191,10 +195,13 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
         if roots.is_refutation and certificate.stability is Stability.NOT_STABLE:
             mark = "FAIL"
         lines.append(CertificateLine(mark, roots.text))
+
     twins = certificate.twins
     if twins is not None:
         lines.append(CertificateLine(_mark_twins(twins), twins.text))
         lines += _compare_rates(roots, twins)
+
+    # Last come the lines that concern the log and the weights in V.
     lines.append(_describe_evidence(certificate))
     paper_note = _describe_paper_weights(certificate)
     if paper_note:
@@ -215,34 +222,36 @@ def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
 def _explain_judgement(certificate: Certificate) -> str:
     """Returns what a judgement means for small disturbances, as a sentence in plain words.
 
-    Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+    For example: "a small disturbance halves every 0.83 s".
 
     Returns:
-        The sentence. Empty for a run that diverged or is open, because the judgement itself
-        says why.
+        The sentence. Empty for a run that diverged or is open (undecided), because the
+        judgement itself says why.
     """
     stability = certificate.stability
     if certificate.end.behaviour is EndBehaviour.DIVERGED or stability is Stability.OPEN:
         return ""
+
     if stability is Stability.SETTLED:
         return (
             f"{describe_settling(certificate)}; "
             "`trilat certify --accept settled` takes this for a success"
         )
-    pace = describe_pace(certificate)
+    decay_rate = describe_pace(certificate)
     if stability is Stability.NOT_STABLE:
-        return pace or "the motion of this run does not come to rest"
-    pace = pace or "small disturbances die away"
+        return decay_rate or "the motion of this run does not come to rest"
+
+    # The run is stable. The theorem may be silent about it, which users would ask about.
+    explanation = decay_rate or "small disturbances die away"
     if not certificate.has_functional:
-        return f"{pace}; the theorem of the paper is about another control law"
+        return f"{explanation}; the theorem of the paper is about another control law"
     if certificate.verdict.finding is verdict_facts.StabilityFinding.DID_NOT_RISE:
-        return f"{pace}; the theorem of the paper does not apply here and is not needed"
-    return pace
+        return f"{explanation}; the theorem of the paper does not apply here and is not needed"
+    return explanation
 
 
 def describe_settling(certificate: Certificate) -> str:
-    """Returns what was seen of a settled run, and that nothing proves more, as a clause.
+    """Returns what was observed of a run that settled, and that no proof exists, as a clause.
 
     A settled run has become slow, or its motion decays. Its arms need not be at rest.
 
@@ -259,24 +268,32 @@ def describe_settling(certificate: Certificate) -> str:
 def describe_pace(certificate: Certificate) -> str:
     """Returns how fast a small disturbance of the final pose dies away or grows, as a sentence.
 
+    For example: "a small disturbance halves every 0.83 s". The rate is that of the slowest or
+    fastest growing characteristic root of the linearised control loop.
+
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
 
     Returns:
-        The sentence, which is about the slowest or the fastest growing of the characteristic
-        roots. Empty if these roots prove nothing, or if their rate is not known.
+        The sentence. Empty if the roots prove nothing, or if their rate is unknown.
     """
     roots = certificate.roots
     if roots is None or not roots.rate_per_s:
         return ""
     if not (roots.is_proof or roots.is_refutation):
         return ""
+    # A disturbance proportional to exp(rate t) changes by a factor of 2 within ln(2) / |rate|.
     verb = "halves" if roots.rate_per_s < 0.0 else "doubles"
-    return f"a small disturbance {verb} every {math.log(2.0) / abs(roots.rate_per_s):.2g} s"
+    factor_two_s = math.log(2.0) / abs(roots.rate_per_s)
+    return f"a small disturbance {verb} every {factor_two_s:.2g} s"
 
 
 def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the judgement, the verdict about V, and the end of the run."""
+    """Returns the first lines of a certificate: judgement, stability theorem, end of the run.
+
+    Each line has a mark such as "ok" or "FAIL". V is the energy function of the theorem, which
+    must not rise by itself in a stable run.
+    """
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
     if certificate.verdict.finding is verdict_facts.StabilityFinding.DID_NOT_RISE:
@@ -284,10 +301,12 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     if certificate.verdict.finding is verdict_facts.StabilityFinding.BROKEN:
         stability_mark = "FAIL"
         verdict_mark = "FAIL"
+
     lines = [CertificateLine(stability_mark, describe_judgement(certificate))]
     if certificate.has_functional:
         lines.append(CertificateLine(verdict_mark, certificate.verdict.text))
     lines += [CertificateLine("note", text) for text in certificate.law_conditions]
+
     if certificate.end.behaviour is EndBehaviour.DIVERGED:
         return lines  # the judgement says already which joint exceeded its limit
     end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
@@ -297,6 +316,9 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 
 def describe_theorem(certificate: Certificate) -> list[str]:
     """Returns a line on what the paper's stability theorem says about a run.
+
+    A theorem in the paper guarantees stability if the controller and the network fulfil its
+    conditions. The line states whether they were fulfilled.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -311,10 +333,12 @@ def describe_theorem(certificate: Certificate) -> list[str]:
 
 
 def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[CertificateLine]:
-    """Returns why the rate of the pushes is not that of the roots, if they print differently.
+    """Returns a remark why two measured rates of decay differ, if their printed numbers do.
 
-    Both are rates of amplitudes. The roots are about small motions near one pose, whereas
-    pushes follow the motion of the run for a limited time.
+    A certificate states the rate of the characteristic roots, and the rate at which small
+    pushes of the arms died away in repetitions of the run (twins). Both belong to amplitudes.
+    The roots describe small motions near one pose, whereas a push follows the motion of the run
+    for a limited time.
 
     Args:
         roots: Characteristic roots of the loop at its final pose. None if there are none.
@@ -323,13 +347,19 @@ def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[Certifica
     Returns:
         A remark. Empty if the rates agree, or if one of them is unknown.
     """
-    worst = twins.worst
-    if roots is None or roots.rate_per_s is None or worst is None:
+    worst_push = twins.worst
+    if roots is None or roots.rate_per_s is None or worst_push is None:
         return []
-    if twins.departure is not None or worst.factor == 0.0 or math.isnan(worst.rate_per_s):
+    if (
+        twins.departure is not None
+        or worst_push.factor == 0.0
+        or math.isnan(worst_push.rate_per_s)
+    ):
         return []  # the text about the pushes states no rate of a push
-    if f"{roots.rate_per_s:+.3g}" == f"{worst.rate_per_s:+.3g}":
+
+    if f"{roots.rate_per_s:+.3g}" == f"{worst_push.rate_per_s:+.3g}":
         return []
+
     is_exact = roots.exact and not roots.is_numerical
     accuracy = "exact" if is_exact else "an approximation"
     text = (
@@ -350,7 +380,10 @@ def _describe_evidence(certificate: Certificate) -> CertificateLine:
 
 
 def _describe_paper_weights(certificate: Certificate) -> str:
-    """Returns how much V would have risen with the weights of the sites that the paper uses.
+    """Returns how much V would have risen with the weights that the paper gives to the sites.
+
+    V is the energy function of the stability proof, a weighted sum over the sites. The paper's
+    weights, all equal to 1, are right only for some networks.
 
     Returns:
         A sentence. Empty if the paper's weights are right for this run.
@@ -377,19 +410,23 @@ def compose_headline(certificate: Certificate) -> str:
     if end.behaviour is EndBehaviour.DIVERGED:
         return f"{certificate.stability}: {end.text}"
     stability = certificate.stability
-    end_alone = end.behaviour.stability
-    text = f"{stability}: {_describe_end(certificate)}"
-    # A proof, or the growth of pushes, may decide otherwise than the record alone.
-    if stability is Stability.STABLE and end_alone is not Stability.SETTLED:
-        text = f"stable by proof, although {_OTHER_ENDS[end.behaviour]}"
-    elif stability is Stability.NOT_STABLE and end_alone is not Stability.NOT_STABLE:
-        text = f"not stable, although {_OTHER_ENDS[end.behaviour]}"
+    recorded_stability = end.behaviour.stability
+    headline = f"{stability}: {_describe_end(certificate)}"
+    # A proof, or the growth of small pushes, may contradict the impression from the recorded
+    # motion. The line must then name both.
+    if stability is Stability.STABLE and recorded_stability is not Stability.SETTLED:
+        headline = f"stable by proof, although {_OTHER_ENDS[end.behaviour]}"
+    elif stability is Stability.NOT_STABLE and recorded_stability is not Stability.NOT_STABLE:
+        headline = f"not stable, although {_OTHER_ENDS[end.behaviour]}"
     rests_on = certificate.decision.rests_on
-    return f"{text}; rests on: {rests_on}" if rests_on else text
+    return f"{headline}; rests on: {rests_on}" if rests_on else headline
 
 
 def _describe_end(certificate: Certificate) -> str:
-    """Returns how a run ends, as a phrase that does not claim more than its judgement."""
+    """Returns how the motion of a run ends, as a phrase that claims no more than its judgement.
+
+    Only a run that is judged as settled needs numbers: the error e and the joint speed |qd|.
+    """
     end = certificate.end
     if certificate.stability is not Stability.SETTLED:
         return end.phrase
@@ -398,6 +435,7 @@ def _describe_end(certificate: Certificate) -> str:
         return f"{end.phrase}, with {error} and |qd| {end.end_speed_rad_s:.2g} rad/s at the end"
     if end.stability is Stability.SETTLED:
         return end.phrase
+
     # The speed of the arms, times the length of the judged part, is below this limit.
     return (
         f"too slow to move by {SETTLED_ERROR_RAD:g} rad in the judged part, |qd| "
@@ -416,6 +454,7 @@ def describe_judgement(certificate: Certificate) -> str:
     """
     if certificate.decision.is_too_short:
         return f"{certificate.stability}: {'; '.join(certificate.reasons)}"
+
     reasons = []
     roots = certificate.roots
     rests_on = certificate.decision.rests_on
@@ -423,9 +462,10 @@ def describe_judgement(certificate: Certificate) -> str:
     for reason in certificate.reasons:
         if is_based_on_roots and roots is not None and reason == roots.text:
             continue  # the headline names these roots already
-        new = reason.removeprefix(certificate.end.text).removeprefix("; ")
-        if new:
-            reasons.append(new)
+        additional_reason = reason.removeprefix(certificate.end.text).removeprefix("; ")
+        if additional_reason:
+            reasons.append(additional_reason)
+
     return "; ".join([compose_headline(certificate), *reasons])
 
 
@@ -482,8 +522,8 @@ def _describe_balance(balance: EnergyBalance) -> str:
     text = f"closes to {residual_j / scale_j:.1e} of the largest energy, {scale_j:.4g} J"
     if unexplained_j >= residual_j:
         return text
-    share = unexplained_j / scale_j
-    return f"{text}; to {share:.1e} once the controller's sampling is booked"
+    unexplained_fraction = unexplained_j / scale_j
+    return f"{text}; to {unexplained_fraction:.1e} once the controller's sampling is booked"
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
@@ -499,30 +539,33 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     Returns:
         Name and energy of each entry.
     """
-    links: dict[str, Array] = {}
-    sources: dict[str, Array] = {}
+    link_energies: dict[str, Array] = {}
+    source_energies: dict[str, Array] = {}
     for name, work in balance.work.items():
-        group = links if "->" in name else sources
-        group[name] = work
-    if len(links) > MAX_LISTED_LINKS:
-        total = np.sum(list(links.values()), axis=0)
-        links = {count_nouns(len(links), "link"): total}
+        is_link = "->" in name  # such as "m1->s"
+        if is_link:
+            link_energies[name] = work
+        else:
+            source_energies[name] = work
+    if len(link_energies) > MAX_LISTED_LINKS:
+        total_j = np.sum(list(link_energies.values()), axis=0)
+        link_energies = {count_nouns(len(link_energies), "link"): total_j}
 
     entries = {}
     for name, energy in balance.dissipation.items():
         entries[f"dissipated: {name}"] = -energy
-    for name, energy in (sources | links).items():
+    for name, energy in (source_energies | link_energies).items():
         entries[f"supplied: {_SOURCE_NAMES.get(name, name)}"] = energy
     entries["supplied: sampling of the controller"] = balance.sampling
     entries["transferred, not cancelled by beta"] = -balance.transfer
     has_no_gaps = balance.judged.all()
-    rest_name = "unexplained" if has_no_gaps else "in gaps, or unexplained"
-    entries[rest_name] = _compute_rest(balance)
+    unexplained_name = "unexplained" if has_no_gaps else "in gaps, or unexplained"
+    entries[unexplained_name] = _compute_rest(balance)
 
-    least_j = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
+    smallest_listed_j = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
     listed = [_describe_v(balance, 0)]
     for name, energy in entries.items():
-        if np.abs(energy).max() > least_j:
+        if np.abs(energy).max() > smallest_listed_j:
             listed.append((name, float(energy[-1])))
     return [*listed, _describe_v(balance, -1)]
 

@@ -117,6 +117,7 @@ class ChartBuilder:
         self._has_values: list[list[bool]] = []  # by table and column
         self.leads = trace_leads(log)
 
+        # The pictures of the arms show the whole motion, which is sampled at a few times.
         times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
         poses = [arm_poses.find_pose(log, site, t_s) for site in log.sites for t_s in times_s]
         self.bounds_m = arm_poses.compute_pose_box_m(poses)
@@ -132,6 +133,7 @@ class ChartBuilder:
         for title in style.name_joints(log):
             self._joint_titles.append(f"joint {title.removeprefix('joint ')}")
 
+        # Tables are decimated so that the page stays below a total number of values.
         counts = max(arm.counts for arm in arms)
         # Each bucket of a table keeps the rows with the extremes of all its columns. Therefore
         # one table with many columns is larger than many tables with one column.
@@ -153,6 +155,7 @@ class ChartBuilder:
         log = self._log
         charts: list[Chart] = []
         missing: dict[str, list[str]] = {}
+
         candidates = [
             *self._build_overview_charts(),
             *self._build_motion_charts(),
@@ -200,16 +203,20 @@ class ChartBuilder:
         """
         log = self._log
         unit = plot_signals.shared_unit(log)
-        limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
-        stated = [line for site in log.sites for line in self._list_stated_delays(site)]
-        has_one_delay = len({line.value for line in stated}) == 1
+        settled_line = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
+        stated_delays: list[StatedLine] = []
+        for site in log.sites:
+            stated_delays += self._list_stated_delays(site)
+        has_one_delay = len({line.value for line in stated_delays}) == 1
+        delay_lines = [self._draw_limit(stated_delays[0].value)] if has_one_delay else []
+
         yield self._make_chart(
             section="overview",
             title="Largest error |e| by site",
-            note=f"Dashed: {limit.value:g} {unit}.{self._note_floor(unit)}",
+            note=f"Dashed: {settled_line.value:g} {unit}.{self._note_floor(unit)}",
             unit=unit,
             series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
-            lines=[limit],
+            lines=[settled_line],
             log=True,
         )
         yield self._make_chart(
@@ -218,13 +225,13 @@ class ChartBuilder:
             note="Dashed: the stated delay." if has_one_delay else "",
             unit="ms",
             series=self._add_maxima(lambda site: plot_signals.sample_ages_ms(log, site)),
-            lines=[self._draw_limit(stated[0].value)] if has_one_delay else [],
+            lines=delay_lines,
             zero=True,
             margin=0.05,
         )
 
     def _note_floor(self, unit: str) -> str:
-        """Returns a sentence with the smallest drawn error, at which smaller ones are drawn.
+        """Returns a note that small errors are drawn at the bottom of the logarithmic axis.
 
         Args:
             unit: Unit of the errors.
@@ -239,7 +246,7 @@ class ChartBuilder:
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
-        """Adds a line per site with the largest values of a signal in short intervals.
+        """Adds a line per site with the largest value of a signal in each short interval.
 
         Within an interval, the line is constant. A line of the values themselves would be a
         broad band wherever they oscillate.
@@ -251,17 +258,25 @@ class ChartBuilder:
         series = []
         for site in self._log.sites:
             values = read_values(site)
-            known = np.where(np.isnan(values), -np.inf, values)
-            largest = known.max(axis=1, initial=-np.inf)
+            # NaN marks an unknown value, which must not hide the known ones of the same record.
+            values_without_nan = np.where(np.isnan(values), -np.inf, values)
+            largest = values_without_nan.max(axis=1, initial=-np.inf)
+
+            # A new interval begins wherever the number of the interval changes.
             records = self._log[site]
-            interval = np.floor(records.t_s * (_MAXIMA / self._end_s)).astype(np.int64)
-            starts = np.flatnonzero(np.diff(interval, prepend=-1))
+            interval_numbers = np.floor(records.t_s * (_MAXIMA / self._end_s)).astype(np.int64)
+            first_records = np.flatnonzero(np.diff(interval_numbers, prepend=-1))
             maxima = largest
-            if len(starts):
-                lengths = np.diff(np.append(starts, len(interval)))
-                maxima = np.repeat(np.maximum.reduceat(largest, starts), lengths)
-            drawn = np.where(np.isfinite(maxima), np.maximum(maxima, _LEAST_DRAWN), np.nan)
-            series.append(self._make_series(site, self._add_records(site, drawn[:, None]), 0))
+            if len(first_records):
+                record_counts = np.diff(np.append(first_records, len(interval_numbers)))
+                maxima = np.repeat(np.maximum.reduceat(largest, first_records), record_counts)
+
+            # The value axis is logarithmic. Therefore 0 is drawn at its lower bound.
+            drawn_values = np.where(
+                np.isfinite(maxima), np.maximum(maxima, _LEAST_DRAWN), np.nan
+            )
+            table = self._add_records(site, drawn_values[:, None])
+            series.append(self._make_series(site, table, column=0))
         return series
 
     def _build_motion_charts(self) -> Iterator[TimeChart]:
@@ -271,31 +286,33 @@ class ChartBuilder:
         torque.
         """
         log = self._log
-        operated = plot_signals.sites_with_operator(log)
-        if operated:
-            series = self._add_signal(site_signals.external_torques, operated)
+        operated_sites = plot_signals.sites_with_operator(log)
+        if operated_sites:
+            series = self._add_signal(site_signals.external_torques, operated_sites)
             title = "operator torque on the arm"
             yield from self._chart_joints("torques", title, "N m", series)
         yield from self._chart_positions()
 
         errors = self._add_signal(site_signals.joint_errors)
-        axes = self._joint_titles
+        axis_names = self._joint_titles
         if site_signals.follows_in_task_space(log):
-            axes = style.name_shared(log)
+            axis_names = style.name_shared(log)
         yield from self._chart_joints(
             section="errors",
             title="tracking error",
             unit=plot_signals.shared_unit(log),
             series_by_site=errors,
-            titles=axes,
+            titles=axis_names,
         )
         yield from self._chart_estimates()
 
         if self._twin is not None:
             series = {}
             for site in log.sites:
-                tick, t_s, moved = site_signals.operator_displacement(log, self._twin, site)
-                series[site] = self._add_columns(site, tick, t_s, moved)
+                tick, t_s, displacements = site_signals.operator_displacement(
+                    log, self._twin, site
+                )
+                series[site] = self._add_columns(site, tick, t_s, displacements)
             yield from self._chart_joints("moved", "moved by the operators", "rad", series)
 
         torques = self._add_signal(site_signals.controller_torques)
@@ -323,10 +340,12 @@ class ChartBuilder:
             yield from self._chart_histograms()
 
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
-        """Adds a table of values to the page.
+        """Adds a table of values to the data of the page, from which its scripts draw curves.
+
+        A table contains encoded binary numbers, which are shorter than their texts.
 
         Args:
-            site: Name of the site, whose tick rate converts ticks to times.
+            site: Name of the site, whose tick rate converts ticks (control periods) to times.
             tick: Ticks of the values, shape (P,).
             values: The values, shape (P, C), a column per quantity.
 
@@ -342,7 +361,9 @@ class ChartBuilder:
         return len(self._tables) - 1
 
     def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
-        """Decimates values, and adds them to the page as a table.
+        """Reduces values to the extremes of intervals, and adds them to the page as a table.
+
+        Each interval keeps its least and largest value, so that no spike is lost.
 
         Args:
             site: Name of the site.
@@ -359,6 +380,9 @@ class ChartBuilder:
     def _add_records(self, site: str, values: Values) -> int:
         """Decimates values that belong to the records of a site, and adds them as a table.
 
+        The records of a long run are more than the page can show. Decimation keeps their
+        extremes.
+
         Args:
             site: Name of the site.
             values: A row of values for each record of the site, shape (K, C).
@@ -372,7 +396,7 @@ class ChartBuilder:
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
     ) -> dict[str, list[TableSeries]]:
-        """Adds the tables of a signal of several sites.
+        """Adds the values of a signal, such as joint torques, to the page for several sites.
 
         Args:
             signal: Function that computes the values of the signal, shape (K, C), from the K
@@ -380,7 +404,7 @@ class ChartBuilder:
             sites: Names of the sites. Empty for all sites.
 
         Returns:
-            The lines of each site, one line per column of the signal.
+            For each site, the lines of the chart: one per column of the signal.
         """
         series = {}
         for site in sites or self._log.sites:
@@ -482,11 +506,16 @@ class ChartBuilder:
             yield self._make_chart(section, f"{title}, {name}", unit, series)
 
     def _chart_positions(self) -> Iterator[TimeChart]:
-        """Yields a chart per site and joint, with the actual and the desired angle."""
+        """Yields a chart per site and joint, with the actual and the desired angle.
+
+        The desired angle is the one that the controller makes the joint follow, computed from
+        the received states of the other arms.
+        """
         for site in self._log.sites:
             records = self._log[site]
             actual = site_signals.joint_angles(records)
             desired = plot_signals.reference_angles(records)
+
             for joint, name in enumerate(self._joint_titles[: actual.shape[1]]):
                 angles = np.stack([actual[:, joint], desired[:, joint]], axis=1)
                 table = self._add_records(site, angles)
@@ -494,6 +523,7 @@ class ChartBuilder:
                 desired_line = TableSeries(
                     label="desired", colour="limit", table=table, column=1, dash=True
                 )
+
                 yield self._make_chart(
                     section="positions",
                     title=f"{site}, {name}",
@@ -512,17 +542,20 @@ class ChartBuilder:
         estimates = self._add_signal(site_signals.parameter_estimates)
         arms = log.scenario.arms
         largest_arm = max(arms.values(), key=lambda arm: arm.counts)
-        thetas = [arms[site].theta for site in log.sites]
+        true_parameters = [arms[site].theta for site in log.sites]
         for index, (name, unit) in enumerate(largest_arm.parameters):
             series = [lines[index] for lines in estimates.values() if index < len(lines)]
-            truths = [float(theta[index]) for theta in thetas if index < len(theta)]
+            # Arms with fewer joints have fewer parameters.
+            true_values = [
+                float(theta[index]) for theta in true_parameters if index < len(theta)
+            ]
             title = name if largest_arm.chain else f"estimate of θ{'₁₂₃₄₅'[index]}"
             yield self._make_chart(
                 section="estimates",
                 title=title,
                 unit=style.typeset_unit(unit),
                 series=series,
-                lines=self._draw_truths(truths),
+                lines=self._draw_truths(true_values),
             )
 
     def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
@@ -547,11 +580,11 @@ class ChartBuilder:
         return StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
 
     def _chart_ages(self) -> Iterator[TimeChart]:
-        """Yields a chart per site with the age of the samples that it uses.
+        """Yields a chart per site with the age of the samples that its controller uses.
 
-        A sample is the state that a peer, another site, publishes in one tick. Its age is the
-        time since it was sent. Lines at the delays that the scenario states serve for
-        comparison.
+        A sample is the state that a peer (another site) publishes in one control period. Its
+        age is the time since it was sent: the delay that the controller experiences. Dashed
+        lines show the delays that the scenario states.
         """
         log = self._log
         for site in log.sites:
@@ -561,9 +594,11 @@ class ChartBuilder:
                 self._make_series(peer, table, column, label=f"{peer} → {site}")
                 for column, peer in enumerate(log[site].peers)
             ]
+
             lines = self._list_stated_delays(site)
             stated_ms = [line.value for line in lines]
             shown_ms = np.concatenate([ages_ms.ravel(), stated_ms])
+
             yield self._make_chart(
                 section="ages",
                 title=f"age of the samples that {site} uses",
@@ -579,6 +614,9 @@ class ChartBuilder:
     def _list_stated_delays(self, site: str) -> list[StatedLine]:
         """Returns lines at the mean delays that the scenario states for the links to a site.
 
+        They are drawn beside the measured delays, so that a reader sees whether the network
+        kept them.
+
         Args:
             site: Name of the receiving site.
 
@@ -590,8 +628,8 @@ class ChartBuilder:
         lines: list[StatedLine] = []
         for peer in log[site].peers:
             colour = log.sites.index(peer)
-            states = list_stated_models(log, f"{peer}->{site}", self._changes)
-            t_s, mean_ms = age_and_lateness.trace_stated_delay(log, states)
+            link_models = list_stated_models(log, f"{peer}->{site}", self._changes)
+            t_s, mean_ms = age_and_lateness.trace_stated_delay(log, link_models)
             # The trace has three points per model: its start, its end, and a gap.
             models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
             for start_s, end_s, delay_ms in models:
@@ -603,29 +641,33 @@ class ChartBuilder:
                         to_s=float(end_s),
                     )
                     lines.append(line)
+
         delays_ms = {line.value for line in lines}
         if len(delays_ms) == 1:
             return [self._draw_limit(lines[0].value)]
         return lines
 
     def _chart_distributions(self) -> Iterator[DistributionChart]:
-        """Yields a chart per receiving site with the distributions of ages and delays.
+        """Yields a chart per receiving site with the distributions of message ages and delays.
 
-        A curve at x shows the percentage of ages, or of delays, that are at most x ms.
+        A curve at x shows the percentage of ages, or of delays, that are at most x ms. The age
+        of a message is its delay plus the time until a newer message replaces it.
         """
-        measured = measure_delay_distributions(self._log)
-        x_ms = age_and_lateness.choose_delay_axis_ms(measured)
+        distributions = measure_delay_distributions(self._log)
+        x_ms = age_and_lateness.choose_delay_axis_ms(distributions)
         for site in self._log.sites:
             series = []
-            for link in measured:
+            for link in distributions:
                 if link.site != site:
                     continue
                 colour = self._log.sites.index(link.peer)
                 curves = (("age", link.age_ms, False), ("delay", link.delay_ms, True))
                 for quantity, values_ms, dash in curves:
+                    # A link without any message has no curve.
                     percent = age_and_lateness.compute_cumulative_percent(values_ms, x_ms)
                     if not np.isfinite(percent).any():
                         continue
+
                     curve = DistributionSeries(
                         label=f"{quantity}, {link.peer}",
                         colour=colour,
@@ -633,6 +675,7 @@ class ChartBuilder:
                         values=_encode(percent, "<f4"),
                     )
                     series.append(curve)
+
             yield DistributionChart(
                 section="delays",
                 title=f"delay and age on the way to {site}",
@@ -643,11 +686,16 @@ class ChartBuilder:
             )
 
     def _chart_histograms(self) -> Iterator[HistogramChart]:
-        """Yields the histograms of the lateness of ticks and of their computing time."""
+        """Yields histograms that show whether the control loops kept their timing.
+
+        One shows how late the loops woke up for their ticks (control periods), and one how long
+        the computation of a tick took.
+        """
         log = self._log
         edges_us = age_and_lateness.choose_bin_edges_us(log)
         rates_hz = {log.scenario.sites[site].rate_hz for site in log.sites}
         periods_us = sorted(1e6 / rate_hz for rate_hz in rates_hz)
+
         titles = {
             "late_us": "wake-up after the deadline",
             "busy_us": "computing time of a tick",
@@ -659,6 +707,7 @@ class ChartBuilder:
                     times_us = getattr(log[site], field)
                     counts = age_and_lateness.bin_loop_times(times_us, edges_us)
                     series.append(HistogramSeries(site, colour, counts.tolist()))
+
             yield HistogramChart(
                 section="timing",
                 title=f"{title}, histogram",
@@ -684,6 +733,8 @@ class ChartBuilder:
         arm = self._log.scenario.arms[site]
         if arm.chain is not None:
             return self._build_chain(index, site)
+
+        # The table has the joint angles, the desired angles and the corners of the bodies.
         records = self._log[site]
         actual = site_signals.joint_angles(records)
         desired = plot_signals.reference_angles(records)
@@ -714,9 +765,9 @@ class ChartBuilder:
         """
         records = self._log[site]
         arm = self._log.scenario.arms[site]
-        last = len(records) - 1
-        instants = np.linspace(0, last, _CHAIN_INSTANTS).astype(np.int64)
-        rows = np.unique(instants)  # short logs have fewer records than instants
+        last_record = len(records) - 1
+        record_indices = np.linspace(0, last_record, _CHAIN_INSTANTS).astype(np.int64)
+        rows = np.unique(record_indices)  # a short log has fewer records than `_CHAIN_INSTANTS`
 
         desired_q = plot_signals.reference_angles(records)
         actual_m = joint_positions_m(arm, records.q[rows])
@@ -742,7 +793,9 @@ class ChartBuilder:
         )
 
     def _trace_bodies(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Returns the edges of each body that a site's arm can touch, in the picture.
+        """Returns the edges of each body that a site's arm can touch, as lines of the picture.
+
+        The page draws them with the arm, for example the box that an arm pushes.
 
         Args:
             site: Name of the site.

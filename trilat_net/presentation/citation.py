@@ -85,7 +85,11 @@ def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
 
 
 def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
-    """Yields the sentences of the paragraph."""
+    """Yields the sentences of a paragraph, for a paper, about a run and its stability.
+
+    They state the scenario, the control laws and delays, the judgement and its basis, the
+    methods that were used (with their citations), and the state of the log.
+    """
     scenario = log.scenario
     ticks = sum(len(log[site]) for site in log.sites)
     yield (
@@ -94,12 +98,14 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
         f"{count_nouns(ticks, 'record')} and judged with trilat-net {find_version()} "
         "\\cite{trilat_net}."
     )
+
     yield from _state_settings(scenario)
     decision = certificate.decision
     statement = f"The run {_STATEMENTS[decision.stability]}"
     if decision.rests_on:
         statement += f"; this rests on {decision.rests_on}"
     yield f"{statement}."
+
     if certificate.law_proofs:
         yield "A stability condition of its control law holds \\cite{Nuno2009}."
     if certificate.has_functional:
@@ -108,6 +114,7 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
             "\\cite{Motaharifar2016}, which holds in continuous time and whose proof was "
             "corrected in trilat-net \\cite{trilat_net}, were compared with the run."
         )
+
     if decision.reasons:
         yield f"Findings that prevent a better judgement: {'; '.join(decision.reasons)}."
     if certificate.roots is not None and certificate.roots.verdict:
@@ -115,6 +122,7 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
             "The loop in force at the end of the run was linearised at the final pose: "
             f"{certificate.roots.text.removeprefix('this rest: ')} \\cite{{Saad2011}}."
         )
+
     twins = certificate.twins
     if twins is not None and twins.pushes:
         pushes = len({growth.push.name for growth in twins.pushes})
@@ -123,6 +131,7 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
             f"The run was executed again with {pushes_text} of its joints "
             f"and estimates \\cite{{Benettin1980}}; {twins.text.removeprefix('twins: ')}."
         )
+
     evidence = certificate.evidence.text
     yield f"Log: {evidence}."
 
@@ -132,22 +141,31 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
 
     Sites with the same law and gains share an entry, and so do links with the same delay.
     """
-    laws = {}
+    law_texts = {}
     for name, site in scenario.sites.items():
         control = site.control
         law = control.tag
         gains = msgspec.structs.asdict(control)
-        source = ""
+        code_note = ""
+
+        # The law is a user's Python class. Its hash tells which version of the file was used.
         if isinstance(control, ImportedLaw):
             law = control.code
             gains = control.settings
-            source = f", other settings as in its file (SHA-256 {control.source_sha256[:16]})"
-        values = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
-        laws[name] = f"{law} ({values}){source}" if values else f"{law}{source}"
-    links = {name: link.describe() for name, link in scenario.links.items()}
-    for title, texts in (("Control laws", laws), ("Delays of the links", links)):
-        if texts:
-            yield f"{title}: {_group_equal(texts)}."
+            code_note = (
+                f", other settings as in its file (SHA-256 {control.source_sha256[:16]})"
+            )
+
+        gains_text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
+        law_texts[name] = (
+            f"{law} ({gains_text}){code_note}" if gains_text else f"{law}{code_note}"
+        )
+
+    delay_texts = {name: link.describe() for name, link in scenario.links.items()}
+    if law_texts:
+        yield f"Control laws: {_group_equal(law_texts)}."
+    if delay_texts:
+        yield f"Delays of the links: {_group_equal(delay_texts)}."
     if scenario.timeline:
         yield f"The scenario plans {count_nouns(len(scenario.timeline), 'change')} of settings."
 
@@ -172,7 +190,10 @@ def _format_commit() -> str:
 
 
 def _list_sources(certificate: Certificate) -> list[str]:
-    """Returns the BibTeX entries of the methods on which a certificate rests."""
+    """Returns the BibTeX entries of the papers with the methods that a judgement rests on.
+
+    Methods that the judgement did not use are not cited.
+    """
     sources = []
     if certificate.roots is not None and certificate.roots.verdict:
         sources.append(_ROOTS)

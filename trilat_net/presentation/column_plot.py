@@ -79,20 +79,21 @@ def plot_log(
     from_s: float | None = None,
     until_s: float | None = None,
 ) -> Figure:
-    """Draws columns of a log over time, with a panel per column and a line per site.
+    """Draws columns of a log over time, with a panel per column and a line per arm.
 
-    If nothing is selected, the figure is the overview of the run.
+    For example, `plot_log(log, ["q1", "tau1"])` draws the angle and the torque of the first
+    joint of all arms. If nothing is selected, the figure is the overview of the run.
 
     Args:
         log: The log.
         names: Names of quantities or columns. Each name gets its own rows of panels.
-        sites: Names of the sites. None for all sites.
+        sites: Names of the arms. None for all arms.
         joints: Joints that are drawn of quantities with a column per joint.
         from_s: First time that is drawn, in s. None for the start of the run.
         until_s: Last time that is drawn, in s. None for the end of the run.
 
     Raises:
-        UnknownName: There is no such column, site or joint.
+        UnknownName: There is no such column, arm or joint.
         UsageError: The interval of time contains no records.
         LogError: The records cannot be read.
     """
@@ -108,8 +109,8 @@ def plot_log(
     columns = {site: _list_columns(log, site) for site in site_names}
     groups = []
     for name in names or DEFAULT_QUANTITIES:
-        group = _find_lines(log, columns, name)
-        groups.append(_filter_joints(log, name, group, joints))
+        panels = _find_lines(log, columns, name)
+        groups.append(_filter_joints(log, name, panels, joints))
     return _draw_groups(log, groups, site_names, interval_s)
 
 
@@ -155,15 +156,23 @@ def _check_interval(
 
 
 def _list_columns(log: Log, site: str) -> list[Column]:
-    """Returns the columns of a site's records, and those of the error."""
+    """Returns everything of a site that can be plotted: columns of its records, and its error.
+
+    The error e is the deviation from the reference that the control law acts on. It is not
+    stored in the log, and therefore not among the columns of its table.
+    """
     columns = [*log.table(site).columns]
     arm = log.scenario.arms[site]
     if arm.shares_pose:
-        units = ["m" if axis in "xyz" else "rad" for axis in TASK_AXES[: arm.counts.shared]]
-        stems = [f"e_{axis}" for axis in TASK_AXES[: arm.counts.shared]]
+        # Arms with different joints follow each other by the pose of their end effectors.
+        axes = TASK_AXES[: arm.counts.shared]
+        units = ["m" if axis in "xyz" else "rad" for axis in axes]
+        stems = [f"e_{axis}" for axis in axes]
     else:
         units = arm.joint_units("rad")
         stems = [f"e{number}" for number in range(1, len(units) + 1)]
+
+    # The names have the form of the other columns: a stem and a unit, such as "e1_rad".
     errors = log[site].e
     for index, (stem, unit) in enumerate(zip(stems, units, strict=True)):
         column = Column(
@@ -196,12 +205,19 @@ def _get_stem(column: Column) -> str:
 
 
 def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) -> _Panels:
-    """Returns the lines of the columns that a name selects.
+    """Returns the lines to draw for a name: one for each matching column of each site.
+
+    A column is a quantity in the records of a run, such as the joint angles. A name may select
+    several columns.
 
     Args:
         log: The log.
         columns: All columns, by site.
-        name: Name of a quantity or of a column, with or without its unit.
+        name: Name of a quantity or of a column, with or without its unit, such as "q", "q1" or
+            "q1_rad".
+
+    Returns:
+        The lines of each panel, by the name of its column.
 
     Raises:
         UnknownName: The name selects no column.
@@ -209,7 +225,8 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
     panels: _Panels = {}
     for site, site_columns in columns.items():
         for column in site_columns:
-            if name in (column.name, _get_stem(column), _get_quantity(column)):
+            accepted_names = (column.name, _get_stem(column), _get_quantity(column))
+            if name in accepted_names:
                 line = _Line(site, log[site].tick, log[site].t_s, column)
                 panels.setdefault(column.name, []).append(line)
     if not panels:
@@ -218,18 +235,21 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
-    """Returns the text of the error that a name selects no column."""
+    """Returns the error message for an unknown column, with the most similar name."""
     if name in FIGURES:
         return (
             f"{name!r} is a figure and no column of the log; "
             f"trilat_net.figure(log, {name!r}) draws it"
         )
+
+    # Dictionaries remove duplicates and keep the order of the columns.
     quantities: dict[str, None] = {}
     column_names: dict[str, None] = {}
     for site_columns in columns.values():
         for column in site_columns:
             quantities[_get_quantity(column)] = None
             column_names[column.name] = None
+
     hint = suggest_nearest(name, [*quantities, *column_names])
     return (
         f"there is no column {name!r}{hint}; the quantities are {', '.join(quantities)}, and "
@@ -238,12 +258,15 @@ def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
-    """Returns the numbers of the selected joints that a site's arm has, counted from 1.
+    """Returns the numbers of the selected joints that the arm of a site has, counted from 1.
+
+    A selection may have numbers and names of joints, or a single one of them. Numbers and names
+    that the arm does not have are ignored.
 
     Args:
         log: The log.
         site: Name of the site.
-        joints: The selected joints.
+        joints: The selected joints. None for all joints.
     """
     names = log.scenario.arms[site].joint_names
     numbers = list(range(1, len(names) + 1))
@@ -293,18 +316,21 @@ def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Pan
     """
     if joints is None:
         return panels
-    kept: _Panels = {}
+
+    panels_of_joints: _Panels = {}
     for column_name, lines in panels.items():
-        kept_lines = []
+        lines_of_joints = []
         for line in lines:
-            number = _get_joint_number(line.column)
-            if number is None or number in _number_joints(log, line.site, joints):
-                kept_lines.append(line)
-        if kept_lines:
-            kept[column_name] = kept_lines
-    if not kept:
+            joint_number = _get_joint_number(line.column)
+            has_no_joint = joint_number is None
+            if has_no_joint or joint_number in _number_joints(log, line.site, joints):
+                lines_of_joints.append(line)
+        if lines_of_joints:
+            panels_of_joints[column_name] = lines_of_joints
+
+    if not panels_of_joints:
         raise UsageError(f"{name} has no column of the joints {joints!r}")
-    return kept
+    return panels_of_joints
 
 
 def _get_joint_number(column: Column) -> int | None:
@@ -322,16 +348,22 @@ def _draw_groups(
     sites: Sequence[str],
     interval_s: tuple[float, float],
 ) -> Figure:
-    """Draws groups of columns. A group begins in a new row.
+    """Draws groups of panels below each other in one figure. A group begins in a new row.
 
     Args:
         log: The log.
-        groups: The lines of each group.
+        groups: The lines of each group, by the name of their column.
         sites: Names of all selected sites.
         interval_s: First and last time to draw, in s.
     """
-    most = max(len(group) for group in groups)
-    column_count = len(style.arrange_joints(most, narrow=False)[0]) if most > 1 else 1
+    largest_group = max(len(group) for group in groups)
+    column_count = 1
+    if largest_group > 1:
+        first_row = style.arrange_joints(largest_group, narrow=False)[0]
+        column_count = len(first_row)
+
+    # Each cell of the grid has the name of a column, or an empty text behind the end of a
+    # group.
     cells: list[str] = []
     for group in groups:
         cells += group
@@ -339,7 +371,10 @@ def _draw_groups(
     row_count = len(cells) // column_count
     height_in = _MARGIN_IN + _ROW_IN * row_count
 
-    lines = {name: group_lines for group in groups for name, group_lines in group.items()}
+    lines: dict[str, list[_Line]] = {}
+    for group in groups:
+        lines.update(group)
+
     with style.time_figure(log, REPORT_SIZE, height_in, interval_s) as plot:
         grid = style.add_panels(plot.figure, row_count, column_count, sharex=True)
         # The lowest panel of each column, which has the time axis. Rows below may be empty.
@@ -352,9 +387,13 @@ def _draw_groups(
                 lowest[column] = axes
             else:
                 axes.remove()
+
         for axes in lowest.values():
             axes.tick_params(labelbottom=True)
-        drawn_sites = {line.site for panel in lines.values() for line in panel}
+
+        drawn_sites: set[str] = set()
+        for panel_lines in lines.values():
+            drawn_sites |= {line.site for line in panel_lines}
         entries = [site for site in sites if site in drawn_sites]
         plot.finish(list(lowest.values()), style.site_legend_entries(log, entries))
     return plot.figure
@@ -368,6 +407,8 @@ def _draw_panel(
 ) -> None:
     """Draws a column of several sites in a panel.
 
+    The curves of the sites share the panel, so that they can be compared.
+
     Args:
         plot: The figure.
         axes: The panel.
@@ -378,42 +419,50 @@ def _draw_panel(
     column = lines[0].column
     unit = f" ({style.typeset_unit(column.unit)})" if column.unit else ""
     axes.set_title(f"{_get_stem(column)}{unit}")
-    words = _list_words(lines)
+    category_names = _list_words(lines)
+
+    # A column of texts, such as the mode, is a step curve between named values.
     for line in lines:
         options = style.site_line(plot.log, line.site)
-        if words:
+        if category_names:
             options["drawstyle"] = "steps-post"
         visible = (line.t_s >= first_s) & (line.t_s <= last_s)
-        values = _read_numbers(line.column, words)
+        values = _read_numbers(line.column, category_names)
         style.plot_decimated(
             axes, line.tick[visible], line.t_s[visible], values[visible], **options
         )
-    if words:
-        axes.set_yticks(range(len(words)), words)
+    if category_names:
+        axes.set_yticks(range(len(category_names)), category_names)
     plot.mark(axes, [line.site for line in lines])
     style.flatten_rounding(axes)
 
 
 def _list_words(lines: Sequence[_Line]) -> list[str]:
-    """Returns the different texts of a column of texts, for the ticks of the value axis.
+    """Returns the distinct texts of a column of texts, which label the ticks of the value axis.
 
-    The list is empty for a column of numbers. Modes have the order of their
-    numbers in messages for viewers.
+    The list is empty for a column of numbers. The modes of the control loop are in the order of
+    the numbers by which messages for viewers represent them. Other texts follow in alphabetical
+    order.
     """
     words: set[str] = set()
     for line in lines:
         if line.column.is_text:
             words |= {str(word) for word in line.column.values}
-    numbers = NUMBERS_BY_MODE_WORD
-    return sorted(words, key=lambda word: (numbers.get(word, len(numbers) + 1), word))
+
+    def sort_key(word: str) -> tuple[float, str]:
+        behind_modes = len(NUMBERS_BY_MODE_WORD) + 1
+        return NUMBERS_BY_MODE_WORD.get(word, behind_modes), word
+
+    return sorted(words, key=sort_key)
 
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
-    """Returns the values of a column as numbers, shape (K,). NaN stands for no value.
+    """Returns the values of a column as numbers to draw, shape (K,). NaN stands for no value.
 
     Args:
         column: The column.
-        words: The texts of the column. Each text becomes its index. Empty for numbers.
+        words: The distinct texts of the column, each of which is drawn at its index. Empty for
+            a column of numbers.
     """
     if not words:
         return np.asarray(column.numbers(), dtype=np.float64)

@@ -69,8 +69,8 @@ class Conclusion(CheckReport):
         for line in (self.verdict, *self.meaning):
             yield line.print_form
         for finding in self.findings:
-            failed = "FAIL" if finding.judged else "open"
-            mark = "ok" if finding.passed else failed
+            failure_mark = "FAIL" if finding.judged else "open"
+            mark = "ok" if finding.passed else failure_mark
             yield MarkedText(MARKS[mark], f"{finding.check}: {finding.text}")
         yield self.table
         yield from self.notes
@@ -222,6 +222,8 @@ def conclude(
 def _run_without_operators(log: Log) -> Log | None:
     """Simulates the run of a log without the people or programs that moved the arms.
 
+    The difference between the two runs shows how far the operators displaced the arms.
+
     Returns:
         The log of the simulation. None if it would not differ from the run, or cannot run.
     """
@@ -242,19 +244,19 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
-    """Returns a table with a row per site: records, timing, and largest error at the end.
+    """Returns a table with a row per site: number of records, timing, and largest final error.
 
-    The error is the largest one of the last second, of the joint that the table names. If the
-    run was shorter, it is that of the whole run.
+    The error is the largest one of any joint in the last second, or of the whole run if the run
+    was shorter. The table names the joint.
 
     Args:
         log: Log of the run.
         is_timed: False to leave out the timing. Loops in virtual time are never late.
     """
-    timing = _TIMING_HEADERS if is_timed else ()
+    timing_headers = _TIMING_HEADERS if is_timed else ()
     has_second = any(log[site].t_s[-1] >= END_WINDOW_S for site in log.sites if len(log[site]))
-    part = " last s" if has_second else ""
-    headers = (*_HEADERS, *timing, f"max|e|{part}, {shared_unit(log)}", "of")
+    error_interval = " last s" if has_second else ""
+    headers = (*_HEADERS, *timing_headers, f"max|e|{error_interval}, {shared_unit(log)}", "of")
     rows = []
     for site in log.sites:
         records = log[site]
@@ -262,16 +264,20 @@ def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
             empty = [""] * (len(headers) - 2)
             rows.append([site, "0", *empty])
             continue
+
+        # The site may have executed ticks whose records were lost at the end of the log.
         ticks = max(log.last_ticks[site], records.last_tick) + 1
         missing = ticks - len(records) - log.absent_ticks(site)
-        times = _list_timing_cells(records) if is_timed else []
+        timing_cells = _list_timing_cells(records) if is_timed else []
         error = JointError.find_in_last_second(records)
-        cells = ["", ""]
+        error_cells = ["", ""]
         if error is not None:
-            cells = [f"{error.value:.3g}", error.joint.removeprefix(f"{site} ")]
-        rows.append([site, str(len(records)), str(missing), *times, *cells])
-    columns = "r" * (len(headers) - 2)
-    return TextTable(headers, rows, align=f"l{columns}l")
+            error_cells = [f"{error.value:.3g}", error.joint.removeprefix(f"{site} ")]
+        rows.append([site, str(len(records)), str(missing), *timing_cells, *error_cells])
+
+    # Numbers are aligned to the right, and the names in the first and last column to the left.
+    number_columns = "r" * (len(headers) - 2)
+    return TextTable(headers, rows, align=f"l{number_columns}l")
 
 
 def _list_timing_cells(records: SiteLog) -> list[str]:
@@ -287,10 +293,9 @@ def _list_timing_cells(records: SiteLog) -> list[str]:
 def conclude_files(
     paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
 ) -> tuple[Log, Conclusion]:
-    """Checks a log that was just recorded, writes its report and prints the result.
+    """Checks a log that was just recorded, writes its report, and prints the result.
 
-    If the user interrupts the drawing of figures, a note gives the command that draws the
-    report later.
+    If the user interrupts the work, a note gives the command that draws the report later.
 
     Args:
         paths: Files of the log.

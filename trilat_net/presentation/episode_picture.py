@@ -71,7 +71,7 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Draws the arms, the bodies and the goal at one instant of the episode.
+        """Draws the arms, the bodies and the goal of the task at one time of an episode.
 
         Args:
             q_rad: Joint angles by site, in rad, shape (n,) each.
@@ -86,18 +86,23 @@ class EpisodePicture:
         for number, (site, axes) in enumerate(self._panels.items()):
             arm = self._scenario.arms[site]
             colour = SITE_COLOURS[number % len(SITE_COLOURS)]
-            all_q_rad = np.asarray(q_rad[site])[np.newaxis]
-            points_m = joint_positions_m(arm, all_q_rad)[0]
+            q_rows_rad = np.asarray(q_rad[site])[np.newaxis]
+            points_m = joint_positions_m(arm, q_rows_rad)[0]
+
             axes.clear()
             _scale_panel(axes, points_m)
             self._draw_bodies(axes, site, bodies.get(site, {}))
             _draw_arm(axes, project_arm_m(arm, points_m), colour)
+
             if goal_m is not None and site == self._goal_site:
-                goal = project_arm_m(arm, np.asarray(goal_m))
-                axes.plot(*goal, **_GOAL)
+                goal_in_picture = project_arm_m(arm, np.asarray(goal_m))
+                axes.plot(*goal_in_picture, **_GOAL)
             axes.text(0.03, 0.97, site, transform=axes.transAxes, va="top", fontsize=9.0)
-        first = next(iter(self._panels.values()))
-        first.text(0.03, 0.03, title, transform=first.transAxes, va="bottom", fontsize=8.0)
+
+        first_panel = next(iter(self._panels.values()))
+        first_panel.text(
+            0.03, 0.03, title, transform=first_panel.transAxes, va="bottom", fontsize=8.0
+        )
         return self._read_pixels()
 
     def _draw_bodies(self, axes: Axes, site: str, bodies: Mapping[str, Array]) -> None:

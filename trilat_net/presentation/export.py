@@ -93,9 +93,13 @@ class Exporter:
         module = import_module(f"{exports.__name__}.{form}")
         self._format: ExportFormat = module.FORMAT
         self._settings = _parse_settings(form, self._format.write, dict(settings))
+
         name = log.name.removesuffix(".active").removesuffix(".mcap")
         self.path = path or log.parent / (name + self._format.ending)
         self._force = force
+
+        # An existing folder is replaced only if its manifest shows that it is an earlier
+        # export.
         self._manifest = EXPORT_MANIFEST if self._format.folder else None
         refuse_existing(self.path, force=force, manifest=self._manifest)
         if self._format.extra:
@@ -120,7 +124,9 @@ class Exporter:
             raise UsageError(
                 f"this format exports a single log, not {len(logs)} logs of different sessions"
             )
-        total = sum(len(log[site]) for log in logs for site in log.sites)
+        total = 0
+        for log in logs:
+            total += sum(len(log[site]) for site in log.sites)
         done = 0
 
         def report_written(records: int) -> None:
@@ -142,11 +148,14 @@ class Exporter:
 def _parse_settings(
     form: str, write: Callable[..., Any], settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Converts the settings of a format to the types of its parameters.
+    """Converts the settings of an export, such as `fps=30`, to the types of their parameters.
+
+    The settings come from the command line as texts. A format declares its settings as
+    keyword-only parameters of its function, with default values that determine the types.
 
     Args:
         form: Name of the format.
-        write: Function whose keyword-only parameters, with their defaults, are the settings.
+        write: Function of the format that writes a log.
         settings: Values of settings by name, as numbers or texts.
 
     Returns:
@@ -159,19 +168,24 @@ def _parse_settings(
     for parameter in inspect.signature(write).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:
             types[parameter.name] = type(parameter.default)
-    unknown = [name for name in settings if name not in types]
-    if unknown:
-        valid = f"the settings of {form} are {', '.join(types)}"
+
+    unknown_names = [name for name in settings if name not in types]
+    if unknown_names:
+        valid_settings = f"the settings of {form} are {', '.join(types)}"
         if not types:
-            valid = f"{form} has no settings"
-        raise UsageError(f"{form} has no setting {unknown[0]!r}; {valid}")
+            valid_settings = f"{form} has no settings"
+        raise UsageError(f"{form} has no setting {unknown_names[0]!r}; {valid_settings}")
+
     values = {}
     for name, value in settings.items():
         try:
             values[name] = types[name](str(value))
         except ValueError:
-            kind = {int: "a whole number", float: "a number"}.get(types[name], "a text")
-            raise UsageError(f"{name} of {form} must be {kind}, not {str(value)!r}") from None
+            kind_texts = {int: "a whole number", float: "a number"}
+            kind_text = kind_texts.get(types[name], "a text")
+            raise UsageError(
+                f"{name} of {form} must be {kind_text}, not {str(value)!r}"
+            ) from None
     return values
 
 
@@ -181,9 +195,10 @@ def store_tables(
     choose_name: Callable[[Table], str],
     store: Callable[[Table, str], Any],
 ) -> str:
-    """Stores every table of a log by a function of the export format, and describes the export.
+    """Stores every table of a log in an export, and returns a description of the export.
 
-    Formats that write one file, such as NumPy's, use it.
+    All formats share this loop. A format supplies two functions, which name and store a table.
+    For example, the NumPy format adds each column as an array to a dictionary.
 
     Args:
         log: Log of the run that is exported.
@@ -202,6 +217,7 @@ def store_tables(
         # Progress is counted in records, which are the rows of the tables of states.
         is_state = table.kind == "state"
         written(len(table) if is_state else 0)
+
     version = collect_provenance()["version_trilat-net"]
     facts = {
         "exported_by": f"trilat-net {version}",
@@ -221,9 +237,10 @@ def write_table_files(
     suffix: str,
     write_table: Callable[[Table, Path], None],
 ) -> None:
-    """Writes every table of a log as a file, their description and the scenario into a folder.
+    """Writes every table of a log as a file of its own, for formats such as CSV and Parquet.
 
-    Formats with a file per table, such as CSV, use it.
+    The folder also gets a description of all tables and the scenario, the text that defines the
+    run.
 
     Args:
         log: Log of the run that is exported.

@@ -55,6 +55,9 @@ Tree = str | JsonObject
 def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
     """Arranges the channels of a log or of a session in panels.
 
+    Foxglove is a program that shows recorded or live data of robots. It opens the layout from a
+    file.
+
     Args:
         sources: Standard channels by topic, for each source of data. If there are several
             sources, each has a tab, whose title is the name of the source.
@@ -93,8 +96,8 @@ class _Panels:
             title: Title of the panel. Empty for the default title.
         """
         identifier = f"{kind}!{len(self.settings) + 1}"
-        titles = dict.fromkeys(_TITLE_KEYS, title) if title else {}
-        self.settings[identifier] = {**titles, **settings}
+        title_settings = dict.fromkeys(_TITLE_KEYS, title) if title else {}
+        self.settings[identifier] = {**title_settings, **settings}
         return identifier
 
     def add_tabs(self, trees: Mapping[str, Tree]) -> str:
@@ -108,28 +111,34 @@ class _Panels:
 
 
 def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
-    """Arranges the channels of one source: tabs of plots and arms, above modes and events."""
+    """Arranges the data of one log or session: tabs of plots and arms, above modes and events.
+
+    A mode is what an arm's controller does at a time, for example "resting". Areas without data
+    are left out.
+    """
     layout = build_plot_layout(channels)
     tabs: dict[str, Tree] = {}
     for name, page in layout.pages.items():
         rows = []
         for plots in page:
-            row = [_add_plot(panels, channels, plot) for plot in plots if not _is_mode(plot)]
-            if row:
-                rows.append(_divide("row", row))
+            plots_in_row = [
+                _add_plot(panels, channels, plot) for plot in plots if not _is_mode(plot)
+            ]
+            if plots_in_row:
+                rows.append(_divide("row", plots_in_row))
         if rows:
             tabs[name] = _divide("column", rows)
     if layout.arms:
         tabs["Arms"] = _add_arms(panels, channels)
 
-    states = [
-        tree for tree in (_add_modes(panels, channels), _add_events(panels, layout)) if tree
-    ]
-    top = panels.add_tabs(tabs)
-    if not states:
-        return top
-    bottom = _divide("row", states, _MODES_PERCENT)
-    return _divide("column", [top, bottom], _PLOTS_PERCENT)
+    # Panels without data have an empty identifier.
+    candidates = (_add_modes(panels, channels), _add_events(panels, layout))
+    lower_panels = [tree for tree in candidates if tree]
+    upper_area = panels.add_tabs(tabs)
+    if not lower_panels:
+        return upper_area
+    lower_area = _divide("row", lower_panels, _MODES_PERCENT)
+    return _divide("column", [upper_area, lower_area], _PLOTS_PERCENT)
 
 
 def _is_mode(plot: CurvePlot) -> bool:
@@ -139,12 +148,15 @@ def _is_mode(plot: CurvePlot) -> bool:
 
 
 def _divide(direction: str, trees: Sequence[Tree], first_percent: float | None = None) -> Tree:
-    """Divides an area among several trees.
+    """Divides an area of the viewer among several panels, or groups of panels (trees).
+
+    The viewer divides an area into two parts only. Therefore the first tree gets its part, and
+    the rest is divided again.
 
     Args:
         direction: "row" to place the trees beside one another, "column" to stack them.
         trees: The trees, at least one.
-        first_percent: Share of the first tree. None if all trees have the same size.
+        first_percent: Part of the first tree, in %. None if all trees have the same size.
     """
     first, *others = trees
     if not others:
@@ -158,26 +170,31 @@ def _divide(direction: str, trees: Sequence[Tree], first_percent: float | None =
 
 
 def _add_plot(panels: _Panels, channels: Ros2Channels, plot: CurvePlot) -> str:
-    """Adds a plot of the curves of one quantity, and returns its identifier."""
-    series = []
+    """Adds a plot with the curves of a quantity, such as joint angles. Returns its identifier.
+
+    Curves that are hidden by default are left out. References, which an arm should follow, are
+    dashed.
+    """
+    curve_settings = []
     for curves in plot.curves:
         topic_path = _get_list_path(channels, curves.entity)
         for index, name in enumerate(curves.names):
             if not curves.visible[index]:
                 continue
             is_reference = name.endswith("_ref")
-            line = {"lineStyle": "dashed"} if is_reference else {}
-            series.append(
+            dashes = {"lineStyle": "dashed"} if is_reference else {}
+            curve_settings.append(
                 {
                     "value": f"{topic_path}[{index}]",
                     "label": name,
                     "enabled": True,
                     "timestampMethod": "receiveTime",
-                    **line,
+                    **dashes,
                 }
             )
+
     settings = {
-        "paths": series,
+        "paths": curve_settings,
         "showLegend": True,
         "legendDisplay": "floating",
         "showPlotValuesInLegend": False,
@@ -205,25 +222,33 @@ def _get_list_path(channels: Ros2Channels, entity: str) -> str:
 
 
 def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
-    """Adds a panel with the modes of all sites over time. Returns "" if there are no modes."""
-    series = []
+    """Adds a panel that shows the modes of all arms over time, such as "resting".
+
+    Returns:
+        The identifier of the panel. Empty if there are no modes.
+    """
+    entries = []
     for topic, channel in channels.items():
         root, _, name = topic.rpartition("/")
-        if name != _MODE or channel.kind not in (STRING, FLOAT64_ARRAY):
+        is_mode = name == _MODE and channel.kind in (STRING, FLOAT64_ARRAY)
+        if not is_mode:
             continue
+
+        site = root.rpartition("/")[2]
         entry: JsonObject = {
             "value": f"{topic}.data",
-            "label": root.rpartition("/")[2],
+            "label": site,
             "enabled": True,
             "timestampMethod": "receiveTime",
         }
-        if channel.kind == FLOAT64_ARRAY:
+        if channel.kind == FLOAT64_ARRAY:  # the mode is a number, which the viewer names
             entry["value"] = f"{topic}.data[0]"
             entry["customStates"] = _name_mode_numbers()
-        series.append(entry)
-    if not series:
+        entries.append(entry)
+
+    if not entries:
         return ""
-    return panels.add("StateTransitions", {"paths": series, "isSynced": True}, "modes")
+    return panels.add("StateTransitions", {"paths": entries, "isSynced": True}, "modes")
 
 
 def _name_mode_numbers() -> JsonObject:

@@ -51,7 +51,10 @@ def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
 
 @cache
 def _make_environment() -> Environment:
-    """Returns the environment of all templates. It compiles each template once."""
+    """Returns the settings and functions that all templates share.
+
+    The result is cached, so that each template is compiled only once.
+    """
     environment = Environment(
         loader=PackageLoader(__package__, "templates"),
         autoescape=True,
@@ -61,6 +64,7 @@ def _make_environment() -> Environment:
     environment.globals["zip"] = zip
     environment.filters["code"] = _mark_code
     environment.filters["hashes"] = _mark_hashes
+
     # JSON has no NaN and no infinity. Texts are written as they are, not as escape sequences.
     dump = partial(json.dumps, allow_nan=False, ensure_ascii=False)
     environment.policies["json.dumps_function"] = dump

@@ -12,6 +12,7 @@ Invariant:
 
 import math
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -33,11 +34,12 @@ _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
 
 def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
-    """Yields the text about the linear analysis of a scenario.
+    """Yields the text that says whether small motions of the coupled arms decay.
 
-    The analysis linearises the loop of arms, controllers and delays at an equilibrium. The text
-    contains, in order, the equilibrium, the delays, the characteristic roots, the verdict about
-    stability, the margin, notes, the ports at which operators hold the arms, and scans.
+    The arms, their controllers and the network delays form a loop, which the analysis has
+    linearised at a pose of rest (equilibrium). The text contains, in order, the equilibrium,
+    the delays, the characteristic roots, the verdict about stability, the delay margin, notes,
+    what operators feel at the arms, and scans of settings.
 
     Args:
         analysis: The analysis.
@@ -47,8 +49,10 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     yield ""
     yield tabulate_roots(analysis)
     yield describe_zero_roots(analysis)
-    verdict, _, rest = describe_linear_verdict(analysis).partition(": ")
-    yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", rest)
+
+    verdict, _, explanation = describe_linear_verdict(analysis).partition(": ")
+    yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", explanation)
+
     margin = analysis.margin.description
     yield f"delay margin, continuous loop, one delay on all links: {margin}"
     yield from (f"note: {note}" for note in analysis.notes)
@@ -58,25 +62,27 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
 
 
 def _describe_scan(scan: EdgeScan, name: str) -> str:
-    """Returns a line with the values of a scenario key at which the stability changes.
+    """Returns a line with the values of a setting at which the loop becomes stable or unstable.
+
+    An example is "control.Kd from 0 to 10: stable from 1.2 on (3.4 rad/s)".
 
     Args:
-        scan: Result of a scan of the key's values.
+        scan: Result of a scan of the setting's values.
         name: Name of the scenario.
     """
-    edges = []
+    edge_texts = []
     for edge in scan.edges:
         state = "stable" if edge.stable_above else "unstable"
-        edges.append(f"{state} from {edge.value:.6g} on ({edge.omega_rad_s:.4g} rad/s)")
-    result = ", ".join(edges) or f"stability of {name} does not change"
+        edge_texts.append(f"{state} from {edge.value:.6g} on ({edge.omega_rad_s:.4g} rad/s)")
+    result = ", ".join(edge_texts) or f"stability of {name} does not change"
     return f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields lines about the equilibrium at which the loop was linearised.
+    """Yields lines about the pose of rest (equilibrium) at which the loop was linearised.
 
-    They state how the equilibrium was computed, its residual, and the pose of each site. If all
-    sites have the same joint angles, a single line has them.
+    They state how the equilibrium was computed, its residual, and the pose of each arm. If all
+    arms have the same joint angles, a single line has them.
 
     Args:
         analysis: The analysis.
@@ -84,13 +90,17 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     rest = analysis.rest
     yield f"rest: {rest.how}; residual {rest.residual:.1g}"
     sites = analysis.conditions.sites
-    angles = [q[: site.layout.joints] for site, q in zip(sites, rest.q, strict=True)]
+    # The rows of `rest.q` have the length of the longest arm.
+    joint_angles = [q[: site.layout.joints] for site, q in zip(sites, rest.q, strict=True)]
+
     is_joint_space = not sites[0].layout.task
-    # The limit is half a unit of the last digit that is printed.
-    if is_joint_space and float(np.ptp(rest.q, axis=0).max()) < 5e-5:
-        yield f"  all sites at ({_list_numbers(angles[0])}) rad"
+    largest_difference_rad = float(np.ptp(rest.q, axis=0).max())
+    half_last_digit_rad = 5e-5  # angles are printed with four decimals
+    if is_joint_space and largest_difference_rad < half_last_digit_rad:
+        yield f"  all sites at ({_list_numbers(joint_angles[0])}) rad"
         return
-    for site, q, pose in zip(sites, angles, analysis.end_effectors, strict=True):
+
+    for site, q, pose in zip(sites, joint_angles, analysis.end_effectors, strict=True):
         text = f"  {site.name} at ({_list_numbers(q)}) rad"
         if len(pose):
             units = "m and rad" if len(pose) > 3 else "m"
@@ -115,10 +125,12 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
     names = analysis.scenario.names
     age_s = analysis.conditions.age_s
     quantity = "mean delay in use" if analysis.conditions.varying else "delay in use"
+    # Site i follows site j over a link if the weight alpha[i, j] is not 0.
     links = list(zip(*np.nonzero(analysis.conditions.alpha), strict=True))
-    values = {float(age_s[i, j]) for i, j in links}
-    if len(values) == 1:
-        yield f"{quantity} on every link: {1e3 * values.pop():.4g} ms"
+    distinct_ages_s = {float(age_s[i, j]) for i, j in links}
+    if len(distinct_ages_s) == 1:
+        [common_age_s] = distinct_ages_s
+        yield f"{quantity} on every link: {1e3 * common_age_s:.4g} ms"
         return
     for i, j in links:
         yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
@@ -181,14 +193,17 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
     Args:
         analysis: The analysis.
     """
-    count = analysis.decisive.zeros
-    if not count:
+    zero_count = analysis.decisive.zeros
+    if not zero_count:
         return "no root at zero"
-    subject = "root is" if count == 1 else "roots are"
+    subject = "root is" if zero_count == 1 else "roots are"
+
     origins = "shared poses"
     if analysis.conditions.sites[0].layout.task:
         origins += ", joints that the task leaves free"
-    return f"{count} {subject} zero by structure: {origins}, and estimates without excitation"
+    return (
+        f"{zero_count} {subject} zero by structure: {origins}, and estimates without excitation"
+    )
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
@@ -260,22 +275,26 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
             "  the loop without operators is unstable: not passive, and without an impedance"
         )
         return lines
+
     lines += _describe_port_passivity(ports)
     absolute = _describe_absolute_stability(ports)
     lines.append(f"  a passive operator in {ports.speed} per site, best weights: {absolute}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
+
     if ports.measured is not None:
         bands = ports.measured.below
         result = "stable"
         if bands:
             result = f"not shown {_list_bands(bands)}, where they damp too little"
         lines.append(f"  the measured operators at the masters, any at each: {result}")
+
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].other_site
         lines.append(
             f"  with {clamped} clamped the loop is unstable: it has no steady impedance"
         )
         return lines
+
     for transparency in ports.transparency:
         lines.append(f"  {_describe_transparency(ports, transparency)}")
     return lines
@@ -311,13 +330,16 @@ def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
     if pole.order:
         meaning = "as of free masses" if pole.passive else "which no passive network has"
         lines.append(f"  at zero frequency Y has a pole of order {pole.order}, {meaning}")
+
     all_ports_text = _describe_passivity(ports.velocity, ports.impedance_unit(), ports.kind)
     lines.append(f"  operators passive in {ports.speed}, coupled or not: {all_ports_text}")
+
     # Each joint alone, without operators at the others.
     for joint, passivity in ports.joints.items():
         unit = ports.impedance_unit(joint)
         joint_text = _describe_passivity(passivity, unit, ports.kind)
         lines.append(f"    {ports.name_port(joint)} alone: {joint_text}")
+
     if ports.proof is not None:
         premise = f"r = {ports.speed} + Lambda e, the proof's premise"
         proof_text = _describe_proof(ports, ports.proof)
@@ -326,15 +348,19 @@ def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
-    """Returns a sentence about the passivity in r that the stability proof assumes.
+    """Returns a sentence about the condition on operators that the stability proof assumes.
+
+    The proof assumes that operators are passive with respect to r, the velocity plus Lambda
+    times the error e. Passive means that they give back no more energy than they took.
 
     Args:
-        ports: Analysed ports.
-        proof: Passivity in r, with the ports of each site weighted as in the proof.
+        ports: Results for the joints or axes at which operators act.
+        proof: Passivity in r, with the joints of each site weighted as in the proof.
     """
     beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
     text = f"{_describe_passivity(proof)}; sites weighted {beta}"
-    if np.ptp(ports.beta) > WEIGHTS_ALIKE:
+    have_different_weights = np.ptp(ports.beta) > WEIGHTS_ALIKE
+    if have_different_weights:
         text += ", which says nothing about operators coupled to each other"
     if proof.passive or ports.estimates_true:
         return text
@@ -344,23 +370,29 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
 
 
 def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") -> str:
-    """Returns a sentence about passivity, and about the damping that is missing.
+    """Returns a sentence that says whether the arms are passive, and which damping is missing.
+
+    Passive arms never supply energy to an operator. An example of a negative result is "not
+    passive at 2-5 Hz; least eigenvalue -0.1 at 3 Hz; 0.05 N m s/rad more at each joint would
+    make it so".
 
     Args:
-        passivity: Result for one port or for all ports.
+        passivity: Result for one joint or for all joints at which operators act.
         unit: Unit of the missing damping. Empty to leave out the damping.
-        kind: Kind of the ports, "joint" or "axis".
+        kind: "joint" or "axis": where operators act.
     """
     if passivity.passive:
         return "passive"
     minima = passivity.minima
-    least = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-    text = f"not passive {_list_bands(minima.below)}; {least}"
+    least_text = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    text = f"not passive {_list_bands(minima.below)}; {least_text}"
+
     if not unit:
         return text
     if math.isinf(passivity.lacking_nm_s_rad):
         plural = "axes" if kind == "axis" else "joints"
         return f"{text}; no damping at the {plural} would make it so"
+
     damping = f"{passivity.lacking_nm_s_rad:.3g} {unit}"
     return f"{text}; {damping} more at each {kind} would make it so"
 
@@ -396,22 +428,22 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     Args:
         ports: Results for the joints at which the operators act.
     """
-    failing = [two_port for two_port in ports.two_ports if two_port.minima.below]
+    failing_ports = [two_port for two_port in ports.two_ports if two_port.minima.below]
 
     # For arms with many joints, the failing two-ports of a pair of sites share a line.
     has_line_per_joint = len(ports.joints) <= _MAX_SEPARATE_JOINTS
-    groups: dict[tuple[object, ...], list[TwoPort]] = {}
-    for two_port in failing:
+    ports_by_line: dict[tuple[object, ...], list[TwoPort]] = {}
+    for two_port in failing_ports:
         joint = two_port.joint if has_line_per_joint else ""
         line_key = (two_port.sites, two_port.clamped, joint)
-        groups.setdefault(line_key, []).append(two_port)
-    lines = [_describe_failing(ports, group) for group in groups.values()]
+        ports_by_line.setdefault(line_key, []).append(two_port)
+    lines = [_describe_failing(ports, group) for group in ports_by_line.values()]
 
-    holding_count = len(ports.two_ports) - len(failing)
+    holding_count = len(ports.two_ports) - len(failing_ports)
     if not holding_count:
         return lines
     subject = "the others"
-    if not failing:
+    if not failing_ports:
         subject = f"every pair and {ports.kind}"
         if any(two_port.clamped for two_port in ports.two_ports):
             subject += ", the third site free or clamped"
@@ -447,7 +479,7 @@ def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
         frequencies = _list_bands(minima.below)
     else:
         # Several two-ports have too many bands to list. The range that contains them is stated.
-        bands = [band for two_port in group for band in two_port.minima.below]
+        bands = list(chain.from_iterable(two_port.minima.below for two_port in group))
         from_hz = min(band.from_hz for band in bands)
         to_hz = max(band.to_hz for band in bands)
         frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
@@ -456,17 +488,18 @@ def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
 
 
 def _describe_transparency(ports: PortAnalysis, transparency: Transparency) -> str:
-    """Returns a sentence about the impedance that an operator feels.
+    """Returns a sentence about the impedance that an operator feels at an arm.
 
-    The impedance is given with the other site free and with it clamped. The larger their ratio,
-    the better the operator can feel what the other site touches.
+    The impedance (force over velocity) is stated while the other arm can move freely, and while
+    the other arm is clamped. The larger the ratio of the two, the better the operator can feel
+    what the other arm touches.
     """
     unit = ports.impedance_unit(transparency.joint)
-    port = ports.name_port(transparency.joint)
+    port_name = ports.name_port(transparency.joint)
     free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
     low_hz, high_hz = transparency.band_hz
     return (
-        f"{transparency.operator_site} feels of {transparency.other_site}, {port}: "
+        f"{transparency.operator_site} feels of {transparency.other_site}, {port_name}: "
         f"{free:.4g} {unit} free and {clamped:.4g} clamped at {QUOTED_AT_HZ:g} Hz; "
         f"over {low_hz:g}-{high_hz:g} Hz the ratio is {transparency.ratio_db:.3g} dB, "
         f"the difference {transparency.difference_nm_s_rad:.3g} {unit}"

@@ -49,14 +49,16 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
     elif facts["problem"]:
         yield MarkedText("[red]cannot be opened:[/red]", sanitize(facts["problem"]))
 
-    views: dict[str, JsonObject] = {}
-    channels: dict[str, JsonObject] = {}
+    standard_channels: dict[str, JsonObject] = {}
+    own_channels: dict[str, JsonObject] = {}
     for topic, channel in facts["channels"].items():
-        is_view = topic.startswith(_VIEW_PREFIX)
-        group = views if is_view else channels
-        group[topic] = channel
-    yield from _compose_channels(channels, session)
-    yield from _compose_views(views)
+        # Some channels repeat the records as standard messages, for viewers of robot data.
+        if topic.startswith(_VIEW_PREFIX):
+            standard_channels[topic] = channel
+        else:
+            own_channels[topic] = channel
+    yield from _compose_channels(own_channels, session)
+    yield from _compose_views(standard_channels)
 
     if session is not None:
         yield from _compose_accounts(session)
@@ -66,20 +68,24 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
 
 
 def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
-    """Yields the session, its scenario and duration, and the state of its records."""
+    """Yields the lines about the recorded session: its name, scenario, duration and records.
+
+    A scenario is the text that defines the run. Its hash shows whether the log contains the
+    text that was executed.
+    """
     scenario: JsonObject = session["scenario"]
     name = f"{session['session']}, {session['driver']}"
     if session["began_utc"]:
         name += f", began {session['began_utc']} UTC"
     title = f": {scenario['title']}" if scenario["title"] else ""
-    source = f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}"
+    origin = f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}"
     if not scenario["as_named"]:
-        source += "; NOT the text whose hash the session names"
+        origin += "; NOT the text whose hash the session names"
     duration = f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"
 
     yield from _compose_line("session", name)
     yield from _compose_line("scenario", scenario["name"] + title)
-    yield from _compose_line("", source)
+    yield from _compose_line("", origin)
     for note in scenario.get("arms", ()):
         yield from _compose_line("", f"note: {note}")
     yield from _compose_line("duration", duration)
@@ -87,7 +93,10 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
 
 
 def _describe_records(facts: JsonObject, session: JsonObject) -> str:
-    """Returns the numbers of recorded and missing records, and the state of the files."""
+    """Returns the numbers of recorded and missing records, and whether the files are intact.
+
+    For example: "30000, none missing; finished".
+    """
     sites: dict[str, JsonObject] = facts["sites"]
     records = sum(site["records"] for site in sites.values())
     missing = sum(site["missing"] for site in sites.values())
@@ -106,11 +115,15 @@ def _describe_records(facts: JsonObject, session: JsonObject) -> str:
 
 
 def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
-    """Yields a table of the sites' records, and a table of their loops if these were timed."""
+    """Yields a table of the records of each arm, and a table of the timing of its control loop.
+
+    The second table exists only for sessions in real time.
+    """
     rows = []
     for name, site in sites.items():
-        executed = site["made_ticks"]
-        ticks = site["expected_ticks"] if executed is None else executed
+        executed_ticks = site["made_ticks"]
+        # An interrupted site may have executed fewer ticks than the scenario plans.
+        ticks = site["expected_ticks"] if executed_ticks is None else executed_ticks
         row = [
             name,
             site["role"],
@@ -126,17 +139,21 @@ def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
     yield from _tabulate(columns.split(", "), rows, text_columns=2)
 
     if any(site["late_us"] for site in sites.values()):
-        loops = []
+        loop_rows = []
         for name, site in sites.items():
             late = _format_percentiles(site["late_us"])
             busy = _format_percentiles(site["busy_us"])
-            loops.append([name, *late, *busy])
+            loop_rows.append([name, *late, *busy])
         headers = ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max")
-        yield from _tabulate(headers, loops)
+        yield from _tabulate(headers, loop_rows)
 
 
 def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
-    """Yields a table of the links, with one-way delays and clocks if they were measured."""
+    """Yields a table of the network connections (links) between the arms.
+
+    The table has the ages of the used messages. One-way delays and clock differences follow if
+    they were measured, and then the numbers of late, lost and duplicate messages.
+    """
     has_delays = any(link["one_way_ms"] for link in links.values())
     has_clocks = any(link["clock_bound_us"] for link in links.values())
     headers = ["link", "age ms p50", "p99", "max"]
@@ -161,21 +178,26 @@ def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
 def _compose_channels(
     channels: Mapping[str, JsonObject], session: JsonObject | None
 ) -> Iterator[Block]:
-    """Yields a table of the channels, and the missing numbers of each channel with gaps.
+    """Yields a table of the channels (series of messages) in the files, and the gaps in each.
+
+    A gap is a range of message numbers that the files lack, because the messages were lost.
 
     Args:
         channels: Channels by topic.
-        session: The session, whose topics are shortened. None if the files contain no session.
+        session: The session, whose name is left out of the topics. None if the files contain no
+            session.
     """
     if not channels:
         return
     prefix = f"/trilat/{session['session']}/" if session else ""
+
     rows = []
     for topic, channel in channels.items():
         name = topic.removeprefix(prefix) or "(none)"
-        counts = _format_counts(channel)
-        intervals = _format_percentiles(channel["between_ms"])
-        rows.append([name, *counts, channel["missing"], *intervals])
+        count_cells = _format_counts(channel)
+        interval_cells = _format_percentiles(channel["between_ms"])
+        rows.append([name, *count_cells, channel["missing"], *interval_cells])
+
     headers = (
         "channel",
         "messages",
@@ -200,10 +222,11 @@ def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
     Args:
         gaps: First and last number of each range.
     """
-    ranges = []
+    range_texts = []
     for first, last in gaps[:_MAX_GAPS]:
-        ranges.append(f"{first}-{last}" if last > first else str(first))
-    text = ", ".join(ranges)
+        range_texts.append(f"{first}-{last}" if last > first else str(first))
+
+    text = ", ".join(range_texts)
     if len(gaps) > _MAX_GAPS:
         text += f" and {count_nouns(len(gaps) - _MAX_GAPS, 'more range')}"
     return text
@@ -222,9 +245,10 @@ def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
 
 
 def _compose_accounts(session: JsonObject) -> Iterator[Block]:
-    """Yields the recorder's counts of the messages of each channel.
+    """Yields the counts that the recorder kept of the messages of each channel.
 
-    Only channels with a fault, such as missing messages, are listed. The others are counted.
+    The counts show whether the log is complete. Only channels with a fault, such as missing
+    messages, are listed. The others are counted.
     """
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
@@ -232,15 +256,17 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
     if not accounts:
         yield "no accounts: the recording was not finished"
         return
-    faulty = {
+    faulty_accounts = {
         topic: account
         for topic, account in accounts.items()
         if _FAULTY_ACCOUNT.search(account) or ":" in topic
     }
-    intact = len(accounts) - len(faulty)
-    if intact:
-        yield f"the recorder accounts for {count_nouns(intact, 'channel')} without a fault"
-    for topic, account in faulty.items():
+
+    intact_count = len(accounts) - len(faulty_accounts)
+    if intact_count:
+        channels_text = count_nouns(intact_count, "channel")
+        yield f"the recorder accounts for {channels_text} without a fault"
+    for topic, account in faulty_accounts.items():
         yield f"{topic.removeprefix(prefix)}: {sanitize(account)}"
 
 
@@ -249,6 +275,7 @@ def _compose_origin(session: JsonObject) -> Iterator[Block]:
     versions: dict[str, str] = dict(session["versions"])
     version = versions.pop("trilat-net", "unknown")
     libraries = [f"{name} {library}" for name, library in versions.items()]
+
     commit = (session["commit"] or "unknown")[:12]
     change_notes = {"true": " with changes", "false": ""}
     changes = change_notes.get(session["commit_dirty"] or "", " (changes unknown)")
@@ -262,11 +289,12 @@ def _compose_origin(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_file(file: JsonObject) -> Iterator[Block]:
-    """Yields a line about a file, and a line about each of its damaged parts."""
+    """Yields a line about a log file: its size and state, and a line per damaged part."""
     name = file["path"]
     if file["part"]:
         name += f", part {file['part'].get('index', '?')}"
 
+    # Messages are stored in compressed chunks.
     chunks = []
     for compression, count in file["compression"].items():
         chunks.append(f"{count_nouns(count, 'chunk')} {compression}")
@@ -275,10 +303,11 @@ def _compose_file(file: JsonObject) -> Iterator[Block]:
         ratio = file["unpacked_bytes"] / file["packed_bytes"]
     size = f"{_format_size(file['size_bytes'])}, {', '.join(chunks) or 'no chunks'}"
 
-    end = "finished"
+    state = "finished"
     if not file["finished"]:
-        end = f"cut off at byte {file['cut_off_at_byte']}"
-    yield from _compose_line("file", f"{name}: {size} ({ratio:.1f} : 1), {end}")
+        state = f"cut off at byte {file['cut_off_at_byte']}"
+    yield from _compose_line("file", f"{name}: {size} ({ratio:.1f} : 1), {state}")
+
     for damage in file["damaged"][:_MAX_GAPS]:
         span = f"byte {damage['offset']}, {count_nouns(damage['length'], 'byte')}"
         yield from _compose_line("", f"{span}: {damage['problem']}")
@@ -300,9 +329,12 @@ def _tabulate(
         rows: Values of each row. None is printed as a dash.
         text_columns: Number of columns at the left that have texts. The others have numbers.
     """
-    cells = [["-" if value is None else str(value) for value in row] for row in rows]
+    text_rows = []
+    for row in rows:
+        texts = ["-" if value is None else str(value) for value in row]
+        text_rows.append(texts)
     yield ""
-    yield TextTable(headers, cells, align="l" * text_columns + "r")
+    yield TextTable(headers, text_rows, align="l" * text_columns + "r")
 
 
 def _format_counts(channel: JsonObject) -> list[object]:

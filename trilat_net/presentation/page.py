@@ -54,6 +54,9 @@ def write_report(
 ) -> list[Path]:
     """Writes report.html and summary.json into a folder.
 
+    The page shows the results of a run to people, and the JSON file has the same numbers for
+    programs.
+
     Args:
         log: Log of the run.
         folder: Folder of both files. It is created if it does not exist.
@@ -116,10 +119,10 @@ def render_report(
     scenario = log.scenario
     builder = ChartBuilder(log, twin)
     data, missing = builder.build()
-    groups = {
-        place: render_chart_groups(log, place, data.charts, missing)
-        for place in ("motion", "links", "loops")
-    }
+    chart_groups = {}
+    for place in ("motion", "links", "loops"):
+        chart_groups[place] = render_chart_groups(log, place, data.charts, missing)
+
     return render_template(
         "report.html",
         name=scenario.name,
@@ -131,12 +134,12 @@ def render_report(
         checks=render_checks(verdicts, facts),
         numbers=render_key_numbers(log, facts),
         overview=render_overview(log, builder, data.charts),
-        motion=_render_motion(groups["motion"]),
+        motion=_render_motion(chart_groups["motion"]),
         timeline=render_timeline(log, facts),
-        links=render_links(log, facts, groups["links"]),
+        links=render_links(log, facts, chart_groups["links"]),
         sites=render_sites(log, facts),
         reasons=reasons,
-        loops=render_loops(log, facts, groups["loops"]),
+        loops=render_loops(log, facts, chart_groups["loops"]),
         origin=render_origin(log, facts, _read_asset("uPlot-LICENSE")),
         data=data.to_builtins(),
         css=_read_asset("theme.css") + _read_asset("report.css"),
@@ -165,15 +168,15 @@ def _render_motion(charts: Markup) -> Markup:
 
 
 def _render_site_css(scenario: Scenario) -> Markup:
-    """Returns the CSS rules for the colours of the sites, in the colours of `theme.css`.
+    """Returns the CSS rules for the colours of the sites (arms), which `theme.css` defines.
 
     The site with index i has the classes `site-i`, for lines in its colour, and `fill-i`, for
     areas in its colour. Colours repeat if there are more sites than colours.
     """
-    colours = scenario.assign_colours(len(SITE_COLOURS))
+    colour_numbers = scenario.assign_colours(len(SITE_COLOURS))
     rules = ""
     for index in range(len(scenario.sites)):
-        value = f"var(--site-{colours[index % len(colours)]})"
-        rules += f".site-{index} {{ stroke: {value}; }} "
-        rules += f".fill-{index} {{ background: {value}; fill: {value}; }}\n"
+        css_colour = f"var(--site-{colour_numbers[index % len(colour_numbers)]})"
+        rules += f".site-{index} {{ stroke: {css_colour}; }} "
+        rules += f".fill-{index} {{ background: {css_colour}; fill: {css_colour}; }}\n"
     return Markup(rules)

@@ -61,9 +61,10 @@ _BALANCE_NOTE = (
 
 
 def render_certificate(log: Log, certificate: Certificate) -> Markup:
-    """Renders the section about stability: the reasons, and folded tables and figures.
+    """Renders the section of the report that explains why a run was judged as stable or not.
 
-    The judgement itself stands at the beginning of the page.
+    It has the reasons as sentences, and tables and figures that a reader can unfold. The
+    judgement itself stands at the beginning of the page.
 
     Args:
         log: Log of the run.
@@ -80,24 +81,29 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
     ]
     body = render_macro("certificate.html", "grounds", lines=lines)
     folds = []
+
     if certificate.premises:
         premises = _render_premises(certificate)
         folds.append(
             render_details("What the theorem requires, and whether it holds here", premises)
         )
+
     if certificate.balance is not None:
         energies = list_energies(certificate.balance)
         rows = [(name, f"{energy_j:.4g}") for name, energy_j in energies]
         table = render_table({"energy": "", "J": "energy over the whole run"}, rows)
         note = render_note(_BALANCE_NOTE)
         folds.append(render_details("Energy balance", table + note))
+
     figures = _draw_certificate(log, certificate)
     if figures:
         pictures = Markup().join(_render_picture(title, figure) for title, figure in figures)
         names = ", ".join(title for title, _ in figures)
         folds.append(render_details(f"Figures: {names}", pictures))
+
     folds.append(render_details("Symbols on this page", render_facts(_SYMBOLS)))
     body += render_folds(folds)
+
     intro = (
         "✓ speaks for stability, ✗ against it, ? decides nothing, · is a remark or does not "
         "apply (`trilat certify --all`)."
@@ -125,11 +131,11 @@ def _render_premises(certificate: Certificate) -> Markup:
 
 
 def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:
-    """Draws the figures of a certificate.
+    """Draws the figures that show why a run was judged as stable or not.
 
-    Which figures exist depends on the evidence of the certificate: the energy function of the
-    stability proof and its energies, the energies that the control laws declare, and twins,
-    which are repeated runs with a small push that grows or decays.
+    Which figures exist depends on the evidence: the energy function of the stability proof,
+    energies that the control laws record themselves, and repetitions of the run with a small
+    push (twins), which grows or decays.
 
     Returns:
         Title and figure of each.
@@ -138,9 +144,8 @@ def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Fig
     twins = certificate.twins
     figures = []
     if certificate.balance is not None:
-        figures.append(
-            ("V, the energy of the theorem, and its parts", draw_functional(log, certificate))
-        )
+        title = "V, the energy of the theorem, and its parts"
+        figures.append((title, draw_functional(log, certificate)))
     if observed is not None and observed.curves:
         title = "energies that the laws declare"
         figures.append((title, draw_observed_energy(log, observed)))

@@ -45,7 +45,9 @@ _ARM_NOTE = (
 
 
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
-    """Renders the moving arms, who leads, the error over time and the delay over time.
+    """Renders the first view of the report: the moving arms, who leads, errors and delays.
+
+    Somebody who opens the page should understand the run without reading further.
 
     Args:
         log: Log of the run.
@@ -57,10 +59,13 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
     if has_records:
         html += render_macro("charts.html", "arm_player")
         html += render_lead_bars(log, builder.leads)
-        html += render_note(" ".join([*describe_leads(log, builder.leads), _ARM_NOTE]))
-    absent = [site for site in log.sites if not len(log[site])]
-    if absent:
-        html += render_note(f"Not drawn, because there is no record: {', '.join(absent)}.")
+        sentences = [*describe_leads(log, builder.leads), _ARM_NOTE]
+        html += render_note(" ".join(sentences))
+
+    empty_sites = [site for site in log.sites if not len(log[site])]
+    if empty_sites:
+        html += render_note(f"Not drawn, because there is no record: {', '.join(empty_sites)}.")
+
     if any(chart.section == "overview" for chart in charts):
         html += render_macro("charts.html", "charts", section="overview", is_small=False)
     if has_records:
@@ -73,7 +78,9 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
 def render_chart_groups(
     log: Log, place: str, charts: Sequence[Chart], missing: Mapping[str, Sequence[str]]
 ) -> Markup:
-    """Renders the groups of charts of a place, and a note about the charts that the page lacks.
+    """Renders a section's groups of charts, and a note about the charts that the page lacks.
+
+    At first only a limited number of charts is unfolded, so that the page is quick to draw.
 
     Args:
         log: Log of the run.
@@ -86,31 +93,35 @@ def render_chart_groups(
         "torques": explain_absent_operator(log),
         "timing": explain_missing_loop_times(log),
     }
-    rendered = []
-    lacking: dict[str, list[str]] = {}  # titles by the reason
-    unfolded = 0
+
+    rendered_groups = []
+    missing_by_reason: dict[str, list[str]] = {}  # titles by the reason
+    unfolded_count = 0
     for section, (heading, note) in _TEXTS[place].items():
         name = f"{heading[0].lower()}{heading[1:]}"
+
         count = sum(chart.section == section for chart in charts)
         if count:
             is_small = has_chains and section == "estimates"
             text = _TEXTS["notes"]["chain_estimates"] if is_small else note
-            fits = unfolded + count <= _MOST_OPEN_CHARTS
+            fits = unfolded_count + count <= _MOST_OPEN_CHARTS
             is_open = section in _OPEN_SECTIONS and fits
-            unfolded += count if is_open else 0
-            rendered.append(_render_group(section, heading, text, count, is_open, is_small))
-            lacking.setdefault(_NO_VALUE, []).extend(missing.get(section, ()))
+            unfolded_count += count if is_open else 0
+            rendered_groups.append(
+                _render_group(section, heading, text, count, is_open, is_small)
+            )
+            missing_by_reason.setdefault(_NO_VALUE, []).extend(missing.get(section, ()))
         elif absence_reasons.get(section):
-            lacking.setdefault(absence_reasons[section], []).append(name)
+            missing_by_reason.setdefault(absence_reasons[section], []).append(name)
         elif section in missing:
-            lacking.setdefault(_NO_VALUE, []).append(name)
+            missing_by_reason.setdefault(_NO_VALUE, []).append(name)
 
     groups = Markup()
-    if rendered:
-        groups = render_macro("charts.html", "groups", groups=rendered)
+    if rendered_groups:
+        groups = render_macro("charts.html", "groups", groups=rendered_groups)
     if place == "loops":  # the section of the loops says itself what is missing
         return groups
-    for reason, titles in lacking.items():
+    for reason, titles in missing_by_reason.items():
         if titles:
             groups += render_note(f"Not on this page, because {reason}: {'; '.join(titles)}.")
     return groups

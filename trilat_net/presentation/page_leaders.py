@@ -78,9 +78,9 @@ def caption_site(scenario: Scenario, site: str) -> str:
 
 
 def trace_leads(log: Log) -> list[_Lead]:
-    """Traces with which weights each slave follows its peers over the run.
+    """Returns who leads each slave arm over the run: the weights with which it follows others.
 
-    The bars, the sentences and the slider of the page use the same data.
+    The bars, the sentences and the slider of the page use these data.
 
     Args:
         log: Log of the run.
@@ -89,8 +89,8 @@ def trace_leads(log: Log) -> list[_Lead]:
         An entry for each slave with records that follows somebody, for at most `_MAX_BARS`.
     """
     leads = []
-    for site, spec in log.scenario.sites.items():
-        if spec.role == "slave" and len(log[site]):
+    for site, site_settings in log.scenario.sites.items():
+        if site_settings.role == "slave" and len(log[site]):
             lead = _trace_lead(log, site)
             if lead.peers:
                 leads.append(lead)
@@ -98,20 +98,28 @@ def trace_leads(log: Log) -> list[_Lead]:
 
 
 def _trace_lead(log: Log, slave: str) -> _Lead:
-    """Traces the dominance factors of a slave, at the points at which their slopes change."""
+    """Returns the weights (dominance factors) with which a slave follows its peers over time.
+
+    The points are those at which the slopes of the weights change, so that straight lines
+    between them show the whole course.
+    """
     end_s = recorded_end_s(log)
     _, ramps = list_ramps(log, slave)
+
+    # Candidates: equal steps, and the begin and the end of each ramp. A point just before the
+    # begin shows a jump as a vertical line.
     times_s = [np.linspace(0.0, end_s, _INSTANTS)]
     for ramp in ramps:
         start_s = ramp.start_ns * 1e-9
         times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
     t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
-    alpha = trace_dominance(log, slave, t_s).alpha
-    followed = np.flatnonzero(alpha.max(axis=0) > 0.0)
-    shares = alpha[:, followed]
-    kept = _find_corners(t_s, shares)
+
+    factors = trace_dominance(log, slave, t_s).alpha
+    followed = np.flatnonzero(factors.max(axis=0) > 0.0)
     peers = [log.scenario.peers(slave)[index] for index in followed]
-    return _Lead(slave, peers, t_s[kept], shares[kept])
+    factors_of_followed = factors[:, followed]
+    corners = _find_corners(t_s, factors_of_followed)
+    return _Lead(slave, peers, t_s[corners], factors_of_followed[corners])
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
@@ -126,7 +134,9 @@ def _find_corners(t_s: Array, shares: Array) -> list[int]:
 
 
 def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
-    """Returns the data with which the page writes who leads at the time of the slider.
+    """Returns the data from which a script of the page states who leads at a chosen time.
+
+    Slaves whose weights never change are left out, because a sentence describes them.
 
     Args:
         leads: Who leads each slave, from `trace_leads`.
@@ -167,7 +177,9 @@ def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
 
 
 def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
-    """Returns a sentence about factors that never change: who leads, with which percentages.
+    """Returns a sentence that says who leads a slave whose weights never change.
+
+    For example: "m1 leads the slave with 80 % and m2 with 20 %, during the whole run."
 
     Args:
         scenario: Scenario of the run.
@@ -177,10 +189,10 @@ def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
     first, *others = lead.peers
     if not others:
         return f"{first} alone leads {slave}, during the whole run."
-    texts = [f"{first} leads {slave} with {_format_percent(lead.shares[0, 0])}"]
-    for peer, share in zip(others, lead.shares[0, 1:], strict=True):
-        texts.append(f"{peer} with {_format_percent(share)}")
-    return f"{join_words(texts)}, during the whole run."
+    phrases = [f"{first} leads {slave} with {_format_percent(lead.shares[0, 0])}"]
+    for peer, factor in zip(others, lead.shares[0, 1:], strict=True):
+        phrases.append(f"{peer} with {_format_percent(factor)}")
+    return f"{join_words(phrases)}, during the whole run."
 
 
 def describe_phases(lead: _Lead) -> str:
@@ -192,34 +204,48 @@ def describe_phases(lead: _Lead) -> str:
     Args:
         lead: Who leads the slave.
     """
-    phases = []
-    start = 0
+    phase_texts = []
+    first_point = 0
     for index in range(1, len(lead.t_s) + 1):
         is_last = index == len(lead.t_s)
-        if not is_last and np.abs(lead.shares[index] - lead.shares[start]).max() <= _SAME_SHARE:
-            continue
-        if index - 1 > start:  # a span, not a point within or between ramps
-            from_s = lead.t_s[start]
+        if not is_last:
+            change = np.abs(lead.shares[index] - lead.shares[first_point]).max()
+            if change <= _SAME_SHARE:
+                continue  # the phase of constant shares continues
+
+        is_longer_than_a_point = index - 1 > first_point  # otherwise within a ramp
+        if is_longer_than_a_point:
+            from_s = lead.t_s[first_point]
             to_s = lead.t_s[index - 1]
             span = f"from {from_s:.4g} s" if is_last else f"{from_s:.4g} to {to_s:.4g} s"
-            phases.append(f"{span}: {_list_shares(lead, start)}")
-        start = index
-    if not phases:
+            phase_texts.append(f"{span}: {_list_shares(lead, first_point)}")
+        first_point = index
+
+    if not phase_texts:
         end = len(lead.t_s) - 1
-        phases = [f"at first {_list_shares(lead, 0)}", f"at the end {_list_shares(lead, end)}"]
-    if len(phases) > _MAX_PHASES:
-        others = len(phases) - _MAX_PHASES
-        phases = [*phases[:_MAX_PHASES], f"and {others} more"]
-    return "; ".join(phases)
+        phase_texts = [
+            f"at first {_list_shares(lead, 0)}",
+            f"at the end {_list_shares(lead, end)}",
+        ]
+
+    if len(phase_texts) > _MAX_PHASES:
+        unlisted_count = len(phase_texts) - _MAX_PHASES
+        phase_texts = [*phase_texts[:_MAX_PHASES], f"and {unlisted_count} more"]
+    return "; ".join(phase_texts)
 
 
 def _render_bar(log: Log, lead: _Lead) -> Markup:
-    """Returns the bar of a slave: an area for each peer, with its share as the height."""
+    """Returns a bar that shows over time how much a slave follows each of its peers, as SVG.
+
+    The areas of the peers are stacked. The height of an area is the weight of its peer, and the
+    areas together fill the bar.
+    """
     end_s = recorded_end_s(log)
     tops = 1.0 - np.cumsum(lead.shares, axis=1)
     bottoms = tops + lead.shares
     peers = []
     for column, peer in enumerate(lead.peers):
+        # The outline of an area runs along its upper edge and back along its lower edge.
         upper = _list_points(lead.t_s, tops[:, column])
         lower = _list_points(lead.t_s[::-1], bottoms[::-1, column])
         points = " ".join([*upper, *lower])

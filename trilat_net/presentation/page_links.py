@@ -93,34 +93,48 @@ def render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mark
         render_details(heading, ages),
         render_details("Samples sent, lost and superseded", _render_samples(log, facts)),
     ]
+
     clocks = _render_clocks(log, facts)
     if clocks:
         folds.append(render_details("Clocks of the senders, seen by the receivers", clocks))
+
     body = render_folds(folds) + charts
     return render_section("Links", _summarise_links(facts), body, "links")
 
 
 def _summarise_links(facts: JsonObject) -> str:
-    """Returns a sentence about the stated delays, the ages in use, and the losses."""
+    """Returns a sentence about the communication: stated delays, ages of messages, and losses.
+
+    For example: "Every link has the delay model ...; the controllers used samples that were 400
+    to 402 ms old, and no sample was lost."
+    """
     links: dict[str, JsonObject] = facts["links"]
-    models = {model["link"] for link in links.values() for model in link["stated"]}
-    stated = f"{count_nouns(len(links), 'link')} with {len(models)} different delay models"
+    models: set[str] = set()
+    for link in links.values():
+        models |= {model["link"] for model in link["stated"]}
+    stated_text = f"{count_nouns(len(links), 'link')} with {len(models)} different delay models"
     if len(models) == 1:
-        stated = f"Every link has the delay model “{typeset(*models)}”"
+        stated_text = f"Every link has the delay model “{typeset(*models)}”"
+
     ages_ms = [link["age_ms"] for link in links.values() if link["age_ms"]["max"] is not None]
     if not ages_ms:
-        return f"{stated}; no sample came into use."
-    least_ms = format_cell(min(age["min"] for age in ages_ms))
-    most_ms = format_cell(max(age["max"] for age in ages_ms))
-    used = f"the controllers used samples that were {least_ms} to {most_ms} ms old"
-    if least_ms == most_ms:
-        used = f"the controllers used samples that were {most_ms} ms old"
-    losses = {name: link["loss"] for name, link in links.items() if link["loss"]}
-    if not losses:
-        return f"{stated}; {used}, and no sample was lost."
-    worst = max(losses, key=lambda name: losses[name])
-    share = format_cell(to_percent(losses[worst]))
-    return f"{stated}; {used}, and up to {share} % were lost (on {typeset(worst)})."
+        return f"{stated_text}; no sample came into use."
+    youngest_ms = format_cell(min(age["min"] for age in ages_ms))
+    oldest_ms = format_cell(max(age["max"] for age in ages_ms))
+    used_text = f"the controllers used samples that were {youngest_ms} to {oldest_ms} ms old"
+    if youngest_ms == oldest_ms:
+        used_text = f"the controllers used samples that were {oldest_ms} ms old"
+
+    loss_by_link = {name: link["loss"] for name, link in links.items() if link["loss"]}
+    if not loss_by_link:
+        return f"{stated_text}; {used_text}, and no sample was lost."
+
+    worst_link = max(loss_by_link, key=lambda name: loss_by_link[name])
+    lost_percent = format_cell(to_percent(loss_by_link[worst_link]))
+    return (
+        f"{stated_text}; {used_text}, and up to {lost_percent} % were lost "
+        f"(on {typeset(worst_link)})."
+    )
 
 
 def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
@@ -131,16 +145,18 @@ def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
     """
     rows = []
     for name, link in facts["links"].items():
-        first, *later = link["stated"]
-        models = [first["link"]]
-        models += [f"from {change['from_s']:g} s: {change['link']}" for change in later]
-        stated = render_macro(
-            "origin.html", "stated_delays", models=[typeset(model) for model in models]
+        first_model, *later_models = link["stated"]
+        model_texts = [first_model["link"]]
+        model_texts += [
+            f"from {change['from_s']:g} s: {change['link']}" for change in later_models
+        ]
+        stated_cell = render_macro(
+            "origin.html", "stated_delays", models=[typeset(model) for model in model_texts]
         )
 
-        values = [link["age_ms"][key] for key in _AGE_KEYS]
-        values += [to_percent(link["ticks_without_new"]), link["silence_ms"]]
-        rows.append([label_link(log, name), stated, *map(format_cell, values)])
+        numbers = [link["age_ms"][key] for key in _AGE_KEYS]
+        numbers += [to_percent(link["ticks_without_new"]), link["silence_ms"]]
+        rows.append([label_link(log, name), stated_cell, *map(format_cell, numbers)])
     return rows
 
 
@@ -157,19 +173,21 @@ def _render_samples(log: Log, facts: JsonObject) -> Markup:
     rows = []
     for name, link in links.items():
         counts: JsonObject = link["samples"] or {}
-        values = [counts.get(key) for key in _SAMPLE_COLUMNS]
-        values += [to_percent(link["loss"]), link["burst"]]
+        numbers = [counts.get(key) for key in _SAMPLE_COLUMNS]
+        numbers += [to_percent(link["loss"]), link["burst"]]
         if is_measured:
             one_way_us = link["one_way_us"] or {}
             clock = link["clock"] or {}
-            values += [one_way_us.get(key) for key in ("min", "p50", "p99", "max")]
-            values.append(clock.get("bound_p50_us"))
-        rows.append([label_link(log, name), *map(format_cell, values)])
+            numbers += [one_way_us.get(key) for key in ("min", "p50", "p99", "max")]
+            numbers.append(clock.get("bound_p50_us"))
+        rows.append([label_link(log, name), *map(format_cell, numbers)])
     return render_table(columns, rows) + render_legend(columns)
 
 
 def _render_clocks(log: Log, facts: JsonObject) -> Markup:
     """Returns the table that compares the clock of each sender with that of the receiver.
+
+    Measured one-way delays are only as accurate as this comparison.
 
     Returns:
         HTML of the table. Empty if all sites read the same clock.
@@ -184,5 +202,6 @@ def _render_clocks(log: Log, facts: JsonObject) -> Markup:
             rows.append([label_link(log, name), *cells])
     if not rows:
         return Markup()
+
     columns = {"clock of the sender": "", **dict(_CLOCK_COLUMNS.values())}
     return render_table(columns, rows) + render_legend(columns)

@@ -98,15 +98,14 @@ def describe_changes(scenario: Scenario) -> str:
     shipped = load_scenario(scenario.name)
     if shipped.title != scenario.title:
         return ""
-    differences = [
-        difference
-        for difference in compare_scenarios([shipped, scenario])
-        if difference.key not in _STATED_KEYS
-    ]
+
+    all_differences = compare_scenarios([shipped, scenario])
+    differences = [entry for entry in all_differences if entry.key not in _STATED_KEYS]
     phrases = []
     for difference in differences[:_MAX_CHANGES]:
-        before, now = difference.values
-        phrases.append(f"{difference}: {now} instead of {before}")
+        shipped_value, value = difference.values
+        phrases.append(f"{difference}: {value} instead of {shipped_value}")
+
     if len(differences) > _MAX_CHANGES:
         phrases.append(f"and {count_nouns(len(differences) - _MAX_CHANGES, 'more setting')}")
     return "; ".join(phrases)
@@ -125,7 +124,10 @@ def _render_assumptions(scenario: Scenario) -> Markup:
 
 
 def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
-    """Returns the facts about the recording, such as its length and its missing records."""
+    """Returns the facts about a recording for a table, such as its length and missing records.
+
+    Each fact is a heading and a text.
+    """
     scenario = log.scenario
     records = f"{facts['records']}, {facts['missing']} missing"
     if not log.complete:
@@ -143,14 +145,19 @@ def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
 
 
 def _describe_driver(log: Log) -> str:
-    """Returns how the run was executed: in virtual time, as a rerun, or as a live session."""
+    """Returns how a run was executed: simulated, repeated from another log, or live.
+
+    A live session has the time of its start ("epoch").
+    """
     session = log.session
     if log.driver == "virtual":
         return "simulated in virtual time"
+
     if log.driver == "rerun":
         source = session.get("rerun_of", "") or "a log"
         sites = session.get("rerun_executed", "").replace(" ", ", ")
         return f"rerun of {source}: {sites} executed afresh"
+
     epoch_s = int(session.get("epoch_unix_ns", "0")) // 10**9
     epoch = datetime.fromtimestamp(epoch_s, UTC)
     return f"live, session {session.get('session', '')}, epoch {epoch:%Y-%m-%d %H:%M:%S} UTC"
@@ -169,7 +176,7 @@ def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
 
 
 def _list_commands(log: Log, scenario: str) -> str:
-    """Returns the commands that verify and repeat the run, a line each.
+    """Returns the commands with which a reader can check and repeat the run, a line each.
 
     Args:
         log: Log of the run.
@@ -178,10 +185,13 @@ def _list_commands(log: Log, scenario: str) -> str:
     file_name = Path(log.source).name
     if not file_name.endswith(".mcap"):
         file_name = "FILE"  # the log was not read from a file
+
+    # Commands execute a user's Python code only if the user permits each file.
     permissions = [f" --law {shlex.quote(file)}" for file in _list_law_files(log.scenario)]
     log_argument = file_name + "".join(permissions)
+
     commands = [f"trilat verify {log_argument}", f"trilat verify --virtual {log_argument}"]
-    if scenario.endswith(".toml"):
+    if scenario.endswith(".toml"):  # the scenario is not shipped, and must be written first
         commands.append(f"trilat scenario show {file_name} > {scenario}")
     commands.append(f"trilat sim {scenario}")
     return "\n".join(commands)
@@ -200,20 +210,25 @@ def _list_law_files(scenario: Scenario) -> list[str]:
 
 
 def _list_versions(log: Log) -> list[tuple[str, str]]:
-    """Returns the software and the machine that recorded the log."""
+    """Returns the software and the machine that recorded a log, as pairs of a name and a text.
+
+    The fingerprint of the arithmetic tells whether another machine computes the same last
+    digits.
+    """
     session = log.session
     commit = session.get("commit", "unknown")
     if session.get("commit_dirty") == "true":
         commit += " with changes"
     platform = session.get("platform", "unknown")
     python = session.get("python", "unknown")
-    facts = [
+    entries = [
         ("commit", commit),
         ("fingerprint of arithmetic", session.get("fingerprint", "unknown")),
         ("platform", f"{platform}, {python}"),
     ]
+
     prefix = "version_"
     for key, version in session.items():
         if key.startswith(prefix):
-            facts.append((key.removeprefix(prefix), version))
-    return facts
+            entries.append((key.removeprefix(prefix), version))
+    return entries

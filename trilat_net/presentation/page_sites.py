@@ -46,6 +46,9 @@ _ANGLE_COLUMNS = {
 def render_sites(log: Log, facts: JsonObject) -> Markup:
     """Renders the section with the records and the motion of each site, as tables.
 
+    A reader sees there how well each arm followed the others, and how hard its controller
+    worked.
+
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.
@@ -62,20 +65,24 @@ def render_sites(log: Log, facts: JsonObject) -> Markup:
         "max |τ| (N\u00a0m)": "largest control torque",
         "ticks at the limit": "ticks with a torque at tau_limit_nm",
     }
+
     rows = []
     angle_rows = []
     for name in log.sites:
         site: JsonObject = facts["sites"][name]
         label = label_site(log, name)
         counts = [str(site["records"]), str(site["missing"])]
-        rows.append([label, *counts, *(format_cell(site[key]) for key in _MOTION_KEYS)])
+        motion_cells = [format_cell(site[key]) for key in _MOTION_KEYS]
+        rows.append([label, *counts, *motion_cells])
+
         end_angles = format_numbers(site["q_end_rad"])
-        moved = format_numbers(site["hands_moved_max_rad"])
-        angle_rows.append([label, end_angles, moved])
+        moved_angles = format_numbers(site["hands_moved_max_rad"])
+        angle_rows.append([label, end_angles, moved_angles])
 
     table = render_table(columns, rows)
     is_open = len(rows) <= _MOST_OPEN_ROWS
     errors = render_details("Errors and torques, by site", table, is_open=is_open)
+
     angles = render_table(_ANGLE_COLUMNS, angle_rows, text_columns=(1, 2))
     angles += render_legend(_ANGLE_COLUMNS)
     summary = "Where the arms ended, and how far operators moved them"
@@ -103,9 +110,9 @@ _LOOP_COLUMNS = {
 
 
 def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
-    """Renders the section with the timing of each site's control loop.
+    """Renders the section of the report about the timing of each site's control loop.
 
-    It shows how punctual the ticks were, and how long they took to compute.
+    It shows how punctual the ticks (control periods) were, and how long they took to compute.
 
     Args:
         log: Log of the run.
@@ -115,26 +122,31 @@ def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mark
     reason = explain_missing_loop_times(log)
     if reason:
         return render_section("Loop timing", f"Not measured: {reason}.", Markup(), "loops")
+
     rows = []
-    overruns = 0
-    skipped = 0
-    worst_us = 0.0
+    overrun_count = 0
+    skipped_count = 0
+    largest_lateness_us = 0.0
     for name in log.sites:
         site: JsonObject = facts["sites"][name]
-        late = site["late_us"]
-        values = [late[key] for key in ("p50", "p99", "p99_9", "max")]
-        values += [site["busy_us"][key] for key in ("p50", "p99", "max")]
-        values += [site["overruns"], site["skipped"]]
-        cells = [NO_NUMBER if value is None else f"{value:.0f}" for value in values]
+        lateness_us = site["late_us"]
+        numbers = [lateness_us[key] for key in ("p50", "p99", "p99_9", "max")]
+        numbers += [site["busy_us"][key] for key in ("p50", "p99", "max")]
+        numbers += [site["overruns"], site["skipped"]]
+
+        cells = [NO_NUMBER if value is None else f"{value:.0f}" for value in numbers]
         rows.append([label_site(log, name), *cells])
-        overruns += site["overruns"] or 0
-        skipped += site["skipped"]
-        worst_us = max(worst_us, late["max"] or 0.0)
+
+        overrun_count += site["overruns"] or 0
+        skipped_count += site["skipped"]
+        largest_lateness_us = max(largest_lateness_us, lateness_us["max"] or 0.0)
+
+    verb = "was" if overrun_count == 1 else "were"
     intro = (
-        f"The latest tick began {worst_us / 1e3:.3g} ms after it was due; "
-        f"{count_nouns(overruns, 'tick')} began a period or more late and "
-        f"{'was' if overruns == 1 else 'were'} made all the same; "
-        f"{count_nouns(skipped, 'tick was', 'ticks were')} skipped."
+        f"The latest tick began {largest_lateness_us / 1e3:.3g} ms after it was due; "
+        f"{count_nouns(overrun_count, 'tick')} began a period or more late and "
+        f"{verb} made all the same; "
+        f"{count_nouns(skipped_count, 'tick was', 'ticks were')} skipped."
     )
     table = render_table(_LOOP_COLUMNS, rows) + render_legend(_LOOP_COLUMNS)
     body = render_details("Lateness and computing time, by loop", table) + charts

@@ -80,6 +80,8 @@ The clause about a run that converged has numbers, see `_explain_end`.
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
     """Renders the judgement whether the run was stable, with what the judgement rests on.
 
+    The page of a run begins with this judgement.
+
     Args:
         log: Log of the run.
         certificate: The judgement, with its reasons.
@@ -95,17 +97,22 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
             explanation="",
             remarks="",
         )
+
     word = certificate.stability.value
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
+
     if certificate.stability is Stability.STABLE and _is_proved_by_roots_alone(certificate):
-        pace = describe_pace(certificate)
-        if pace:
-            sentences.append(f"{_start_sentence(pace)}.")
+        decay_rate = describe_pace(certificate)
+        if decay_rate:
+            sentences.append(f"{_start_sentence(decay_rate)}.")
         sentences.append(_ROOTS_AND_THEOREM)
-    if any(finding.judged and not finding.passed for finding in findings):
+
+    has_failed_check = any(finding.judged and not finding.passed for finding in findings)
+    if has_failed_check:
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so that the judgement may be wrong.")
+
     remarks = [f"{_start_sentence(remark)}." for remark in certificate.remarks]
     return render_macro(
         "summary.html",
@@ -135,7 +142,10 @@ def _is_proved_by_roots_alone(certificate: Certificate) -> bool:
 
 
 def describe_basis(certificate: Certificate) -> str:
-    """Returns a sentence that says what a judgement means, and what it rests on.
+    """Returns a sentence that says what a judgement about stability means and rests on.
+
+    A simulation and a live session, or a proof and an observation, support a judgement to
+    different degrees.
 
     Args:
         certificate: The judgement, with its reasons.
@@ -144,14 +154,18 @@ def describe_basis(certificate: Certificate) -> str:
     if certificate.end.behaviour is EndBehaviour.DIVERGED:
         return f"The run {decision.rests_on}."
     meaning = _explain_word(certificate)
+
     if decision.stability is Stability.STABLE:
         basis = decision.rests_on.replace("; ", ", and ")
         return f"{meaning}: {basis}."
     if decision.stability is not Stability.OPEN:
         return f"{meaning} – {decision.rests_on}."
-    reason, *others = [text for text in (decision.rests_on, *decision.reasons) if text]
-    more = f" ({count_nouns(len(others), 'more reason')} below)" if others else ""
-    return f"{meaning} – {reason}{more}."
+    # The judgement is open. The first reason is stated, and the others are counted.
+    reason, *other_reasons = [text for text in (decision.rests_on, *decision.reasons) if text]
+    count_text = (
+        f" ({count_nouns(len(other_reasons), 'more reason')} below)" if other_reasons else ""
+    )
+    return f"{meaning} – {reason}{count_text}."
 
 
 def _explain_word(certificate: Certificate) -> str:
@@ -162,22 +176,27 @@ def _explain_word(certificate: Certificate) -> str:
 
 
 def _explain_end(log: Log, certificate: Certificate) -> str:
-    """Returns how the record ends, and why that does not contradict the judgement.
+    """Returns how the motion ends, and why that does not contradict the judgement of the run.
 
-    The judgement is about the loop: whether disturbances of its motion die away. The record may
-    end with errors that stay, or with motion that has not yet died away.
+    The judgement is about the loop: whether disturbances of its motion die away. A stable run
+    may end with errors that stay, for example because an operator still pushes. Without an
+    explanation, a reader might take the judgement for wrong.
     """
     end = certificate.end
     if end.missing_sites:
         return f"There is no record of {join_words(end.missing_sites)}."
     stability = certificate.stability
     is_stable = stability in (Stability.STABLE, Stability.SETTLED)
-    remains = end.end_error_rad > SETTLED_ERROR_RAD
+    error_remains = end.end_error_rad > SETTLED_ERROR_RAD
     has_converged = end.behaviour is EndBehaviour.CONVERGED
+
+    # How the motion ends.
     if has_converged:
-        clause = f"no joint was faster than {end.end_speed_rad_s:.2g} rad/s"
-        largest = f"no error was above {end.end_error_rad:.2g} {end.error_unit}"
-        clause = f"{clause}, and errors stay" if remains else f"{clause}, and {largest}"
+        speed_text = f"no joint was faster than {end.end_speed_rad_s:.2g} rad/s"
+        error_text = f"no error was above {end.end_error_rad:.2g} {end.error_unit}"
+        if error_remains:
+            error_text = "errors stay"
+        clause = f"{speed_text}, and {error_text}"
     elif is_stable and end.behaviour is EndBehaviour.UNDECIDED:
         clause = "the motion alone decided nothing, and the evidence above does not need it"
     else:
@@ -186,13 +205,14 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     if end.behaviour is EndBehaviour.DIVERGED:
         text = f"The record ends soon after {clause}."
 
+    # Why the end and the judgement are both true.
     if is_stable and end.stability is Stability.NOT_STABLE:
         return f"{text} The proof and the pushes show that such motion dies away."
-    if is_stable and remains:
+    if is_stable and error_remains:
         cause = _explain_remaining_error(log)
         meaning = f"{stability.capitalize()} means that disturbances die away"
         return f"{text} {meaning}, not that errors vanish{cause}."
-    if stability is Stability.NOT_STABLE and not remains:
+    if stability is Stability.NOT_STABLE and not error_remains:
         if end.stability is Stability.SETTLED:
             return f"{text} This motion is small, but grows from small disturbances."
         return f"{text} All errors were small then, but they do not die away."
@@ -249,7 +269,7 @@ def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
 
 
 def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
-    """Finds the largest |e| of a run, of all joints.
+    """Returns the largest error |e| of any joint in a run, with its joint and time.
 
     Args:
         log: Log of the run.
@@ -259,15 +279,16 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
         The first record with this error. None if no record has a finite error.
     """
     peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
-    known = [peak for peak in peaks if peak is not None]
-    return max(known, key=lambda peak: peak.value, default=None)
+    known_peaks = [peak for peak in peaks if peak is not None]
+    return max(known_peaks, key=lambda peak: peak.value, default=None)
 
 
 def _list_error_cards(log: Log) -> list[_KeyNumber]:
-    """Returns the errors of the slaves, and then those of the masters.
+    """Returns the key numbers about errors, for the slaves and then for the masters.
 
-    The error of a slave says how well the remote arm follows the people. The error of a master
-    is large while its operator leads the others, and says nothing about how well they follow.
+    A slave is a remote arm, and a master is an arm that a person moves. The error of a slave
+    says how well it follows the people. The error of a master is large while its operator leads
+    the others, and says nothing about how well they follow.
     """
     slaves = [site for site in log.sites if log.scenario.sites[site].role == "slave"]
     masters = [site for site in log.sites if site not in slaves]
@@ -281,7 +302,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 
 
 def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
-    """Returns the largest error of some sites, and their largest one in the last second.
+    """Returns the largest error of some sites, with their largest error in the last second.
 
     Args:
         log: Log of the run.
@@ -295,12 +316,13 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     detail = f"largest, of {peak.joint}, at {peak.t_s:.2f} s"
 
     last_errors = [JointError.find_in_last_second(log[site]) for site in sites]
-    known = [error for error in last_errors if error is not None]
-    last = max(known, key=lambda error: error.value, default=None)
-    if last is not None:
-        part = "in the last second" if log[last.site].t_s[-1] >= END_WINDOW_S else "in all"
-        detail += f"; {last.value:.3g} {unit} {part}, of {last.joint}"
-        if last.site in _list_pushed_sites(log):
+    known_errors = [error for error in last_errors if error is not None]
+    last_error = max(known_errors, key=lambda error: error.value, default=None)
+    if last_error is not None:
+        is_long_enough = log[last_error.site].t_s[-1] >= END_WINDOW_S
+        interval_text = "in the last second" if is_long_enough else "in all"
+        detail += f"; {last_error.value:.3g} {unit} {interval_text}, of {last_error.joint}"
+        if last_error.site in _list_pushed_sites(log):
             detail += ", which a hand or a wall still pushes"
     return _KeyNumber(f"{join_words(sites)} {place}", f"{peak.value:.3g} {unit}", detail)
 
@@ -318,20 +340,18 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumbe
     Returns:
         The number in a list. Empty if the distance is unknown.
     """
-    view = RunView(log)
+    run_view = RunView(log)
     unit = "rad" if shared_unit(log) == "rad" else "m"
-    errors = [
-        measure_undelayed_error(view, slave)[f"undelayed_max_{unit}"].value for slave in slaves
-    ]
-    known = [error for error in errors if error is not None]
-    if not known:
+    distances = []
+    for slave in slaves:
+        metrics = measure_undelayed_error(run_view, slave)
+        distances.append(metrics[f"undelayed_max_{unit}"].value)
+    known_distances = [distance for distance in distances if distance is not None]
+    if not known_distances:
         return []
     name = f"{join_words(slaves)} from where the masters are"
-    return [
-        _KeyNumber(
-            name, f"{max(known):.3g} {unit}", "largest at the same moment, delay included"
-        )
-    ]
+    value = f"{max(known_distances):.3g} {unit}"
+    return [_KeyNumber(name, value, "largest at the same moment, delay included")]
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
@@ -347,23 +367,28 @@ def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
 
 
 def _describe_delay(facts: JsonObject) -> _KeyNumber:
-    """Returns the mean age of the samples that the controllers used, and its range."""
+    """Returns the mean age of the samples that the controllers used, and its range.
+
+    The age of a sample is the delay that a controller experiences.
+    """
     ages_ms = [link["age_ms"] for link in facts["links"].values()]
     means_ms = [age["mean"] for age in ages_ms if age["mean"] is not None]
     if not means_ms:
         return _KeyNumber("Delay in use", NO_NUMBER, "no sample was used")
+
     mean_ms = f"{float(np.mean(means_ms)):.3g}"
-    least_ms = format_cell(min(age["min"] for age in ages_ms if age["min"] is not None))
-    most_ms = format_cell(max(age["max"] for age in ages_ms if age["max"] is not None))
-    links = count_nouns(len(means_ms), "link")
-    detail = f"mean of {links}; {least_ms} to {most_ms} ms"
-    if least_ms == most_ms:
-        detail = f"on {links}, always"
+    youngest_ms = format_cell(min(age["min"] for age in ages_ms if age["min"] is not None))
+    oldest_ms = format_cell(max(age["max"] for age in ages_ms if age["max"] is not None))
+    links_text = count_nouns(len(means_ms), "link")
+
+    detail = f"mean of {links_text}; {youngest_ms} to {oldest_ms} ms"
+    if youngest_ms == oldest_ms:
+        detail = f"on {links_text}, always"
     return _KeyNumber("Delay in use", f"{mean_ms} ms", detail)
 
 
 def render_alarms(log: Log) -> Markup:
-    """Renders the alarms of a run as a list in large type.
+    """Renders the alarms of a run, such as an emergency stop, as a list in large type.
 
     Faults and stops are the severe alarms. If there are any, only these are listed, because
     other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and the rest
@@ -378,16 +403,16 @@ def render_alarms(log: Log) -> Markup:
     alarms = list_alarms(log)
     if not alarms:
         return Markup()
-    severe = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
-    candidates = severe if severe else alarms
-    listed = candidates[:_MAX_ALARMS]
+    severe_alarms = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
+    candidates = severe_alarms if severe_alarms else alarms
+    listed_alarms = candidates[:_MAX_ALARMS]
 
     return render_macro(
         "summary.html",
         "alarms",
-        alarms=listed,
+        alarms=listed_alarms,
         severe_words=_SEVERE_ALARMS,
-        not_listed=len(alarms) - len(listed),
+        not_listed=len(alarms) - len(listed_alarms),
     )
 
 
@@ -395,8 +420,8 @@ def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
     """Renders the results of the checks of the log as one line, which unfolds into a list.
 
     Args:
-        findings: Results of the checks. A check that failed may also be one that could not be
-            judged, for example because the code of a user's law may not run here.
+        findings: Results of the checks. Some may be undecided, for example because the code of
+            a user's control law may not run here.
         facts: Numbers of the run, from `summarise_run`.
 
     Returns:
@@ -404,38 +429,45 @@ def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
     """
     if not findings:
         return Markup()
-    failed = [finding.check for finding in findings if finding.judged and not finding.passed]
-    withheld = [finding.check for finding in findings if not finding.judged]
+
+    failed_checks = [
+        finding.check for finding in findings if finding.judged and not finding.passed
+    ]
+    undecided_checks = [finding.check for finding in findings if not finding.judged]
     summary = f"✓ {_summarise_checks(findings, facts)}"
-    if failed:
-        summary = f"✗ Failed: {', '.join(failed)}"
-    elif withheld:
-        summary = f"? Not judged: {', '.join(withheld)}"
-    verdicts = render_macro("summary.html", "checks", findings=findings)
-    details = render_details(summary, verdicts, is_open=bool(failed))
+    if failed_checks:
+        summary = f"✗ Failed: {', '.join(failed_checks)}"
+    elif undecided_checks:
+        summary = f"? Not judged: {', '.join(undecided_checks)}"
+
+    result_list = render_macro("summary.html", "checks", findings=findings)
+    details = render_details(summary, result_list, is_open=bool(failed_checks))
     return render_macro("summary.html", "check_line", details=details)
 
 
 def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
-    """Returns a sentence about checks that all passed.
+    """Returns a sentence about the checks of a log if all of them passed.
 
-    A result with a remark, such as ticks that a site did not execute, is quoted in full.
+    For example: "All records present; executed again bit for bit; 3 other checks passed." A
+    result with a remark, such as ticks that a site did not execute, is quoted in full.
     """
-    parts = []
+    clauses = []
     for finding in findings:
         has_remark = ";" in finding.text
         if finding.check == "records":
             missing = facts["missing"]
-            records = "all records present"
-            lack = f"{count_nouns(missing, 'record')} missing"
-            parts.append(lack if missing else records)
+            complete_text = "all records present"
+            missing_text = f"{count_nouns(missing, 'record')} missing"
+            clauses.append(missing_text if missing else complete_text)
         elif finding.check == "executed again" and not has_remark:
             is_exact = "bit for bit" in finding.text
-            parts.append(f"executed again {'bit for bit' if is_exact else 'to 1e-9'}")
+            agreement = "bit for bit" if is_exact else "to 1e-9"
+            clauses.append(f"executed again {agreement}")
         elif finding.check == "executed again":
-            parts.append(f"executed again: {finding.text}")
-    others = len(findings) - len(parts)
-    if others:
-        parts.append(f"{count_nouns(others, 'other check')} passed")
-    text = "; ".join(parts)
+            clauses.append(f"executed again: {finding.text}")
+
+    other_count = len(findings) - len(clauses)
+    if other_count:
+        clauses.append(f"{count_nouns(other_count, 'other check')} passed")
+    text = "; ".join(clauses)
     return f"{text[:1].upper()}{text[1:]}."

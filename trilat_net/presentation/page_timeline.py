@@ -76,10 +76,11 @@ def render_timeline(log: Log, facts: JsonObject) -> Markup:
     """
     moments = list_moments(log, facts)
     body = _render_moments(log, moments[:MAX_SHOWN])
-    others = moments[MAX_SHOWN:_MAX_MOMENTS]
-    if others:
+    folded_moments = moments[MAX_SHOWN:_MAX_MOMENTS]
+    if folded_moments:
         summary = f"{count_nouns(len(moments) - MAX_SHOWN, 'more moment')}"
-        body += render_details(summary, _render_moments(log, others))
+        body += render_details(summary, _render_moments(log, folded_moments))
+
     intro = "What was done to the arms, and how they reacted."
     if facts["changes"]:
         intro += " Charts mark changes by number."
@@ -99,6 +100,8 @@ def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
 
 def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
     """Lists what happened in a run, in the order of time: changes, pushes, modes and errors.
+
+    The page of the run lists them, so that a reader can relate the curves to what happened.
 
     Args:
         log: Log of the run.
@@ -125,11 +128,11 @@ def describe_dominance(scenario: Scenario) -> str:
     Args:
         scenario: Scenario of the run.
     """
-    sentences = []
-    for site, shares in scenario.dominance.items():
-        followed = [f"{peer} {share:g}" for peer, share in shares.items() if share]
-        sentences.append(f"{site} follows {', '.join(followed) or 'nobody'}")
-    return "; ".join(sentences)
+    clauses = []
+    for site, factors in scenario.dominance.items():
+        followed_peers = [f"{peer} {factor:g}" for peer, factor in factors.items() if factor]
+        clauses.append(f"{site} follows {', '.join(followed_peers) or 'nobody'}")
+    return "; ".join(clauses)
 
 
 def _list_hands(log: Log) -> Iterator[_RunMoment]:
@@ -146,13 +149,17 @@ def _list_hands(log: Log) -> Iterator[_RunMoment]:
 
 
 def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
-    """Yields the changes of the run, numbered as in the charts."""
+    """Yields the changes of settings during a run, such as another delay, as moments.
+
+    They have the numbers with which charts mark them.
+    """
     for number, change in enumerate(facts["changes"], 1):
         tick = change["taken_at_tick"]
         # Changes of the scenario have a time only. Commands are applied at a tick.
         origin = "scenario"
         if tick is not None:
             origin = f"command, applied at tick {tick} of {change['site']}"
+
         sentence = change["sentence"]
         subject = sentence.partition(" ")[0]
         # The name of a site keeps its letters, also at the beginning of a sentence.
@@ -163,33 +170,40 @@ def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
 
 
 def _list_pushes(log: Log) -> Iterator[_RunMoment]:
-    """Yields when hands, walls or bodies pushed the arm of each site, and how strongly."""
+    """Yields when operators, walls or bodies pushed each arm, and with which torque.
+
+    Short pauses do not divide a push. If an arm was pushed very often, a single moment states
+    the number of pushes.
+    """
     for site in sites_with_operator(log):
         records = log[site]
         torques = np.abs(records.tau_x).max(axis=1, initial=0.0)
-        spans = _find_spans(records.t_s, torques > _LEAST_PUSH_NM)
-        if not spans:
+        is_pushed = torques > _LEAST_PUSH_NM
+        pushes = _find_spans(records.t_s, is_pushed)
+        if not pushes:
             continue
+
         subject = _name_pusher(log, site)
-        largest = f"with at most {torques.max():.3g} N m"
-        first_s = spans[0][0]
-        last_s = spans[-1][1]
-        if len(spans) > _MAX_PUSHES:
-            times = f"{len(spans)} times until {last_s:.3f} s"
-            yield _RunMoment(first_s, f"{subject} pushes {site} {times}, {largest}.", site)
+        torque_text = f"with at most {torques.max():.3g} N m"
+        first_s = pushes[0][0]
+        last_s = pushes[-1][1]
+        if len(pushes) > _MAX_PUSHES:
+            times = f"{len(pushes)} times until {last_s:.3f} s"
+            yield _RunMoment(first_s, f"{subject} pushes {site} {times}, {torque_text}.", site)
             continue
-        for start_s, end_s in spans:
+
+        for start_s, end_s in pushes:
             inside = (records.t_s >= start_s) & (records.t_s <= end_s)
-            largest = f"with at most {torques[inside].max():.3g} N m"
-            until = "to the end" if end_s >= records.t_s[-1] else f"until {end_s:.3f} s"
-            text = f"{subject} pushes {site} {until}, {largest}."
+            torque_text = f"with at most {torques[inside].max():.3g} N m"
+            end_text = "to the end" if end_s >= records.t_s[-1] else f"until {end_s:.3f} s"
+            text = f"{subject} pushes {site} {end_text}, {torque_text}."
             yield _RunMoment(start_s, text, site)
 
 
 def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
-    """Returns the start and the end of each time in which a condition holds, in s.
+    """Returns the intervals of time in which a condition holds, as start and end in s.
 
-    Pauses that are shorter than `_PAUSE_S` do not divide such a time.
+    Interruptions that are shorter than `_PAUSE_S` do not divide an interval.
 
     Args:
         t_s: Times of K records, shape (K,).
@@ -198,9 +212,11 @@ def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
     times_s = t_s[acts]
     if not len(times_s):
         return []
-    before_pause = np.flatnonzero(np.diff(times_s) > _PAUSE_S)
-    starts_s = times_s[np.append(0, before_pause + 1)]
-    ends_s = times_s[np.append(before_pause, len(times_s) - 1)]
+
+    # An interval ends at the last time before a pause, and the next one begins behind it.
+    last_before_pause = np.flatnonzero(np.diff(times_s) > _PAUSE_S)
+    starts_s = times_s[np.append(0, last_before_pause + 1)]
+    ends_s = times_s[np.append(last_before_pause, len(times_s) - 1)]
     return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
@@ -215,29 +231,39 @@ def _name_pusher(log: Log, site: str) -> str:
 
 
 def _list_modes(log: Log) -> Iterator[_RunMoment]:
-    """Yields when sites did not follow their peers, with the reason if there was an alarm."""
-    reasons = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
+    """Yields when an arm did not follow the others, but held its position, braked or returned.
+
+    The sentence has the reason if there was an alarm. Arms that did the same at the same time
+    share a sentence.
+    """
+    alarms_by_start = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
     end_s = recorded_end_s(log)
-    sites: dict[tuple[float, str], list[str]] = {}
-    bad_sites = set()
+    sites_by_moment: dict[tuple[float, str], list[str]] = {}
+    alarming_moments = set()
     for site in log.sites:
         for mode, from_s, to_s in find_mode_intervals(log[site]):
-            alarm = reasons.get((site, from_s))
+            alarm = alarms_by_start.get((site, from_s))
             reason = "" if alarm is None else f" ({alarm.word}: {alarm.reason})"
-            until = "to the end" if to_s >= end_s else f"until {to_s:.3f} s"
-            text = f"{_DID.get(mode, mode)} {until}{reason}"
-            # Sites that do the same at the same time share a sentence.
-            sites.setdefault((from_s, text), []).append(site)
+            end_text = "to the end" if to_s >= end_s else f"until {to_s:.3f} s"
+            text = f"{_DID.get(mode, mode)} {end_text}{reason}"
+
+            moment = (from_s, text)
+            sites_by_moment.setdefault(moment, []).append(site)
             if alarm is not None:
-                bad_sites.add((from_s, text))
-    for (from_s, text), names in sites.items():
-        site = names[0] if len(names) == 1 else ""
-        sentence = f"{join_words(names)} {text}."
-        yield _RunMoment(from_s, sentence, site, is_bad=(from_s, text) in bad_sites)
+                alarming_moments.add(moment)
+
+    for moment, site_names in sites_by_moment.items():
+        from_s, text = moment
+        site = site_names[0] if len(site_names) == 1 else ""
+        sentence = f"{join_words(site_names)} {text}."
+        yield _RunMoment(from_s, sentence, site, is_bad=moment in alarming_moments)
 
 
 def _list_errors(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
-    """Yields the largest error, when all errors became small, and when a site diverged."""
+    """Yields the moments at which the tracking error was largest, became small, or diverged.
+
+    The tracking error is the difference between the actual and the desired joint angles.
+    """
     unit = shared_unit(log)
     peak = find_error_peak(log)
     if peak is not None and peak.value > 0.0:
@@ -246,9 +272,11 @@ def _list_errors(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
             f"{peak.site} has the largest error of the run, {peak.value:.3g} {unit} at {joint}."
         )
         yield _RunMoment(peak.t_s, text, peak.site)
+
     if facts["settle_s"]:
         limit = f"{facts['settle_below_rad']:g} {unit}"
         yield _RunMoment(facts["settle_s"], f"From here on, every |e| stays below {limit}.")
+
     for name, site in facts["sites"].items():
         diverged_s = site["diverged_at_s"]
         if diverged_s is not None:

@@ -19,13 +19,14 @@ from ..log import Ints, Log, SiteLog
 
 
 def reference_angles(part: SiteLog) -> Array:
-    """Returns the angles that the joints of a site should reach, in rad.
+    """Returns the angles that the joints of an arm should reach, in rad.
 
-    The reference q_des, Eq. (6), is the weighted mean of the peers' delayed angles. In task
-    space the joints have no reference, and the angles q themselves are returned.
+    The reference q_des, Eq. (6), is the weighted mean of the delayed angles of the other arms.
+    If the arms follow each other's end effectors (task space), the joints have no reference,
+    and the angles q themselves are returned.
 
     Args:
-        part: Log of the site.
+        part: Records of the arm.
 
     Returns:
         Angles, shape (K, n).
@@ -34,12 +35,10 @@ def reference_angles(part: SiteLog) -> Array:
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the derivative of a site's error: its velocity minus the followed velocity.
-
-    A site is the process that runs one arm.
+    """Returns the rate of an arm's tracking error: its velocity minus the velocity to follow.
 
     Args:
-        part: The site's part of the log, with K records.
+        part: The K records of the arm.
 
     Returns:
         Velocity errors of the n joints, shape (K, n), in rad/s. If the arm follows with its end
@@ -55,9 +54,10 @@ def joint_error_rates(part: SiteLog) -> Array:
 
 
 def shared_unit(log: Log) -> str:
-    """Returns the unit of the coordinates that the sites share, and of their errors.
+    """Returns the unit of the coordinates with which the arms follow each other.
 
     It is "rad" for joint angles, "m" for positions and "m, rad" for poses of end effectors.
+    Errors have the same unit.
 
     Args:
         log: The log of the run.
@@ -70,7 +70,10 @@ def shared_unit(log: Log) -> str:
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns how old each peer's sample in use is at every record of a site, in ms.
+    """Returns the delays that the control loop of a site experiences, in ms.
+
+    In each tick, the loop uses the newest message (sample) of each peer, another site. The
+    delay is the age of this message.
 
     Args:
         log: The log of the run.
@@ -79,17 +82,18 @@ def sample_ages_ms(log: Log, site: str) -> Array:
     Returns:
         Ages, shape (K, N - 1), with a column for each peer. NaN before a peer's first sample.
     """
-    part = log[site]
+    records = log[site]
     columns = []
-    for peer in part.peers:
+    for peer in records.peers:
         rate_hz = log.scenario.sites[peer].rate_hz
-        columns.append(part.age_s(peer, rate_hz) * 1e3)
-    shape = (len(part.peers), len(part))
+        columns.append(records.age_s(peer, rate_hz) * 1e3)
+    # The shape is stated, because a site without peers has no columns.
+    shape = (len(records.peers), len(records))
     return np.array(columns).reshape(shape).T
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Lists the sites at which somebody may act on the arm.
+    """Returns the sites at which a person or program may act on the arm.
 
     They have an operator in the scenario, or recorded external torques.
 
@@ -98,8 +102,9 @@ def sites_with_operator(log: Log) -> list[str]:
     """
     sites = []
     for site in log.sites:
-        has_hands = bool(log.scenario.sites[site].hands)
-        if has_hands or np.any(log[site].tau_x):
+        has_operator = bool(log.scenario.sites[site].hands)
+        has_external_torque = np.any(log[site].tau_x)
+        if has_operator or has_external_torque:
             sites.append(site)
     return sites
 
@@ -136,31 +141,31 @@ def extreme_rows(values: Array, buckets: int) -> Ints:
     Returns:
         Indices of the rows.
     """
-    rows, columns = values.shape
-    if rows <= 2 * buckets or not columns:
-        return np.arange(rows)
+    row_count, column_count = values.shape
+    if row_count <= 2 * buckets or not column_count:
+        return np.arange(row_count)
 
-    # The negated floor division rounds up.
-    size = -(-rows // buckets)
-    filled_buckets = -(-rows // size)
+    # The negated floor division rounds up, so that all rows lie in a bucket.
+    bucket_size = -(-row_count // buckets)
+    filled_buckets = -(-row_count // bucket_size)
     # the last bucket is filled up with its last row, which changes no extreme
-    filled_rows = np.arange(filled_buckets * size)
-    valid_rows = np.minimum(filled_rows, rows - 1)
-    index = valid_rows.reshape(-1, size)
-    bucket = np.arange(filled_buckets)
+    filled_rows = np.arange(filled_buckets * bucket_size)
+    valid_rows = np.minimum(filled_rows, row_count - 1)
+    rows_of_buckets = valid_rows.reshape(-1, bucket_size)
+    bucket_numbers = np.arange(filled_buckets)
 
-    ends = np.array([0, rows - 1])
-    keep = [ends]
-    for column in range(columns):
-        block = values[index, column]
+    first_and_last = np.array([0, row_count - 1])
+    chosen_rows = [first_and_last]
+    for column in range(column_count):
+        block = values[rows_of_buckets, column]
         missing = np.isnan(block)
         above_missing = np.where(missing, np.inf, block)
         below_missing = np.where(missing, -np.inf, block)
         lowest = above_missing.argmin(1)
         highest = below_missing.argmax(1)
-        keep.append(index[bucket, lowest])
-        keep.append(index[bucket, highest])
-    return np.unique(np.concatenate(keep))
+        chosen_rows.append(rows_of_buckets[bucket_numbers, lowest])
+        chosen_rows.append(rows_of_buckets[bucket_numbers, highest])
+    return np.unique(np.concatenate(chosen_rows))
 
 
 def decimate(
@@ -184,23 +189,23 @@ def decimate(
         return _DecimatedTrace(tick, t_s, values)
 
     # narrower gaps are narrower than a pixel, and there may be thousands of them
-    ticks = tick[-1] - tick[0]
-    bucket_ticks = max(1.0, ticks / buckets)
+    total_ticks = tick[-1] - tick[0]
+    bucket_ticks = max(1.0, total_ticks / buckets)
     before_gap = np.flatnonzero(np.diff(tick) > bucket_ticks)
     after_gap = before_gap + 1
     beside_gaps = np.concatenate([before_gap, after_gap])
-    keep = np.union1d(extreme_rows(values, buckets), beside_gaps)
+    chosen_rows = np.union1d(extreme_rows(values, buckets), beside_gaps)
 
     # the row of NaN is one period after the last record before the gap
     gap_ticks = tick[after_gap] - tick[before_gap]
     gap_s = t_s[after_gap] - t_s[before_gap]
     period_s = gap_s / gap_ticks
-    nan_position = np.searchsorted(keep, before_gap) + 1
+    nan_position = np.searchsorted(chosen_rows, before_gap) + 1
     nan_tick = tick[before_gap] + 1
     nan_t_s = t_s[before_gap] + period_s
-    kept_values = values[keep]
+    chosen_values = values[chosen_rows]
     return _DecimatedTrace(
-        tick=np.insert(tick[keep], nan_position, nan_tick),
-        t_s=np.insert(t_s[keep], nan_position, nan_t_s),
-        values=np.insert(kept_values, nan_position, np.nan, axis=0),
+        tick=np.insert(tick[chosen_rows], nan_position, nan_tick),
+        t_s=np.insert(t_s[chosen_rows], nan_position, nan_t_s),
+        values=np.insert(chosen_values, nan_position, np.nan, axis=0),
     )

@@ -45,11 +45,14 @@ def _find_plugin_hand(log: Log, site: str) -> LiveHand:
 
 
 def find_plugin_actions(log: Log, site: str) -> str:
-    """Returns the kind of exported actions that the plugin accepts at a site.
+    """Returns the kind of actions that a log must be exported with for the LeRobot plugin.
+
+    The plugin commands the operator model of an arm by positions of its end effector ("tip") or
+    by joint angles. A dataset for training must contain the same kind.
 
     Args:
         log: Log of the run.
-        site: Name of the site.
+        site: Name of the site whose arm the plugin holds.
 
     Raises:
         UsageError: The operator of the site is commanded by forces, which are not exported.
@@ -83,7 +86,7 @@ def observe_as_plugin(
         UsageError: The scenario has no operator for the plugin at this site.
     """
     hand = _find_plugin_hand(log, site)
-    values: list[Array] = []
+    columns: list[Array] = []
     names: list[str] = []
     for observed_site in (slave, site):
         records = log[observed_site]
@@ -91,9 +94,10 @@ def observe_as_plugin(
         joints = log.scenario.arms[observed_site].joint_names
         quantities = {"pos": records.q, "vel": records.qd, "tau_x": records.tau_x}
         for quantity, numbers in quantities.items():
-            values.append(numbers[site_rows])
+            columns.append(numbers[site_rows])
             names += [f"{observed_site}.{joint}.{quantity}" for joint in joints]
 
+    # The coordinates in which the operator moves the arm: joints, or the end effector.
     records = log[site]
     site_rows = rows[site]
     pose = records.q[site_rows]
@@ -104,18 +108,20 @@ def observe_as_plugin(
         pose = end_effector.position
         pose_rate = end_effector.speed
         axes = TASK_AXES[: pose.shape[1]]
-    pull = _compute_pull(hand, records.hand[site_rows], pose, pose_rate)
+
+    force = _compute_pull(hand, records.hand[site_rows], pose, pose_rate)
     # The operator feels the reaction of the force that moves the arm.
-    values += [pose, -pull]
+    columns += [pose, -force]
     names += [f"{axis}.pos" for axis in axes]
     names += [f"{axis}.felt" for axis in axes]
-    return np.hstack(values), names
+    return np.hstack(columns), names
 
 
 def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array) -> Array:
-    """Computes the force of the operator on the arm, as `Hand.force` does in a live session.
+    """Computes the force of an operator model on its arm, as `Hand.force` does in a session.
 
-    With the stiffness K and the damping B, the force is
+    The operator is modelled as a spring and damper that pulls the arm to a target. With the
+    stiffness K and the damping B, the force is
 
         F = K (target - pose) + B (target rate - pose rate)
 
@@ -130,20 +136,22 @@ def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array)
     Returns:
         The force in N, or in mode `joint` the torques in N m, shape (F, n).
     """
-    source = hand.actor
-    size = pose.shape[1]
+    settings = hand.actor
+    coordinate_count = pose.shape[1]
     grip = vectors[:, :1]
-    target = vectors[:, 3 : 3 + size]
-    target_rate = vectors[:, 3 + size :]
-    pull = target
+    target = vectors[:, 3 : 3 + coordinate_count]
+    target_rate = vectors[:, 3 + coordinate_count :]
+
+    unlimited_force = target  # in mode `force`, the target is the force itself
     if hand.mode != "force":
-        stiffness = np.array(source.K)
-        damping = np.array(source.B)
-        pull = stiffness * (target - pose) + damping * (target_rate - pose_rate)
-    magnitude = np.linalg.norm(pull, axis=1, keepdims=True)
-    above_limit = magnitude > source.limit
-    limitation = np.divide(
-        source.limit, magnitude, out=np.ones_like(magnitude), where=above_limit
+        stiffness = np.array(settings.K)
+        damping = np.array(settings.B)
+        unlimited_force = stiffness * (target - pose) + damping * (target_rate - pose_rate)
+
+    magnitude = np.linalg.norm(unlimited_force, axis=1, keepdims=True)
+    is_above_limit = magnitude > settings.limit
+    scale = np.divide(
+        settings.limit, magnitude, out=np.ones_like(magnitude), where=is_above_limit
     )
-    force: Array = grip * limitation * pull
+    force: Array = grip * scale * unlimited_force
     return force

@@ -65,7 +65,9 @@ def explain_no_functional(scenario: Scenario) -> str:
 def describe_missing_functionals(
     missing: Sequence[premise_quantities.MissingFunctional],
 ) -> str:
-    """Explains for which arms the energy function of the stability proof does not exist.
+    """Returns for which arms the energy function of the stability proof is missing, and why.
+
+    A run with such an arm is judged without the energy function.
 
     Args:
         missing: Sites of these arms, grouped by the reason.
@@ -74,10 +76,11 @@ def describe_missing_functionals(
         The names of the sites and the reasons, separated by semicolons. Empty if the energy
         exists for every arm.
     """
-    return "; ".join(
-        f"{', '.join(group.sites)}: {_OBSTACLES[group.obstacle].format(law=group.law)}"
-        for group in missing
-    )
+    clauses = []
+    for group in missing:
+        reason = _OBSTACLES[group.obstacle].format(law=group.law)
+        clauses.append(f"{', '.join(group.sites)}: {reason}")
+    return "; ".join(clauses)
 
 
 def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
@@ -112,11 +115,13 @@ def _describe_parameters(quantities: premise_quantities.ParameterQuantities) -> 
 
 def _describe_gains(quantities: premise_quantities.GainQuantities) -> str:
     if quantities.scales is None:
-        rows = []
+        gain_texts = []
         for site, gains in quantities.Kd.items():
-            values = ", ".join(f"{gain:g}" for gain in gains)
-            rows.append(f"{site} ({values})")
-        return f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
+            numbers = ", ".join(f"{gain:g}" for gain in gains)
+            gain_texts.append(f"{site} ({numbers})")
+        gains_text = ", ".join(gain_texts)
+        return f"Kd differs in shape between sites, so that no beta exists: {gains_text}"
+
     if not quantities.is_positive:
         return "some Kd is zero, but the theorem requires positive Kd"
     if len(set(quantities.scales.values())) == 1:
@@ -130,27 +135,33 @@ def _describe_walls(quantities: premise_quantities.WallQuantities) -> str:
     summary = "every sampled wall is passive"
     if quantities.active:
         summary = "a sampled wall generates energy in contact"
-    texts = [
+
+    # A sampled wall of stiffness K and damping B is passive if the damping of the arm is at
+    # least K h / 2 + B, where h is the period of the control loop.
+    listed_walls = quantities.active or quantities.walls
+    wall_texts = [
         f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own "
         f"damping {wall.arm_damping_n_s_m:.3g}; generated {wall.generated_j:.3g} J "
         "with respect to qd"
-        for wall in quantities.active or quantities.walls
+        for wall in listed_walls
     ]
-    return f"{summary}: {'; '.join(texts)}"
+    return f"{summary}: {'; '.join(wall_texts)}"
 
 
 def _describe_dominance(quantities: premise_quantities.DominanceQuantities) -> str:
     if quantities.changing:
         text = f"the shares of {_join_limited(quantities.changing)} change"
-        losses = [
+        loss_texts = [
             f"{loss.site} without {loss.peer} {loss.from_s:.4g} to {loss.to_s:.4g} s"
             for loss in quantities.losses
         ]
-        if losses:
-            text += f": {_join_limited(losses)}; the remaining sites follow each other"
+        if loss_texts:
+            text += f": {_join_limited(loss_texts)}; the remaining sites follow each other"
         return text
+
     if len(quantities.groups) > 1:
         return describe_closed_groups(quantities.groups)
+
     if quantities.weightless:
         leaders = ", ".join(quantities.groups[0])
         followers = ", ".join(quantities.weightless)
@@ -158,6 +169,7 @@ def _describe_dominance(quantities: premise_quantities.DominanceQuantities) -> s
             f"alpha is reducible: none of {leaders} follows {followers}, whose beta is 0, so V "
             f"says nothing about {followers}, which follow as in a cascade"
         )
+
     text = "constant, alpha irreducible"
     if quantities.beta is not None:
         text += f"; beta: {_format_by_site(quantities.beta)}"
@@ -166,30 +178,36 @@ def _describe_dominance(quantities: premise_quantities.DominanceQuantities) -> s
 
 def _describe_delays(quantities: premise_quantities.DelayQuantities) -> str:
     if quantities.varying:
-        ages = [
+        age_texts = [
             f"{link.peer}->{link.site} "
             f"({1e3 * link.shortest_s:.4g} to {1e3 * link.longest_s:.4g} ms)"
             for link in quantities.varying
         ]
-        return f"the age of the sample in use varies: {_join_limited(ages)}"
+        return f"the age of the sample in use varies: {_join_limited(age_texts)}"
+
     if not quantities.constant_s:
         return "no sample came into use"
-    delays = {f"{1e3 * delay_s:.4g} ms" for delay_s in quantities.constant_s}
-    return f"constant on every link: {', '.join(sorted(delays))}"
+    delay_texts = {f"{1e3 * delay_s:.4g} ms" for delay_s in quantities.constant_s}
+    return f"constant on every link: {', '.join(sorted(delay_texts))}"
 
 
 def _describe_following(quantities: premise_quantities.FollowingQuantities) -> str:
-    texts = [
+    interruption_texts = [
         f"{site} {from_s:.4g} to {to_s:.4g} s"
         for site, from_s, to_s in quantities.interruptions
     ]
     for site, count in quantities.limited_ticks.items():
-        ticks = count_nouns(count, "tick")
-        texts.append(f"{site} with a reference as fast as it may be at {ticks}")
-    if not texts:
+        ticks_text = count_nouns(count, "tick")
+        interruption_texts.append(
+            f"{site} with a reference as fast as it may be at {ticks_text}"
+        )
+
+    if not interruption_texts:
         return "every site follows its peers all the time"
-    modes = "hold, brake, return or stop" if quantities.is_halted else "hold, brake or return"
-    return f"{modes}: {_join_limited(texts)}"
+    modes_text = (
+        "hold, brake, return or stop" if quantities.is_halted else "hold, brake or return"
+    )
+    return f"{modes_text}: {_join_limited(interruption_texts)}"
 
 
 def _describe_torques(quantities: premise_quantities.TorqueQuantities) -> str:
@@ -242,6 +260,7 @@ def _describe_operators(quantities: premise_quantities.OperatorQuantities) -> st
     if quantities.weightless:
         sites = _join_limited(quantities.weightless)
         return f"{sites}, of beta 0, is pushed: V does not show that"
+
     supply = quantities.supply
     if supply is None:
         return "nobody pushes"

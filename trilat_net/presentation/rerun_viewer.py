@@ -123,6 +123,8 @@ def open_rerun(
 def _require_display(options: ViewerOptions) -> None:
     """Checks that there is a display if the viewer would open a window.
 
+    Without a display, the viewer itself fails with an obscure message.
+
     Raises:
         UsageError: There is no display.
     """
@@ -152,8 +154,8 @@ def _list_commands(
 ) -> list[list[str]]:
     """Returns the arguments of the calls of Rerun that show or save a log, in order.
 
-    The viewer accepts connections from this machine only. The address of a viewer for browsers
-    is printed.
+    The viewer accepts connections from this machine only. If the log is shown in a browser, the
+    address of the page is printed.
 
     Args:
         options: How the log is shown.
@@ -163,11 +165,14 @@ def _list_commands(
     """
     if options.save is not None:
         return _list_save_commands(log, layout, options.save)
+
     port = str(_find_free_port())
     command = [str(log), str(layout), "--bind", _LOOPBACK, "--port", port]
     if not options.web:
         return [command]
+
     page_port = str(_find_free_port())
+    # The URL of the page contains the source of the data, percent-encoded.
     data_address = f"rerun%2Bhttp%3A%2F%2F{_LOOPBACK}%3A{port}%2Fproxy"
     page_address = f"http://{_LOOPBACK}:{page_port}/?url={data_address}"
     print_line(f"open {page_address}; Ctrl-C ends it")
@@ -308,9 +313,10 @@ _MAX_LEGEND_NAMES = 20
 
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Arranges the plots of a log's standard channels on pages.
+    """Arranges the channels (series of messages) of a log as plots on the pages of the viewer.
 
-    Pages and rows without any curve are left out.
+    A page has a row of plots per quantity and a plot per arm. Pages and rows without any curve
+    are left out.
 
     Args:
         channels: Standard channels by topic. Topics of sites are `<root>/<site>/<name>`, those
@@ -320,16 +326,16 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
         topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
     ]
     # A dictionary instead of a set keeps the order of the sites.
-    roots: dict[str, None] = {}
+    site_roots: dict[str, None] = {}
     for topic in channels:
         if topic not in session_topics:
-            roots[topic.rpartition("/")[0]] = None
+            site_roots[topic.rpartition("/")[0]] = None
 
     rows_by_page = {**_PAGES, "Sent by laws": _list_sent_rows(channels)}
     pages = {}
     for name, rows in rows_by_page.items():
-        plots = [_build_row(channels, list(roots), row) for row in rows]
-        page = [row_plots for row_plots in plots if row_plots]
+        plots_by_row = [_build_row(channels, list(site_roots), row) for row in rows]
+        page = [row_plots for row_plots in plots_by_row if row_plots]
         if page:
             pages[name] = page
 
@@ -361,12 +367,12 @@ def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
 
 
 def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> list[CurvePlot]:
-    """Returns the plots of a quantity: a plot for each site that has its channels.
+    """Returns the plots of one quantity, such as the joint angles, for all sites that have it.
 
     Args:
         channels: Standard channels by topic.
         roots: First parts of the sites' topics, up to the name of the channel.
-        row: The quantity.
+        row: The quantity, and the channels that contain it.
     """
     plots = []
     for root in roots:
@@ -374,9 +380,12 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
         for name, field in row.sources:
             topic = f"{root}/{name}"
             channel = channels.get(topic)
-            selected = None if channel is None else _select_curves(topic, field, channel)
-            if selected is not None:
-                curves.append(selected)
+            if channel is None:
+                continue
+            selected_curves = _select_curves(topic, field, channel)
+            if selected_curves is not None:
+                curves.append(selected_curves)
+
         if curves:
             title = f"{_get_channel_name(root)}: {row.quantity}"
             if row.unit:
@@ -388,6 +397,9 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
 def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves | None:
     """Returns the curves of a channel that belong to a quantity.
 
+    A channel is a series of messages with a list of numbers, such as the angles of all joints.
+    A plot may need only some of them.
+
     Args:
         topic: Topic of the channel.
         field: Field of the channel, see `_PlotRow`.
@@ -398,6 +410,7 @@ def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves 
     """
     if channel.kind == STRING:
         return None
+
     names = _name_curves(channel)
     channel_name = _get_channel_name(topic)
     if channel_name == "theta_hat":
@@ -407,7 +420,8 @@ def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves 
     if channel_name == "tau_x":
         # This quantity shares a plot with the torque of the same joints.
         names = [f"tau_x {name}" for name in names]
-    return _PlotCurves(topic, tuple(names), (True,) * len(names))
+    all_visible = (True,) * len(names)
+    return _PlotCurves(topic, tuple(names), all_visible)
 
 
 def _name_curves(channel: Ros2Channel) -> list[str]:
@@ -422,6 +436,9 @@ def _name_curves(channel: Ros2Channel) -> list[str]:
 
 def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> _PlotCurves | None:
     """Returns the curves of the estimates of one kind of inertial parameter.
+
+    An adaptive control law estimates the inertial parameters of the arm, such as masses and
+    inertias. A plot shows one kind, because the units differ.
 
     Args:
         topic: Topic of the channel.
@@ -489,6 +506,8 @@ _TIMELINE = "message_publish_time"
 def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     """Writes a layout as a blueprint, the file from which Rerun reads it.
 
+    A blueprint tells the viewer which plots and views it arranges on the screen.
+
     Args:
         layout: The plots on each page, and what else is shown.
         application: Rerun's name of the recordings to which the layout applies.
@@ -502,8 +521,8 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     for name, page in layout.pages.items():
         rows = []
         for plots in page:
-            row = [_make_plot_view(rrb, plot) for plot in plots]
-            rows.append(rrb.Horizontal(*row))
+            plot_views = [_make_plot_view(rrb, plot) for plot in plots]
+            rows.append(rrb.Horizontal(*plot_views))
         views.append(rrb.Vertical(*rows, name=name))
     if layout.arms:
         frame = rrb.SpatialInformation(target_frame=WORLD)
@@ -513,9 +532,9 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     parts = [rrb.Tabs(*views)]
     if layout.lines:
         parts.append(rrb.TextLogView(origin=layout.lines, name="events"))
-    shares = [6, 1]
+    relative_heights = [6, 1]  # the events need far less space than the plots
     blueprint = rrb.Blueprint(
-        rrb.Vertical(*parts, row_shares=shares[: len(parts)]),
+        rrb.Vertical(*parts, row_shares=relative_heights[: len(parts)]),
         rrb.TimePanel(state="collapsed", timeline=_TIMELINE),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -527,19 +546,19 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
 
 def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
     """Returns Rerun's view of a plot, in which each channel has its own colors."""
-    styles = {}
+    styles_by_channel = {}
     for index, curves in enumerate(plot.curves):
-        styles[curves.entity] = _style_curves(curves, first_color=2 * index)
-    most_names = max(len(curves.names) for curves in plot.curves)
+        styles_by_channel[curves.entity] = _style_curves(curves, first_color=2 * index)
+    longest_legend = max(len(curves.names) for curves in plot.curves)
     legend = rrb.PlotLegend(
         corner=rrb.Corner2D.RightTop,
-        visible=False if most_names > _MAX_LEGEND_NAMES else None,
+        visible=False if longest_legend > _MAX_LEGEND_NAMES else None,
     )
     return rrb.TimeSeriesView(
         name=plot.title,
         origin="/",
         contents=[curves.entity for curves in plot.curves],
-        overrides=styles,
+        overrides=styles_by_channel,
         plot_legend=legend,
     )
 
@@ -552,11 +571,11 @@ def _style_curves(curves: _PlotCurves, first_color: int) -> Any:
         first_color: Index of the color of the first curve. Further curves have the next colors.
     """
     rr = import_extra("rerun", "view", "viewers")
-    pale = cycle(_PALE_COLORS)
-    strong = cycle(_COLORS[first_color:] + _COLORS[:first_color])
+    pale_palette = cycle(_PALE_COLORS)
+    strong_palette = cycle(_COLORS[first_color:] + _COLORS[:first_color])
     colors = []
     for name in curves.names:
-        palette = pale if name.endswith("_ref") else strong
+        palette = pale_palette if name.endswith("_ref") else strong_palette
         colors.append(next(palette))
     return rr.SeriesLines(
         names=list(curves.names), colors=colors, visible_series=list(curves.visible)

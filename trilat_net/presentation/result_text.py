@@ -98,6 +98,7 @@ class TextTable(NamedTuple):
                 # hashes may not wrap.
                 no_wrap=hash_width is not None and self._fits(index, hash_width),
             )
+
         for row in self.rows:
             is_heading = len(row) == 1 < len(self.headers)
             default_style = "bold" if is_heading else ""
@@ -128,11 +129,11 @@ class TextTable(NamedTuple):
 
         A "|" in a cell is escaped, because it would begin a new column.
         """
-        rule = ["--:" if right else "---" for right in self.to_the_right]
-        rows = [self.titles, rule]
+        separators = ["--:" if right else "---" for right in self.to_the_right]
+        rows = [self.titles, separators]
         for row in self.rows:
-            missing = len(self.headers) - len(row)
-            rows.append([*row, *[""] * missing])
+            missing_cells = len(self.headers) - len(row)
+            rows.append([*row, *[""] * missing_cells])
         lines = []
         for row in rows:
             cells = [cell.replace("|", "\\|") for cell in row]
@@ -161,6 +162,7 @@ class TextTable(NamedTuple):
         table = list(self.rows)
         if any(self.titles):
             table.insert(0, self.titles)
+
         widths = [0] * len(self.headers)
         for row in table:
             for index, cell in enumerate(row[: len(widths)]):
@@ -262,12 +264,14 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
         The blocks in the order of the text. Each line is a `MarkedText`, whose mark, such as a
         green "ok", may be empty.
     """
+    # A class may have methods for its text, or a function in this folder composes the text.
     compose_blocks = getattr(result, "brief_blocks", None) if brief else None
     if compose_blocks is None:
         compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:
         composers = _BRIEF_COMPOSERS if brief else _COMPOSERS
         compose_blocks = partial(_import_composer(result, composers), result)
+
     blocks: Iterable[Block] = compose_blocks()
     return [MarkedText("", block) if isinstance(block, str) else block for block in blocks]
 
@@ -285,8 +289,8 @@ def _import_composer(
         composers: Functions as "module:function", by class name, such as `_COMPOSERS`.
     """
     classes = [cls.__name__ for cls in type(result).__mro__]
-    known = next(name for name in classes if name in composers)
-    module_name, _, function_name = composers[known].partition(":")
+    listed_class = next(name for name in classes if name in composers)
+    module_name, _, function_name = composers[listed_class].partition(":")
     module = import_module(f"{__package__}.{module_name}")
     composer: Callable[[Result], Iterable[Block]] = getattr(module, function_name)
     return composer

@@ -33,6 +33,7 @@ def render_site_html(site: SiteLog) -> Markup:
     heading = render_macro("result.html", "heading", text=repr(site).strip("<>"))
     if not len(site):
         return heading
+
     headers = ("quantity", "first", "last", "least", "greatest", "meaning")
     table = TextTable(headers, list(_list_rows(site)), align="lrrrrl")
     return heading + table.html()

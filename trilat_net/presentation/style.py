@@ -180,16 +180,17 @@ def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
             further site then has a thinner line, so that lines on top of one another stay
             visible.
     """
-    index = log.sites.index(site)
-    last = len(log.sites) - 1
+    site_index = log.sites.index(site)
+    last_index = len(log.sites) - 1
     if width is None:
         width = _WIDEST_PT
-        if last > 0:  # not for a single site, which would divide by zero
-            width = _WIDEST_PT - _THINNER_PT * index / last
-    repetitions = index // len(SITE_COLOURS)
+        if last_index > 0:  # not for a single site, which would divide by zero
+            width = _WIDEST_PT - _THINNER_PT * site_index / last_index
+
+    palette_repetitions = site_index // len(SITE_COLOURS)
     return {
         "color": site_colour(log, site),
-        "linestyle": DASHES[repetitions % len(DASHES)],
+        "linestyle": DASHES[palette_repetitions % len(DASHES)],
         "linewidth": width,
     }
 
@@ -251,16 +252,17 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
             band has too.
     """
     buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
-    rows = []
+    points = []
     for bucket in buckets:
         if len(bucket):
             middle_s = t_s[bucket].mean()
-            rows.append((middle_s, *_compute_spread(values[bucket])))
-    middles_s, low, median, high = np.array(rows).reshape(-1, 4).T
+            points.append((middle_s, *_compute_spread(values[bucket])))
+
+    middles_s, smallest, median, largest = np.array(points).reshape(-1, 4).T
     axes.fill_between(
         middles_s,
-        low,
-        high,
+        smallest,
+        largest,
         color=options["color"],
         alpha=SPREAD["alpha"],
         linewidth=0.0,
@@ -290,23 +292,24 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of the joints' panels.
+    """Returns the titles of the panels that show a joint each, such as "joint 1".
 
-    A title is the number of the joint. Names are added only if the arms are chains whose joints
-    all have the same names. The arm with the most joints decides the number of titles.
+    Names of joints are added if the arms are chains whose joints all have the same names. The
+    arm with the most joints decides the number of titles.
 
     Args:
         log: Log with the arms.
     """
     arms = [log.scenario.arms[site] for site in log.sites]
-    longest = max(arms, key=lambda arm: arm.counts.joints)
-    numbers = range(1, longest.counts.joints + 1)
+    longest_arm = max(arms, key=lambda arm: arm.counts.joints)
+    numbers = range(1, longest_arm.counts.joints + 1)
     names_differ = len({arm.joint_names for arm in arms}) > 1
-    if longest.chain is None or names_differ:
+    if longest_arm.chain is None or names_differ:
         return [f"joint {number}" for number in numbers]
-    units = longest.joint_units("rad")
+
+    units = longest_arm.joint_units("rad")
     titles = []
-    for number, name, unit in zip(numbers, longest.joint_names, units, strict=True):
+    for number, name, unit in zip(numbers, longest_arm.joint_names, units, strict=True):
         # The axes of the figure have the units of revolute joints. Prismatic joints differ.
         quantity = " (m, N)" if unit == "m" else ""
         titles.append(f"{number}: {name}{quantity}")
@@ -314,13 +317,12 @@ def name_joints(log: Log) -> list[str]:
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns titles for the coordinates that the sites exchange.
+    """Returns titles for the coordinates with which the arms follow each other.
 
-    They are joints, or axes of the task space if the sites exchange poses of their end
-    effectors.
+    They are joints, or axes of the task space if the arms follow each other's end effectors.
 
     Args:
-        log: Log with the sites.
+        log: Log with the arms.
     """
     arm = log.scenario.arms[log.sites[0]]
     if arm.shares_pose:
@@ -369,9 +371,7 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class _JointPanels(NamedTuple):
-    """Panels of a figure that shows each joint in a panel of its own.
-
-    `add_joint_panels` creates and arranges them.
+    """Panels of a figure in which each joint has a panel, as `add_joint_panels` creates them.
 
     Attributes:
         joints: A panel per joint.
@@ -412,9 +412,10 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
     choices = (2,) if narrow or joints == 2 else (3, 4)
     # The fewest rows win. Of arrangements with as many rows, the fewest empty cells win.
     columns = min(choices, key=count_cells)
-    _, empty = count_cells(columns)
+    _, empty_cells = count_cells(columns)
+
     cells = [str(joint) for joint in range(joints)]
-    cells += ["."] * empty
+    cells += ["."] * empty_cells
     return [cells[first : first + columns] for first in range(0, len(cells), columns)]
 
 
@@ -651,10 +652,9 @@ _CHANGE_NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Makes a function that reads the values to draw from the records of a site.
+    """Returns a function that reads the values to draw of any site of a log.
 
-    A site is a process that runs one arm. `TimeFigure.joint_row` draws what the function
-    returns.
+    Figures pass this function to `TimeFigure.joint_row`, which calls it for each site (arm).
 
     Args:
         log: Log with the records of the sites.
@@ -666,18 +666,14 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
     """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
-        """Reads the values to draw from the K records of a site.
-
-        A site is a process that runs one arm, and a record contains the values of one tick
-        (period of its control loop).
+        """Returns the numbers and times of a site's K ticks, and the values to draw.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The numbers of the ticks, shape (K,).
-            Their times, shape (K,), in s.
-            The values, shape (K, J), with J values per record.
+            The numbers of the ticks, shape (K,). Their times, shape (K,), in s. The values,
+            shape (K, J).
         """
         records = log[site]
         return records.tick, records.t_s, values(records)
@@ -732,18 +728,23 @@ class TimeFigure:
         self.figure = figure
         self._small_pt = form.small_pt
         self._interval_s = interval_s or (0.0, recorded_end_s(log))
-        changes = list_changes(log)
+
+        shown_changes = list_changes(log)
         if interval_s is not None:
             # Numbers of other changes would be drawn beside the panels.
             first_s, last_s = interval_s
-            changes = [entry for entry in changes if first_s <= entry.change.at_s <= last_s]
-        self._changes = list(enumerate(changes, 1))
+            shown_changes = [
+                applied for applied in shown_changes if first_s <= applied.change.at_s <= last_s
+            ]
+        self._changes = list(enumerate(shown_changes, 1))
         self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
 
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
     ) -> None:
         """Draws a line over time with a value for each record of a site, in the site's colour.
+
+        If a run has more records than the figure has pixels, only the extremes are drawn.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.
@@ -753,14 +754,14 @@ class TimeFigure:
             **options: Options of the line, which take precedence over those of the site.
         """
         records = self.log[site]
-        line = {**site_line(self.log, site, width), **options}
-        plot_decimated(axes, records.tick, records.t_s, values, **line)
+        line_options = {**site_line(self.log, site, width), **options}
+        plot_decimated(axes, records.tick, records.t_s, values, **line_options)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal over time, with a panel per joint and a line per site.
+        """Draws a signal over time, with a panel per joint and a line per site (arm).
 
-        A site is a process that runs one arm. Times in which a site does not follow other sites
-        are shaded, and changes of settings are marked.
+        Times in which a site does not follow other sites are shaded, and changes of settings
+        are marked.
 
         Args:
             row: The panels, as Matplotlib axes.
@@ -769,9 +770,10 @@ class TimeFigure:
         """
         for site in sites:
             tick, t_s, values = signal(site)
-            line = site_line(self.log, site)
+            line_options = site_line(self.log, site)
             for axes, joint_values in zip(row, values.T, strict=False):
-                plot_decimated(axes, tick, t_s, joint_values, **line)
+                plot_decimated(axes, tick, t_s, joint_values, **line_options)
+
         for axes in row:
             self.mark(axes, sites)
             if len(row) > 2:
@@ -780,10 +782,10 @@ class TimeFigure:
     def mark(
         self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True
     ) -> None:
-        """Marks events in a panel.
+        """Marks what happened during the run in a panel: interruptions and changes of settings.
 
-        The panel is shaded in the colour of a site while the site does not follow its peers. It
-        has a vertical line at each change that the sites applied.
+        The panel is shaded in the colour of a site (arm) while the site does not follow its
+        peers. It has a vertical line at each change that the sites applied.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.
@@ -797,11 +799,15 @@ class TimeFigure:
         for number, applied in self._changes:
             is_other_link = bool(link) and applied.change.link != link
             if applied.site in sites and not is_other_link:
-                at_s = applied.change.at_s
-                self._mark_change(axes, at_s, str(number) if numbered else "")
+                number_text = str(number) if numbered else ""
+                self._mark_change(axes, applied.change.at_s, number_text)
 
     def _shade_modes(self, axes: Axes, site: str) -> None:
-        """Shades a panel in the colour of a site while the site does not follow its peers."""
+        """Shades a panel in the colour of a site while the site does not follow its peers.
+
+        The shading shows when an arm held its position, braked or returned, for example after
+        the network was interrupted.
+        """
         colour = site_colour(self.log, site)
         for mode, from_s, to_s in self._modes[site]:
             axes.axvspan(
@@ -815,6 +821,9 @@ class TimeFigure:
 
     def _mark_change(self, axes: Axes, at_s: float, number: str) -> None:
         """Draws a vertical line at the time of a change.
+
+        The changes of a run, such as another link delay, are numbered and explained below the
+        figure.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.
@@ -862,10 +871,10 @@ class TimeFigure:
 
     def _add_footnote(self, *sentences: str) -> None:
         """Writes sentences below the panels, each on new lines. Empty ones are left out."""
-        letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
+        letters_per_line = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
         lines: list[str] = []
         for sentence in sentences:
-            lines += textwrap.wrap(sentence, letters)
+            lines += textwrap.wrap(sentence, letters_per_line)
         if lines:
             self.figure.supxlabel(
                 typeset("\n".join(lines)),
@@ -884,17 +893,18 @@ class TimeFigure:
         Returns:
             The sentence. Empty if there are no changes.
         """
-        marked = []
+        change_texts = []
         for number, applied in self._changes:
             if applied.change.link or not links:
-                marked.append(f"{number}: {applied.subject} {applied.text}")
-        if not marked:
+                change_texts.append(f"{number}: {applied.subject} {applied.text}")
+        if not change_texts:
             return ""
-        parts = marked[:MOST_EXPLAINED_CHANGES]
-        more = len(marked) - len(parts)
-        if more:
-            parts.append(f"and {more} more")
-        return f"Changes: {'; '.join(parts)}"
+
+        listed_texts = change_texts[:MOST_EXPLAINED_CHANGES]
+        unlisted_count = len(change_texts) - len(listed_texts)
+        if unlisted_count:
+            listed_texts.append(f"and {unlisted_count} more")
+        return f"Changes: {'; '.join(listed_texts)}"
 
     def _explain_shading(self) -> str:
         """Returns a sentence that explains the shaded times. Empty if nothing is shaded."""
@@ -903,8 +913,8 @@ class TimeFigure:
             meanings |= {interval.meaning for interval in intervals}
         if not meanings:
             return ""
-        parts = []
+        phrases = []
         for meaning in sorted(meanings):
             shade = " (lighter)" if meaning.mode is Mode.RETURN else ""
-            parts.append(f"{meaning.does}{shade}")
-        return f"Shaded in the color of a site: it {', '.join(parts)}"
+            phrases.append(f"{meaning.does}{shade}")
+        return f"Shaded in the color of a site: it {', '.join(phrases)}"

@@ -61,18 +61,22 @@ _MAX_FREQUENCIES = 16
 
 
 def compose_log(log: Log) -> Iterator[Block]:
-    """Yields the text that introduces a log.
+    """Yields the text with which a command introduces a recorded run.
 
-    It consists of the session, a table with a row per site, and the notable facts of the run,
-    such as alarms and changes.
+    It consists of a line about the session, a table with a row per arm, and the notable facts
+    of the run, such as alarms and changes of settings.
 
     Args:
         log: Log of the run.
     """
     yield log.headline()
     keys = ("site", "rate_hz", "records", "missing", "last_s")
-    rows = [[str(row[key]) for key in keys] for row in log.to_rows()]
-    yield TextTable(("site", "rate Hz", "records", "missing", "until s"), rows, align="lr")
+    rows = []
+    for row in log.to_rows():
+        cells = [str(row[key]) for key in keys]
+        rows.append(cells)
+    headers = ("site", "rate Hz", "records", "missing", "until s")
+    yield TextTable(headers, rows, align="lr")
     yield from format_run_lines(log)
 
 
@@ -114,16 +118,17 @@ def format_outside_lines(log: Log) -> list[str]:
     for event in log.events:
         if event.kind in OUTSIDE_EVENT_KINDS:
             text = event.text[:MOST_LINE_CHARACTERS]
-            lines.append("".join(letter if letter.isprintable() else " " for letter in text))
+            printable = [letter if letter.isprintable() else " " for letter in text]
+            lines.append("".join(printable))
     return _limit_lines(lines)
 
 
 def format_link_lines(log: Log) -> list[str]:
-    """Returns a line for each link whose delay varies or which loses samples.
+    """Returns a line for each network link whose delay varies or which loses messages.
 
-    A link leads from one site to another, and transmits the samples of the sender's state. A
-    line has the delay that the scenario states for the link, the measured one-way delay, the
-    age of the samples in use, and the losses.
+    A link transmits the state of one arm to another, as a message (sample) per control period.
+    A line has the delay that the scenario states for the link, the measured one-way delay, the
+    age of the messages in use, and the losses.
 
     Args:
         log: Log of the run.
@@ -132,46 +137,47 @@ def format_link_lines(log: Log) -> list[str]:
         The lines. Empty if all links have a constant delay and no losses.
     """
     lines = []
-    for use in link_summary.summarise_links(log):
-        if use.plain:
+    for link in link_summary.summarise_links(log):
+        if link.plain:
             continue
-        measured = any(state.link.measured for state in use.stated)
-        origin = "" if measured else "stated "
+        is_measured = any(model.link.measured for model in link.stated)
+        origin = "" if is_measured else "stated "
 
-        parts = [f"link {use.name}: {origin}{_format_stated_models(use.stated)}"]
-        if use.one_way_us is not None and measured:
-            parts.append(f"one way {_format_spread(use.one_way_us, 1e-3)}")
-        if use.age_ms is None:
-            parts.append("no sample in use")
+        clauses = [f"link {link.name}: {origin}{_format_stated_models(link.stated)}"]
+        if link.one_way_us is not None and is_measured:
+            clauses.append(f"one way {_format_spread(link.one_way_us, 1e-3)}")
+        if link.age_ms is None:
+            clauses.append("no sample in use")
         else:
-            parts.append(f"effective {_format_spread(use.age_ms)}")
-        if use.counts is not None:
-            parts.append(_describe_losses(use, use.counts))
-        lines.append("; ".join(parts))
+            clauses.append(f"effective {_format_spread(link.age_ms)}")
+        if link.counts is not None:
+            clauses.append(_describe_losses(link, link.counts))
+        lines.append("; ".join(clauses))
     return _limit_lines(lines)
 
 
 def _format_change_lines(log: Log) -> list[str]:
-    """Returns a line for each change that was made during the run.
+    """Returns a line for each change of a setting during the run.
 
-    A change is a command to a site, another model of a link, or other dominance factors, which
-    are the weights with which a site follows its peers.
+    A change is a command to an arm, another delay of a link, or other weights with which an arm
+    follows the others (dominance factors).
 
     Args:
         log: Log of the run.
     """
     lines = []
-    for changed in list_changes(log):
-        tick = changed.taken_at_tick
+    for change in list_changes(log):
+        tick = change.taken_at_tick
         origin = "by the scenario" if tick is None else f"applied at tick {tick}"
-        lines.append(f"change: {changed.sentence} ({origin})")
+        lines.append(f"change: {change.sentence} ({origin})")
     return _limit_lines(lines)
 
 
 def _format_mode_lines(log: Log) -> list[str]:
-    """Returns a line for each site that at times did not follow its peers.
+    """Returns a line for each arm that at times did not follow the others.
 
-    Such a site held its position, braked or returned. The line states when it did.
+    The line says when the arm held its position, braked or returned, for example "m1: held
+    2.100-2.600 s".
 
     Args:
         log: Log of the run.
@@ -181,13 +187,13 @@ def _format_mode_lines(log: Log) -> list[str]:
         intervals = find_mode_intervals(log[site])
         if not intervals:
             continue
-        parts = []
+        phrases = []
         for interval in intervals[:MOST_LINES]:
             period = f"{interval.from_s:.3f}-{interval.to_s:.3f} s"
-            parts.append(f"{interval.meaning.did} {period}")
+            phrases.append(f"{interval.meaning.did} {period}")
         if len(intervals) > MOST_LINES:
-            parts.append(f"and {len(intervals) - MOST_LINES} more")
-        lines.append(f"{site}: {', '.join(parts)}")
+            phrases.append(f"and {len(intervals) - MOST_LINES} more")
+        lines.append(f"{site}: {', '.join(phrases)}")
     return lines
 
 
@@ -202,54 +208,55 @@ def format_clock_lines(log: Log) -> list[str]:
     lines = []
     for site in log.sites:
         for peer in log[site].peers:
-            use = link_summary.summarise_clock(log, peer, site)
-            if use is not None and not use.shared:
-                lines.append(f"clock of {peer} seen by {site}: {_format_clock(use)}")
+            clock = link_summary.summarise_clock(log, peer, site)
+            if clock is not None and not clock.shared:
+                lines.append(f"clock of {peer} seen by {site}: {_format_clock(clock)}")
     return _limit_lines(lines)
 
 
 def _format_stated_models(states: Sequence[StatedModel]) -> str:
-    """Describes how a link between two arms delays and loses messages during a run.
+    """Returns how a link delays and loses messages during a run, as its scenario states.
 
-    The description follows the scenario (description of the experiment) and its changes.
+    For example: "constant 400 ms, then constant 800 ms from 5 s on".
 
     Args:
-        states: Models of the link, in the order of time. If there are more than three, only the
-            first and the last are described, with the number of changes between them.
-
-    Returns:
-        The description, for a line of text.
+        states: Delay models of the link, in the order of time. If there are more than three,
+            only the first and the last are described, with the number of changes between them.
     """
-    first, *later = states
-    parts = [first.link.describe()]
-    if len(later) > 2:
-        parts.append(f"{count_nouns(len(later) - 1, 'change')}")
-        later = later[-1:]
-    parts += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later]
-    return ", then ".join(parts)
+    first_model, *later_models = states
+    phrases = [first_model.link.describe()]
+    if len(later_models) > 2:
+        phrases.append(f"{count_nouns(len(later_models) - 1, 'change')}")
+        later_models = later_models[-1:]
+    phrases += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later_models]
+    return ", then ".join(phrases)
 
 
 def _format_clock(use: link_summary.ClockSummary) -> str:
-    """Describes the difference between the clocks of two sites.
+    """Returns a description of how far the clocks of two machines differ.
+
+    Measured one-way delays are only as accurate as this difference is known.
 
     Args:
         use: Summary of the difference over the run.
 
     Returns:
-        The offset, its bound, its drift and faults, as text.
+        The offset, the bound of its error, its drift and faults, as text.
     """
-    known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
-    parts = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
+    bound_text = (
+        f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
+    )
+    clauses = [f"{use.offset_us / 1e3:+.3f} ms at the end, {bound_text}"]
     if use.drift_ppm is not None:
-        parts.append(f"drift {use.drift_ppm:+.2f} ppm")
+        clauses.append(f"drift {use.drift_ppm:+.2f} ppm")
     if use.faults:
-        early = count_nouns(
+        early_text = count_nouns(
             use.faults,
             singular="sample arrived before it was sent",
             plural="samples arrived before they were sent",
         )
-        parts.append(f"{early}: a clock has stepped")
-    return ", ".join(parts)
+        clauses.append(f"{early_text}: a clock has stepped")
+    return ", ".join(clauses)
 
 
 def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -> str:
@@ -274,6 +281,8 @@ def _format_number(value: float) -> str:
 def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
     """Returns the number and percentage of a link's samples that were not used, by reason.
 
+    A sample is the state that one site sends to another in each control period.
+
     Args:
         use: Summary of the link.
         counts: Numbers of its samples.
@@ -285,15 +294,15 @@ def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleC
         "superseded": counts.superseded,
         "duplicates": counts.duplicate + counts.copies,
     }
-    judged = max(counts.judged, 1)
-    parts = []
+    judged_count = max(counts.judged, 1)
+    clauses = []
     for name, count in losses.items():
         if count:
-            parts.append(f"{name} {count} ({100 * count / judged:.3g} %)")
+            clauses.append(f"{name} {count} ({100 * count / judged_count:.3g} %)")
     # Shorter bursts would be printed as "1 in a row", which says nothing.
     if use.burst is not None and use.burst > 1.005:
-        parts.append(f"{_format_number(use.burst)} in a row")
-    return ", ".join(parts) or "nothing lost"
+        clauses.append(f"{_format_number(use.burst)} in a row")
+    return ", ".join(clauses) or "nothing lost"
 
 
 def _limit_lines(lines: list[str]) -> list[str]:
@@ -330,15 +339,16 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
         mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
         # The text of the check may name a single location already.
-        if finding.wrong == 1 and str(finding.places[0]) in finding.text:
+        is_named_already = finding.wrong == 1 and str(finding.places[0]) in finding.text
+        if is_named_already:
             continue
         for location in finding.places[:_MAX_LOCATIONS]:
             names_file = len(report.files) > 1 and location.file
-            file = f"{location.file}: " if names_file else ""
-            yield f"       {file}{location}"
+            file_text = f"{location.file}: " if names_file else ""
+            yield f"       {file_text}{location}"
         if finding.wrong > _MAX_LOCATIONS:
-            more = finding.wrong - _MAX_LOCATIONS
-            yield f"       and {more} more; --json names {len(finding.places)}"
+            unlisted_count = finding.wrong - _MAX_LOCATIONS
+            yield f"       and {unlisted_count} more; --json names {len(finding.places)}"
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
@@ -353,6 +363,7 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
     state = "was finished" if recovery.finished else "was not finished"
     yield f"{recovery.output}: recovered from {recovery.path}, which {state}"
     rows = []
+    # Each row of the table is a heading and a text.
     record_counts = recovery.coverage.judged
     if record_counts:
         counts = ", ".join(f"{site} {count}" for site, count in record_counts.items())
@@ -360,16 +371,18 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
         rows.append(("of the run", str(recovery.coverage)))
         rows.append(("source", f"digest chain {recovery.chain}"))
     rows.append(("messages", f"{recovery.messages} in {recovery.duration_s:.3f} s"))
-    lists = [("lost", recovery.lost)]
+
+    loss_lists = [("lost", recovery.lost)]
     # Without a number of expected records nothing can be called missing.
     if recovery.coverage.expected:
-        lists.append(("missing", recovery.missing))
-    for name, lines in lists:
-        first, *others = lines[:_MAX_LOSSES] or ["nothing"]
-        rows.append((name, first))
-        rows += [("", text) for text in others]
+        loss_lists.append(("missing", recovery.missing))
+    for name, lines in loss_lists:
+        first_loss, *other_losses = lines[:_MAX_LOSSES] or ["nothing"]
+        rows.append((name, first_loss))
+        rows += [("", text) for text in other_losses]
         if len(lines) > _MAX_LOSSES:
             rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
+
     yield TextTable(("", ""), [(f"  {name}", text) for name, text in rows])
 
 
@@ -385,14 +398,20 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
     request = rerun.request
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
     yield f"{request.mode}: {', '.join(request.replaced)} executed afresh{recorded}"
+
     changes = describe_rerun_changes(request)
     for line in changes or ["nothing is changed: this is the experiment of the log"]:
         yield f"  {line}"
+
+    # The table has a row for each executed site, with pairs of columns: logged and rerun.
     undelayed = _compare_undelayed_errors(rerun)
     rows = []
+
+    # Details that do not fit into the table.
     for effect in rerun.sites.values():
         pairs: list[tuple[float, float] | None] = []
         pairs += [effect.error_rms_rad, effect.error_max_rad]
+
         if undelayed:
             pairs.append(undelayed.get(effect.site))
         pairs.append(effect.torque_max_nm)
@@ -400,6 +419,7 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
         for pair in pairs:
             cells += ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
         rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
+
     headers = ["site", "ticks", "identical", "rms e rad", "rerun", "max e rad", "rerun"]
     if undelayed:
         headers += ["undelayed", "rerun"]
@@ -426,22 +446,27 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
 
 
 def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
-    """Returns the largest undelayed error of each executed site, in the log and in the rerun.
+    """Returns how far arms were from the others at the same time, in a log and in its rerun.
 
-    Both are taken over the times of which the log and the rerun have a record. Sites without
-    such an error, for example because they follow nobody, are left out.
+    The tracking error compares an arm with delayed states of the others. The undelayed error
+    compares it with their states at the same time, and shows the effect of another delay. Both
+    runs are compared over the times of which both have a record. Sites that follow nobody have
+    no such error, and are left out.
+
+    Returns:
+        Largest undelayed error in the log and in the rerun, by site.
     """
-    log = RunView(rerun.before)
-    repeated = RunView(rerun.after)
+    logged_run = RunView(rerun.before)
+    repeated_run = RunView(rerun.after)
     key = "undelayed_max_rad" if shared_unit(rerun.before) == "rad" else "undelayed_max_m"
     errors = {}
     for site, effect in rerun.sites.items():
         if not effect.compared:
             continue
-        before = measure_undelayed_error(log, site, repeated)[key].value
-        after = measure_undelayed_error(repeated, site, log)[key].value
-        if before is not None and after is not None:
-            errors[site] = (before, after)
+        logged_error = measure_undelayed_error(logged_run, site, repeated_run)[key].value
+        repeated_error = measure_undelayed_error(repeated_run, site, logged_run)[key].value
+        if logged_error is not None and repeated_error is not None:
+            errors[site] = (logged_error, repeated_error)
     return errors
 
 
@@ -455,7 +480,9 @@ def _name_sample(tick: object) -> str:
 
 
 def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
-    """Returns lines on the differences between the rerun of a site and the log.
+    """Returns lines about the differences between the log of an arm and its repeated execution.
+
+    They state the largest deviation of the joint angles, and the first value that differs.
 
     Args:
         effect: The differences.
@@ -463,18 +490,23 @@ def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
     """
     lines = []
     if effect.q_max_rad:
-        largest = f"{effect.q_max_rad:.3g} rad off the log, at {effect.q_max_at_s:.3f} s"
-        lines.append(f"q is up to {largest}; {effect.q_rms_rad:.3g} rad rms")
-    first = effect.first
-    if first is not None:
-        logged, computed = _format_difference(first.logged, first.computed)
-        when = f"tick {first.tick} ({first.tick / rate_hz:.3f} s)"
-        change = f"{first.field} was {logged}, is {computed}"
-        if first.field.startswith(_USED_FIELD):
-            peer = first.field.removeprefix(_USED_FIELD).removesuffix("]")
-            samples = [_name_sample(tick) for tick in (first.logged, first.computed)]
-            change = f"the sample of {peer} in use was {samples[0]}, is {samples[1]}"
-        lines.append(f"the first difference is at {when}: {change}")
+        largest_text = f"{effect.q_max_rad:.3g} rad off the log, at {effect.q_max_at_s:.3f} s"
+        lines.append(f"q is up to {largest_text}; {effect.q_rms_rad:.3g} rad rms")
+
+    first_difference = effect.first
+    if first_difference is not None:
+        logged_text, computed_text = _format_difference(
+            first_difference.logged, first_difference.computed
+        )
+        time_text = f"tick {first_difference.tick} ({first_difference.tick / rate_hz:.3f} s)"
+        change = f"{first_difference.field} was {logged_text}, is {computed_text}"
+        if first_difference.field.startswith(_USED_FIELD):
+            peer = first_difference.field.removeprefix(_USED_FIELD).removesuffix("]")
+            logged_sample = _name_sample(first_difference.logged)
+            computed_sample = _name_sample(first_difference.computed)
+            change = f"the sample of {peer} in use was {logged_sample}, is {computed_sample}"
+        lines.append(f"the first difference is at {time_text}: {change}")
+
     if effect.diverged_at_s is not None:
         lines.append(f"diverged at {effect.diverged_at_s:.3f} s and ends there")
     return lines
@@ -532,12 +564,17 @@ def compose_ping(report: Result) -> Iterator[Block]:
     yield f"session {facts['session']} {state}; times in us; {clock_note}"
     rows = []
     for member in members:
-        rtt = member.get("rtt_us", {})
-        times_us = [rtt.get("min"), rtt.get("p50"), rtt.get("p99"), member.get("jitter_us")]
-        times = ["" if time_us is None else f"{time_us:.0f}" for time_us in times_us]
+        round_trip_us = member.get("rtt_us", {})
+        times_us = [
+            round_trip_us.get("min"),
+            round_trip_us.get("p50"),
+            round_trip_us.get("p99"),
+            member.get("jitter_us"),
+        ]
+        time_cells = ["" if time_us is None else f"{time_us:.0f}" for time_us in times_us]
         answers = str(member["answers"])
         rows.append(
-            [member["member"], member["host"], answers, *times, _describe_clock(member)]
+            [member["member"], member["host"], answers, *time_cells, _describe_clock(member)]
         )
     headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
     yield TextTable(headers, rows, align="llrrrrrl")
@@ -548,11 +585,11 @@ def compose_ping(report: Result) -> Iterator[Block]:
         for link in links:
             delays_us = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
             # A negative time stands for a delay that was not measured.
-            delays = ["none" if delay_us < 0 else str(delay_us) for delay_us in delays_us]
-            offset = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
-            rows.append([link["from"], link["to"], *delays, *offset])
-        heads = ("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
-        yield TextTable(heads, rows, align="llr")
+            delay_cells = ["none" if delay_us < 0 else str(delay_us) for delay_us in delays_us]
+            clock_cells = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
+            rows.append([link["from"], link["to"], *delay_cells, *clock_cells])
+        link_headers = ("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
+        yield TextTable(link_headers, rows, align="llr")
 
 
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -579,6 +616,7 @@ def compose_topic_delays(report: Result) -> Iterator[Block]:
         delays_us = publisher["delay_us"]
         if delays_us["min"] < 0.0:
             has_negative_delay = True
+
         cells = [
             publisher["gid"][:8],
             publisher["type"],
@@ -633,7 +671,7 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
     """
     facts = benchmark.to_dict()
     needs = facts["needs"]
-    name = facts["scenario"]
+    scenario_name = facts["scenario"]
     if facts["connect"]:
         yield f"the network from this machine to {', '.join(facts['connect'])}"
     else:
@@ -642,23 +680,26 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
             "which trilat ping --answer runs"
         )
     yield "one way is half a round trip with the handling at the far end; times in us"
+
     rows = []
     for row in facts["rows"]:
-        times = row["one_way_us"] or {}
-        delays = [f"{times[key]:.0f}" if key in times else "" for key in ("p50", "p99", "max")]
+        percentiles_us = row["one_way_us"] or {}
+        delay_cells = [
+            f"{percentiles_us[key]:.0f}" if key in percentiles_us else ""
+            for key in ("p50", "p99", "max")
+        ]
         same_size = row["bytes"] == needs["sample_bytes"]
         same_rate = row["rate_hz"] == needs["rate_hz"]
-        scenario = name if same_size and same_rate else ""
+        scenario_cell = scenario_name if same_size and same_rate else ""
         counts = [row["bytes"], f"{row['rate_hz']:g}", row["sent"], row["lost"]]
-        rows.append([row["transport"], *map(str, counts), *delays, scenario])
+        rows.append([row["transport"], *map(str, counts), *delay_cells, scenario_cell])
     headers = ("transport", "bytes", "rate", "sent", "lost", "p50", "p99", "max", "as in")
     yield TextTable(headers, rows, align="lrrrrrrrl", units=("", "", "Hz"))
-    yield f"{name}: {needs['words']}"
+    yield f"{scenario_name}: {needs['words']}"
     for transport in facts["transports"]:
         mark = MARKS["ok" if transport["good"] else "fail"]
-        yield MarkedText(
-            mark, f"{transport['transport']}: {_judge_transport(transport, needs)}"
-        )
+        judgement = _judge_transport(transport, needs)
+        yield MarkedText(mark, f"{transport['transport']}: {judgement}")
 
 
 def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
@@ -684,43 +725,42 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
     if needs["held_ms"]:
         relation = "hides in" if transport["hidden"] else "exceeds"
         delay += f" {relation} the {needs['held_ms']:g} ms for which links hold samples"
-    parts = [delay, f"samples are in use {transport['age_ms']:.4g} ms old"]
+    clauses = [delay, f"samples are in use {transport['age_ms']:.4g} ms old"]
 
     is_stability_known = needs["stable_ms"] is not None
     if transport["spare_ms"] is not None:
-        parts.append(f"{transport['spare_ms']:.4g} ms to spare")
+        clauses.append(f"{transport['spare_ms']:.4g} ms to spare")
     elif is_stability_known:
-        parts.append("at which the loop is not stable")
+        clauses.append("at which the loop is not stable")
     if transport["lost_share"]:
-        parts.append(f"{100 * transport['lost_share']:.3g} % lost")
+        clauses.append(f"{100 * transport['lost_share']:.3g} % lost")
 
     # A play-out buffer of the largest delay makes the delay of all samples equal.
     playout = (
         f"a play-out of {transport['playout_ms']} ms would hold every one of these samples"
     )
-    return f"{', '.join(parts)}; {playout}"
+    return f"{', '.join(clauses)}; {playout}"
 
 
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields the tables with the measured numbers of a run.
 
-    There is a table for each group of quantities. The numbers may belong to the run, a site
-    (process that runs one arm), a link between two sites, or a wall. Further tables describe
-    what operators feel: forces, stiffness and impedance. Last come the reasons why numbers are
-    missing.
+    There is a table for each group of quantities, with a column for each subject: the run, an
+    arm, a network link, or a wall. Further tables describe what operators feel: forces,
+    stiffness and impedance. Last come the reasons why numbers are missing.
 
     Args:
         metrics: The measured numbers.
     """
     reasons: dict[str, list[str]] = {}
     tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
-    for (group, _), members in tables:
-        yield from _compose_group(group, list(members), metrics, reasons)
+    for (group, _), group_quantities in tables:
+        yield from _compose_group(group, list(group_quantities), metrics, reasons)
     yield from _compose_sharing(metrics)
     yield from _compose_stiffness(metrics)
     yield from _compose_impedance(metrics)
-    for reason, missing in reasons.items():
-        yield _explain_missing(sanitize(", ".join(missing)), reason)
+    for reason, missing_names in reasons.items():
+        yield _explain_missing(sanitize(", ".join(missing_names)), reason)
 
 
 def _explain_missing(subject: str, reason: str) -> MarkedText:
@@ -745,7 +785,7 @@ def _compose_group(
     applicable = {
         quantity: by_subject
         for quantity, by_subject in values.items()
-        if any(metric.applies for metric in by_subject.values())
+        if _apply_any(by_subject.values())
     }
 
     # All quantities of a group have the same subjects.
@@ -753,7 +793,7 @@ def _compose_group(
     subjects = [
         subject
         for subject in all_subjects
-        if any(by_subject[subject].applies for by_subject in applicable.values())
+        if _apply_any(by_subject[subject] for by_subject in applicable.values())
     ]
     if not subjects:
         return
@@ -773,10 +813,10 @@ def _compose_group(
 
 
 def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table of the forces that a site at rest feels while another site is pushed.
+    """Yields a table of the forces that an arm at rest feels while another arm is pushed.
 
-    The expected force follows from the dominance factors, which are the weights with which the
-    sites follow each other. Yields nothing if no site was at rest while another one was pushed.
+    The expected force follows from the dominance factors, the weights with which the arms
+    follow each other. Yields nothing if no arm was at rest while another one was pushed.
     """
     if not metrics.sharing_ratios:
         return
@@ -785,7 +825,9 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
     if metrics.axes:
         joint_header = "axis"
         unit = metrics.unit("N m", 1)
+
     rows = []
+
     for pair in metrics.sharing_ratios:
         wall_note = " (wall)" if pair.by_wall else ""
         deviation = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %"
@@ -800,6 +842,7 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
             deviation,
         ]
         rows.append(row)
+
     headers = (
         "at rest",
         joint_header,
@@ -819,23 +862,29 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table of the stiffness that sites felt, or nothing if it was not measured."""
+    """Yields a table of the stiffness that operators felt at the arms.
+
+    It is the change of an operator's torque over the change of the joint angle, for example
+    against a wall that another arm touches. Yields nothing if no stiffness was measured.
+    """
     if not metrics.stiffness:
         return
+
     rows = []
-    for felt in metrics.stiffness:
+    for measurement in metrics.stiffness:
         stiffness = _NO_NUMBER
-        if felt.stiffness_nm_rad is not None:
-            stiffness = _format_value(felt.stiffness_nm_rad)
+        if measurement.stiffness_nm_rad is not None:
+            stiffness = _format_value(measurement.stiffness_nm_rad)
         row = [
-            f"{felt.from_s:.1f} to {felt.to_s:.1f} s",
-            metrics.label(felt.joint),
-            felt.site,
-            _format_value(felt.torque_nm),
-            _format_value(felt.angle_rad),
+            f"{measurement.from_s:.1f} to {measurement.to_s:.1f} s",
+            metrics.label(measurement.joint),
+            measurement.site,
+            _format_value(measurement.torque_nm),
+            _format_value(measurement.angle_rad),
             stiffness,
         ]
         rows.append(row)
+
     headers = (
         "stiffness felt",
         "axis" if metrics.axes else "joint",
@@ -858,17 +907,17 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
     rows = []
     for response in metrics.responses:
         direction = "along" if metrics.axes else "joint"
-        source = f" of {response.of}" if response.of else ""
+        source_text = f" of {response.of}" if response.of else ""
         axis = f"{direction} {metrics.label(response.joint)}"
-        title = f"{response.kind}{source} at {response.at}, {axis}"
+        title = f"{response.kind}{source_text} at {response.at}, {axis}"
         unit = metrics.unit(response.unit, response.joint)
-        ratios: Sequence[FrequencyResponse] = [response.ratio]
+        listed_ratios: Sequence[FrequencyResponse] = [response.ratio]
         if len(response.spectrum) > 1:
             # Every step-th ratio is listed. The step is rounded up, so that at most
             # _MAX_FREQUENCIES ratios are listed.
             step = math.ceil(len(response.spectrum) / _MAX_FREQUENCIES)
-            ratios = response.spectrum[::step]
-        for index, ratio in enumerate(ratios):
+            listed_ratios = response.spectrum[::step]
+        for index, ratio in enumerate(listed_ratios):
             shown_title = title if index == 0 else ""
             rows.append([shown_title, unit, *_list_response_cells(ratio)])
     headers = ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""]
@@ -886,6 +935,11 @@ def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
     cells = [_format_value(number or 0.0) for number in numbers]
     error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
     return [*cells, f"+- {error}"]
+
+
+def _apply_any(metrics: Iterable[Metric]) -> bool:
+    """Returns True if at least one of some metrics makes sense for the run."""
+    return any(metric.applies for metric in metrics)
 
 
 def _format_metric(metric: Metric) -> str:
@@ -910,7 +964,7 @@ def _tabulate(
         text_columns: Number of columns at the left that have texts, and are aligned to the
             left. The other columns have numbers, and are aligned to the right.
     """
-    last = "r" if heads[-1] else "l"
-    align = "l" * text_columns + "r" * (len(heads) - text_columns - 1) + last
-    yield TextTable(heads, list(rows), align)
+    last_letter = "r" if heads[-1] else "l"
+    alignment = "l" * text_columns + "r" * (len(heads) - text_columns - 1) + last_letter
+    yield TextTable(heads, list(rows), alignment)
     yield ""

@@ -339,16 +339,18 @@ def warn_of_damage(log: "Log") -> None:
     for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
         print_note(problem)
     if log.damaged:
-        rest = len(log.damaged) - _MAX_DAMAGED
-        unlisted = f"and {rest} more damaged parts; " if rest > 0 else ""
+        unlisted_count = len(log.damaged) - _MAX_DAMAGED
+        unlisted_text = (
+            f"and {unlisted_count} more damaged parts; " if unlisted_count > 0 else ""
+        )
         advice = "make a whole file of everything that can be read: trilat log recover FILE"
-        print_note(f"{unlisted}{advice}")
+        print_note(f"{unlisted_text}{advice}")
 
 
 def warn_user_laws(log: "Log") -> None:
-    """Tells the user which user-written control laws a new execution of the log will run.
+    """Tells the user which user-written control laws will run when a log is executed again.
 
-    It also names those that it may not run, because the user has not allowed it.
+    The warning also names the laws that may not run, because the user has not allowed them.
 
     Args:
         log: The log.
@@ -380,6 +382,7 @@ def warn_if_unfinished(path: Path) -> None:
         scanner = RecordScanner(stream)
         if scanner.ends:
             return
+        # The file is scanned for intact records only if its end is damaged, which takes longer.
         survey = RecoverySurvey(scanner)
     if scanner.finished:
         trailing = count_nouns(scanner.trailing, "byte follows", "bytes follow")

@@ -107,7 +107,11 @@ def _describe_coarse_energies(energies: facts.CoarseEnergies) -> str:
 
 
 def _describe_course(course: facts.FunctionalCourse) -> str:
-    """Returns whether V rose, and what follows of it from the premises of the theorem."""
+    """Returns whether V, the energy function of the stability proof, rose during a run.
+
+    The sentence also says whether the premises (conditions) of the theorem hold, under which V
+    must not rise.
+    """
     if course.rise is not None:
         context = "though the premises of the theorem hold, which is one of continuous time"
         if course.failed:
@@ -117,13 +121,14 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
     text = "V did not rise"
     if course.external:
         text = f"V rose by no more than the {' and '.join(course.external)} gave"
-    first = f"{course.first_j:.4g} J at {course.from_s:.4g} s"
-    text += f": {first}, {course.last_j:.4g} J at {course.to_s:.4g} s"
-    undecided = [describe_quantities(quantities) for quantities in course.undecided]
-    text = "; ".join([text, *undecided])
+    first_text = f"{course.first_j:.4g} J at {course.from_s:.4g} s"
+    text += f": {first_text}, {course.last_j:.4g} J at {course.to_s:.4g} s"
+    undecided_texts = [describe_quantities(quantities) for quantities in course.undecided]
+    text = "; ".join([text, *undecided_texts])
     if course.failed:
         return f"{_describe_failed(course.failed)}; {text}"
-    return f"{_COVERED}{', as far as the log tells' if undecided else ''}: {text}"
+    reservation = ", as far as the log tells" if undecided_texts else ""
+    return f"{_COVERED}{reservation}: {text}"
 
 
 def _describe_failed(names: Sequence[str]) -> str:
@@ -156,7 +161,9 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
 
 
 def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
-    """Returns a sentence on a growth of V that nobody supplied, although the run looks stable.
+    """Returns a sentence on a growth of the energy V that no operator or wall explains.
+
+    Such a growth is doubtful, even if the run looks stable.
 
     Args:
         growth: The growth at the end of the run.
@@ -179,7 +186,9 @@ def describe_evidence(evidence: facts.Evidence) -> str:
 
 
 def doubt_evidence(evidence: facts.Evidence) -> list[str]:
-    """Returns sentences that say why records do not suffice to judge a run.
+    """Returns sentences that say why records do not suffice to judge the stability of a run.
+
+    For example, the log has been changed, or too many records are missing.
 
     Args:
         evidence: The records on which a certificate is based.
@@ -187,15 +196,16 @@ def doubt_evidence(evidence: facts.Evidence) -> list[str]:
     Returns:
         The sentences. Empty if the records suffice.
     """
-    least = evidence.min_coverage
+    required_share = evidence.min_coverage
     reasons = []
     if not evidence.integrity.passed:
         reasons.append(f"the log is not as it was made: {evidence.integrity.text}")
-    if evidence.coverage.share < least:
-        reasons.append(f"records are missing: {evidence.coverage.describe(least)}")
-    share = evidence.functional_share
-    if share is not None and share < least:
-        reasons.append(f"V is judged over {100.0 * share:.4g} % of its periods")
+    if evidence.coverage.share < required_share:
+        reasons.append(f"records are missing: {evidence.coverage.describe(required_share)}")
+
+    judged_share = evidence.functional_share
+    if judged_share is not None and judged_share < required_share:
+        reasons.append(f"V is judged over {100.0 * judged_share:.4g} % of its periods")
     if evidence.unmet:
         sites = " and ".join(evidence.unmet)
         reasons.append(f"{sites}, as recorded, did not react to this run")

@@ -59,6 +59,7 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
             f"with --views off; write a file for viewers with `trilat log export {log} --to "
             "ros2`, and name that file instead"
         )
+
     sources = {"ROS 2": channels}
     if _is_log(channels):
         sources = {"Log": channels, "ROS 2": _list_session_topics(log)}
@@ -68,7 +69,9 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
 
 
 def write_rviz_config(log: Path, *, force: bool = False) -> Path:
-    """Writes a configuration of RViz, the viewer of ROS, for the session of a log or for a bag.
+    """Writes a configuration of RViz, the 3D viewer of ROS, that shows the arms of a log.
+
+    A log is shown while its session is running over ROS, and a bag while it is played.
 
     Args:
         log: File of the log or bag.
@@ -107,7 +110,7 @@ def _list_session_topics(log: Path) -> dict[str, Ros2Channel]:
     Raises:
         LogError: The log cannot be read.
     """
-    opened = open_log(log)
-    session = make_session_name(opened.session["session"])
-    table = TopicTable.read(NAMINGS[0])
-    return list_full_topics(opened.scenario, session, table)
+    opened_log = open_log(log)
+    session = make_session_name(opened_log.session["session"])
+    topic_names = TopicTable.read(NAMINGS[0])
+    return list_full_topics(opened_log.scenario, session, topic_names)

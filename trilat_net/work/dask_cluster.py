@@ -66,6 +66,7 @@ def describe_worker() -> WorkerIdentity:
         for file in sorted(root.rglob("*.py")):
             name = file.relative_to(root.parent).as_posix()
             digest.update(name.encode() + b"\0" + file.read_bytes())
+
     provenance = collect_provenance()
     return {
         "trilat-net": provenance["version_trilat-net"],
@@ -129,6 +130,7 @@ def explain_unfit_worker(
             f"has {remote_text}, but the study needs {local_text}; results from both cannot "
             "be mixed"
         )
+
     if lacks:
         return (
             f"lacks the control law {', '.join(lacks)}, or has another file of it: "
@@ -164,6 +166,9 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 def check_this_worker(required: WorkerRequirements) -> None:
     """Checks in a worker of a cluster that it would compute the same results as this study.
+
+    A worker that joins during the study has not been checked before. Results from different
+    program versions must not be mixed.
 
     Args:
         required: Versions of the program and its packages, and files of control laws, that
@@ -296,6 +301,7 @@ class DaskCluster:
                     f"the worker {worker} has Python {worker_python}, "
                     f"but this program runs on Python {python}"
                 )
+
         answers = self._client.run(_make_probe(), files, on_error="return")
         for worker, answer in answers.items():
             if isinstance(answer, BaseException):
@@ -321,6 +327,7 @@ class DaskCluster:
             raise RunFailed(
                 f"the scheduler at {self.address} no longer responds: {error}"
             ) from None
+
         now_ns = self._clock.monotonic_ns()
         if workers or self._last_worker_ns < 0:
             self._last_worker_ns = now_ns

@@ -117,6 +117,7 @@ def run_batch(
     start_ns = clock.monotonic_ns()
     results: list[Any] = []
     error = None
+
     with allowing_any_settings(allowed):
         new_results: Iterable[Any] = map(function, items)
         if together is not None and len(items) > 1:
@@ -231,6 +232,9 @@ class _Feed(Generic[T]):
     def return_lost(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
         """Puts the items of a batch whose worker died back into the queue, to run them again.
 
+        A worker may die because the operating system has run out of memory. Most of its items
+        succeed in a second attempt.
+
         Args:
             batch: Batch whose worker died.
             losses: Number of losses that count for each item.
@@ -300,7 +304,9 @@ class WorkerPool:
     ) -> Iterator[tuple[int, R]]:
         """Runs a function on each item with all workers, and yields each result as it arrives.
 
-        The order of the results may differ from that of the items.
+        An item is an independent piece of work, such as one simulated run. The order of the
+        results may differ from that of the items, so that a study can store each result at
+        once.
 
         Args:
             function: Function at module level, so that another process can import it.
@@ -337,6 +343,7 @@ class WorkerPool:
                 self._submit(function, feed, pending, together)
                 if not pending:
                     return
+
                 ended = wait(pending, _POLL_S, FIRST_COMPLETED).done
                 if not ended and self._cluster is not None:
                     self._cluster.check_alive()
@@ -405,6 +412,7 @@ class WorkerPool:
             batch = feed.pop_batch(idle=not pending)
             if not batch:
                 return
+
             numbers = [number for number, _ in batch]
             items = [item for _, item in batch]
             arguments: Any = (function, items, self._required, dict(allowed_code), together)

@@ -14,6 +14,7 @@ Invariant:
 import csv
 import errno
 import io
+import itertools
 import json
 import os
 import zlib
@@ -30,6 +31,9 @@ from .executor import Progress, Together, WorkerPool
 
 def extend_file(path: Path) -> BinaryIO:
     """Opens a file for appending without a buffer, and creates it if it does not exist.
+
+    No buffer means that a line is in the file as soon as it was written, even if the process is
+    killed then.
 
     Args:
         path: Path of the file.
@@ -69,7 +73,8 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
             first appear.
     """
     stream = io.StringIO()
-    header = columns or list(dict.fromkeys(key for row in rows for key in row))
+    all_keys = itertools.chain.from_iterable(rows)
+    header = columns or list(dict.fromkeys(all_keys))
     writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -209,6 +214,8 @@ class RunJournal(Generic[E]):
         self._study = study
         self._remedy = remedy
         self.done: StoredRuns[E] = StoredRuns(path, kind)
+
+        # Read the runs that an interrupted study has stored already.
         offset = 0
         is_torn = False
         if path.exists():
@@ -219,6 +226,7 @@ class RunJournal(Generic[E]):
                         self.done.add_offset(_read_key(text, kind), offset)
                     offset += len(line)
                     is_torn = not line.endswith(b"\n")
+
         self._file = extend_file(path)
         if is_torn:
             # The last line is torn. It is ended here, so that it does not spoil the next one.
@@ -246,11 +254,13 @@ class RunJournal(Generic[E]):
         """
         if (entry.cell, entry.seed) in self.done:
             return
+
         values = msgspec.to_builtins(entry)
         text = json.dumps(values, separators=(",", ":")).encode()
         checksum = self._checksum(text)
         line = b"%s\t%08x\n" % (text, checksum)
         self._write(line)
+
         offset = self._file.tell() - len(line)
         self.done.add_offset(_RunKey(entry.cell, entry.seed), offset)
 
@@ -266,7 +276,7 @@ class RunJournal(Generic[E]):
         together_count: int = 1,
         note: Callable[[E], None] | None = None,
     ) -> None:
-        """Executes the runs of a study that are not finished yet, and writes each as it ends.
+        """Executes the unfinished runs of a study, and stores each run as soon as it ends.
 
         Args:
             pool: Workers that execute the runs.
@@ -295,6 +305,7 @@ class RunJournal(Generic[E]):
             except LogRefused as error:
                 progress = f"{number - 1} of {count_nouns(total, 'run')} had finished"
                 raise LogRefused(f"{error}; {progress}") from None
+
             if note is not None:
                 note(entry)
             show(number, total)

@@ -127,7 +127,8 @@ class DeviceHand:
             self.release()
 
         self.states += 1
-        if all(map(math.isfinite, (*state.position_m, *state.velocity_m_s))):
+        is_readable = all(map(math.isfinite, (*state.position_m, *state.velocity_m_s)))
+        if is_readable:
             self._follow(state, now_ns)
         else:
             self.unreadable += 1
@@ -180,22 +181,26 @@ class DeviceHand:
             self._move_target(step_m, elapsed_s)
 
     def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
-        """Moves the target by a step of the device, unless the step is a jump.
+        """Moves the target of the arm by a motion of the device, in rotated and scaled form.
 
-        A step is a jump if it is longer than the speed limit of the scenario allows.
+        A motion that is faster than the speed limit of the scenario is a jump, for example
+        after a lost message. It is counted and ignored.
 
         Args:
             step_m: Change of the device's position, in m.
             elapsed_s: Time since the previous state, in s.
         """
         settings = self._settings
-        gap_s = min(max(elapsed_s, _MIN_STATE_GAP_S), _MAX_STATE_GAP_S)
-        if math.hypot(*step_m) > settings.jump_m_s * gap_s:
+        limited_gap_s = min(max(elapsed_s, _MIN_STATE_GAP_S), _MAX_STATE_GAP_S)
+        is_jump = math.hypot(*step_m) > settings.jump_m_s * limited_gap_s
+        if is_jump:
             self.jumps += 1
             return
+
         target: list[float] = []
         for coordinate, axis in zip(self._target, self._axes, strict=True):
-            target.append(coordinate + settings.scale * _compute_product(axis, step_m))
+            step_along_axis = settings.scale * _compute_product(axis, step_m)
+            target.append(coordinate + step_along_axis)
         self._target = list(self._reach.find_nearest(target))
 
     def _compute_force(self) -> Vector:
@@ -221,6 +226,7 @@ class DeviceHand:
         magnitude = max(math.hypot(*force), 1e-9)  # avoids a division by zero
         reduction = min(1.0, settings.force_limit_n / magnitude)
         device_axes = zip(*self._axes, strict=True)
+        # The force is reduced to the limit, and rotated to the axes of the device.
         x, y, z = (reduction * _compute_product(force, axis) for axis in device_axes)
         return x, y, z
 
@@ -283,6 +289,7 @@ class DeviceHand:
                             button = repr(self._settings.clutch)
                             say(f"the device is there: its button {button} takes hold")
                         is_present = True
+
             except OSError as problem:
                 self.release()
                 if is_present is not False:

@@ -169,15 +169,16 @@ class HandImpedance(Result):
         yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
         yield self._tabulate_matrices()
         sine_rows = [_format_response(response) for response in self.responses]
-        heads = ("sine", "motion", "force", "coherence", "unexplained")
+        headers = ("sine", "motion", "force", "coherence", "unexplained")
         units = ("Hz", "mm", "N")
-        yield TextTable(heads, sine_rows, "r", units)
-        settings: list[str] = []
+        yield TextTable(headers, sine_rows, "r", units)
+
+        setting_texts: list[str] = []
         for key, value in self.to_hand().items():
-            text = json.dumps(value)
-            settings.append(f"{key} = {text}")
-        table = ", ".join(settings)
-        yield f"in a scenario, without the mass of the hand: hands = [{{ {table} }}]"
+            value_text = json.dumps(value)
+            setting_texts.append(f"{key} = {value_text}")
+        table_text = ", ".join(setting_texts)
+        yield f"in a scenario, without the mass of the hand: hands = [{{ {table_text} }}]"
 
     def _tabulate_matrices(self) -> TextTable:
         """Returns a table with a row for each of M, B and K, and a column for each entry.
@@ -187,18 +188,18 @@ class HandImpedance(Result):
         """
         axes = "xyz"[: len(self.K)]
         entries = list(product(range(len(axes)), repeat=2))
-        heads = [axes[row] + axes[column] for row, column in entries]
+        headers = [axes[row] + axes[column] for row, column in entries]
         rows: list[tuple[str, ...]] = []
         for letter, unit in UNITS.items():
             matrix = getattr(self, letter)
-            half = self.halves[letter]
+            half_widths = self.halves[letter]
             cells = [f"{letter}, {unit}"]
             for entry in entries:
                 value = matrix[entry]
-                half_width = half[entry]
+                half_width = half_widths[entry]
                 cells.append(f"{value:.4g} +- {half_width:.2g}")
             rows.append(tuple(cells))
-        return TextTable(("", *heads), rows, align="lr")
+        return TextTable(("", *headers), rows, align="lr")
 
 
 def _format_response(response: _SineResponse) -> tuple[str, ...]:
@@ -295,10 +296,13 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
 def _list_responses(
     F: Complex, X: Complex, hz: Array, unexplained: Array
 ) -> tuple[_SineResponse, ...]:
-    """Returns the response at each frequency, averaged over the segments.
+    """Returns the response of hand and arm at each frequency, averaged over the segments.
+
+    The responses show how well a frequency determines the hand: the amplitudes, how well they
+    repeat (coherence), and which part of the force the fit does not explain.
 
     Args:
-        F: Phasors of the force, shape (segments, F, n), in N.
+        F: Phasors (complex amplitudes) of the force, shape (segments, F, n), in N.
         X: Phasors of the position, shape (segments, F, n), in m.
         hz: The F frequencies, in Hz.
         unexplained: Fraction of the force that the fit does not explain, shape (F,).
@@ -306,10 +310,12 @@ def _list_responses(
     force_coherence = _compute_coherence(F)
     motion_coherence = _compute_coherence(X)
     coherence = np.minimum(force_coherence, motion_coherence)
+
     mean_motion = X.mean(axis=0)
     motion_mm = 1e3 * np.linalg.norm(mean_motion, axis=1)
     mean_force = F.mean(axis=0)
     force_n = np.linalg.norm(mean_force, axis=1)
+
     responses: list[_SineResponse] = []
     for index, frequency_hz in enumerate(hz):
         response = _SineResponse(
@@ -347,14 +353,15 @@ def _find_sines(scenario: Scenario) -> _Sines:
             the hand cannot be identified then.
     """
     multisines: list[Multisine] = []
-    for spec in scenario.sites.values():
-        multisines += [hand for hand in spec.hands if isinstance(hand, Multisine)]
+    for site_settings in scenario.sites.values():
+        multisines += [hand for hand in site_settings.hands if isinstance(hand, Multisine)]
     if not multisines:
         raise UsageError(
             "no operator of kind 'multisine' in the scenario moves an arm, so the "
             "reaction of a hand cannot be distinguished from its own movements "
             "(docs/studies/measured-hands.md)"
         )
+
     frequencies_hz: list[float] = []
     for multisine in multisines:
         frequencies_hz += map(float, multisine.frequencies_hz)
@@ -366,13 +373,13 @@ def _find_sines(scenario: Scenario) -> _Sines:
 
 
 def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array, Array]:
-    """Computes the force of the hand ON the end effector, and the position of the end effector.
+    """Returns the force of the hand ON the end effector, and the end effector's position.
 
     The recorded torque of the operators contains the hand and the simulated operators of the
-    same site. Operators that follow a script, such as sines, are subtracted from it.
+    same arm. Operators that follow a script, such as sines, are subtracted from it.
 
     Args:
-        records: Records of the site.
+        records: Records of the arm.
         scenario: Scenario of the run.
 
     Returns:
@@ -382,13 +389,14 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
     end_effector = split.end_effector
     scripted_torque = np.zeros_like(records.q)
     for hand in scenario.sites[records.site].hands:
-        source = hand.actor
-        if source.kind in SCRIPTED_KINDS:
+        operator = hand.actor
+        if operator.kind in SCRIPTED_KINDS:
             scripted_torque += compute_operator_script(
-                source,
+                operator,
                 records.nominal_s,
                 end_effector.J[0],
             )
+
     hand_torque = split.operator - scripted_torque
     force = end_effector.find_force(hand_torque)
     return force, end_effector.position
@@ -416,23 +424,27 @@ def _compute_phasors(
     Returns:
         For each segment, phasors of shape (F, signals).
     """
-    size = round(segment_s * records.rate_hz)
+    segment_size = round(segment_s * records.rate_hz)
     half_s = 0.5 * segment_s
     first_tick = round((start_s + half_s) * records.rate_hz)
     first_row = max(first_tick - records.first, 0)
-    end_row = len(signals) - size + 1
-    step = size // 2
-    window_phase = 2.0 * np.pi * np.arange(size) / size
+    end_row = len(signals) - segment_size + 1
+    row_step = segment_size // 2
+
+    # Hann window.
+    window_phase = 2.0 * np.pi * np.arange(segment_size) / segment_size
     window = 0.5 - 0.5 * np.cos(window_phase)
     window_sum = window.sum()
+
     phasors: list[Complex] = []
-    for start in range(first_row, end_row, step):
-        rows = slice(start, start + size)
-        known_share = records.known[rows].mean()
+    for start in range(first_row, end_row, row_step):
+        segment_rows = slice(start, start + segment_size)
+        known_share = records.known[segment_rows].mean()
         if known_share < MIN_KNOWN_SHARE:
             continue
-        segment = signals[rows]
-        cycles = np.outer(hz, records.t_s[rows])
+
+        segment = signals[segment_rows]
+        cycles = np.outer(hz, records.t_s[segment_rows])
         carriers = np.exp(-2j * np.pi * cycles)
         mean = window @ segment / window_sum
         deviation = segment - mean
@@ -450,8 +462,8 @@ def _compute_coherence(phasors: Complex) -> Array:
     Args:
         phasors: The phasors, shape (segments, F, n).
     """
-    squares = np.abs(phasors) ** 2
-    power = squares.mean(axis=0).sum(axis=1)
+    squared_amplitudes = np.abs(phasors) ** 2
+    power = squared_amplitudes.mean(axis=0).sum(axis=1)
     mean_phasors = phasors.mean(axis=0)
     squares_of_mean = np.abs(mean_phasors) ** 2
     power_of_mean = squares_of_mean.sum(axis=1)
@@ -487,34 +499,37 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
     Raises:
         UsageError: The motions do not distinguish the axes, or mass, damping and stiffness.
     """
-    count, _, axes = X.shape
+    segment_count, _, axis_count = X.shape
+    # Each derivative multiplies a phasor by j w.
     s = 1j * w[:, np.newaxis]
     acceleration = s**2 * X
     velocity = s * X
     motions = -np.concatenate((acceleration, velocity, X), axis=2)
     if not _can_distinguish(motions):
+        axes_text = count_nouns(axis_count, "axis")
         raise UsageError(
-            f"{site}: the end effector moved along fewer than {count_nouns(axes, 'axis')}, "
+            f"{site}: the end effector moved along fewer than {axes_text}, "
             "or at too few frequencies to distinguish mass, damping and stiffness: "
             "let sines of other frequencies act on another joint"
         )
 
-    all_segments = np.arange(count)
+    all_segments = np.arange(segment_count)
     forces = F.transpose(2, 0, 1)
     estimate = _fit_all_axes(forces, motions, all_segments)
 
     # The jackknife leaves out one segment at a time.
     partial_estimates: list[Array] = []
-    for segment in range(count):
-        others = all_segments[all_segments != segment]
-        partial_estimates.append(_fit_all_axes(forces, motions, others))
-    freedom = count - 1
-    pseudo_values = count * estimate - freedom * np.array(partial_estimates)
+    for segment in range(segment_count):
+        other_segments = all_segments[all_segments != segment]
+        partial_estimates.append(_fit_all_axes(forces, motions, other_segments))
+
+    freedom = segment_count - 1
+    pseudo_values = segment_count * estimate - freedom * np.array(partial_estimates)
     # Neighbouring segments overlap and are correlated, which widens the interval.
-    inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * freedom / count
+    inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * freedom / segment_count
     deviation = pseudo_values.std(axis=0, ddof=1)
     student_quantile = stdtrit(freedom, 0.975)
-    halves = student_quantile * deviation * np.sqrt(inflation / count)
+    halves = student_quantile * deviation * np.sqrt(inflation / segment_count)
 
     mean_force = F.mean(axis=0)
     fitted_force = motions.mean(axis=0) @ estimate.T
@@ -522,8 +537,8 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
     residual = np.linalg.norm(force_error, axis=1)
     force_size = np.linalg.norm(mean_force, axis=1)
     # The rows of M, B and K for an axis follow each other in the estimate.
-    matrix_rows = estimate.reshape(axes, 3, axes)
-    half_rows = halves.reshape(axes, 3, axes)
+    matrix_rows = estimate.reshape(axis_count, 3, axis_count)
+    half_rows = halves.reshape(axis_count, 3, axis_count)
     return _HandFit(
         matrices=matrix_rows.transpose(1, 0, 2),
         halves=half_rows.transpose(1, 0, 2),
@@ -544,10 +559,11 @@ def _fit_all_axes(forces: Complex, motions: Complex, segments: NDArray[np.int64]
 
 
 def _can_distinguish(motions: Complex) -> bool:
-    """Returns whether the motions determine mass, damping and stiffness along all axes.
+    """Returns True if the motions determine mass, damping and stiffness along all axes.
 
-    They do so if there are enough frequencies, and if the motions along the axes, and their
-    derivatives, are linearly independent up to the condition number `MAX_CONDITION`.
+    Otherwise the fit would return arbitrary numbers. There must be enough frequencies, and the
+    motions along the axes and their derivatives must be linearly independent, up to the
+    condition number `MAX_CONDITION`.
 
     Args:
         motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
@@ -557,9 +573,10 @@ def _can_distinguish(motions: Complex) -> bool:
     column_sizes = np.linalg.norm(design, axis=0)
     normalised = design / np.maximum(column_sizes, _TINY)
     singular_values = np.linalg.svd(normalised, compute_uv=False)
-    largest = singular_values[0]
-    smallest = singular_values[-1]
-    is_singular = smallest * MAX_CONDITION < largest
+    largest_singular = singular_values[0]
+    smallest_singular = singular_values[-1]
+    is_singular = smallest_singular * MAX_CONDITION < largest_singular
+
     equation_count, unknown_count = design.shape
     return equation_count >= unknown_count and not is_singular
 

@@ -139,9 +139,12 @@ class _SingleSender:
         is_other_publisher = self._publisher not in (b"", publisher)
         if is_other_publisher and silent_ns < SENDER_TIMEOUT_NS:
             self._conflict_ns = now_ns
+
         self._publisher = publisher
         self._received_ns = now_ns
-        if now_ns - self._conflict_ns < SENDER_TIMEOUT_NS:
+
+        has_recent_conflict = now_ns - self._conflict_ns < SENDER_TIMEOUT_NS
+        if has_recent_conflict:
             raise ValueError(
                 "has two publishers: the messages of both are refused until one of them is "
                 "silent"
@@ -199,6 +202,7 @@ class TargetTopic:
             TrilatError: The target is refused.
         """
         with self._lock:
+            # Two programs that command the arm would move it back and forth.
             try:
                 self._sender.admit(attachment.gid)
             except ValueError:
@@ -274,11 +278,15 @@ class DominanceTopic:
         """
         shares = _check_finite(cdr.read_float_array(data))
         if len(shares) != len(self._peers):
-            size = count_nouns(len(shares), "number")
+            count_text = count_nouns(len(shares), "number")
             peers_text = ", ".join(self._peers)
-            raise ValueError(f"has {size}, but needs one weight for each peer: {peers_text}")
-        silent_ns = self._sender.admit(attachment.gid)
-        if silent_ns > SENDER_TIMEOUT_NS:
+            raise ValueError(
+                f"has {count_text}, but needs one weight for each peer: {peers_text}"
+            )
+
+        silence_ns = self._sender.admit(attachment.gid)
+        # After a pause, the weights are requested again even if they have not changed.
+        if silence_ns > SENDER_TIMEOUT_NS:
             self._sent_request = None
         peer_shares = zip(self._peers, shares, strict=True)
         self._requested = dict(peer_shares)
@@ -333,7 +341,7 @@ class SilenceNotice:
         self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
 
     def pop(self, topic: str, site: str) -> str:
-        """Returns the notice if one is due now. Returns the empty text otherwise.
+        """Returns a notice that the robot sends no measurement, if one is due. Empty otherwise.
 
         Args:
             topic: Name of the topic, with its leading slash.
@@ -343,14 +351,15 @@ class SilenceNotice:
         if now_ns < self._due_ns:
             return ""
         self._due_ns = now_ns + NEXT_NOTICE_NS
+
         if self._has_measurement:
             return f"no further measurement on {topic}: {site} has lost its arm"
         if not self._has_message:
             return f"no message on {topic} yet: {site} waits for its arm"
         text = f"no measurement on {topic} yet: {site} waits for its arm"
         if self._other_joints:
-            wanted = ", ".join(names[0] for names in self._joints)
-            text += f" with {wanted}; a message has {', '.join(self._other_joints[:9])}"
+            joint_names = ", ".join(names[0] for names in self._joints)
+            text += f" with {joint_names}; a message has {', '.join(self._other_joints[:9])}"
         return text
 
 
@@ -455,9 +464,9 @@ class RobotArm:
                 self.send_safe_command()
             return
 
-        tick = (record.boot, record.tick)
-        if tick != self._published_tick:
-            self._published_tick = tick
+        record_identity = (record.boot, record.tick)
+        if record_identity != self._published_tick:
+            self._published_tick = record_identity
             ordered_torque = [torque[index] for index in self._joint_order]
             self._commands.put(self._pack(*ordered_torque))
 
@@ -495,23 +504,24 @@ def _order_joints(
     Raises:
         UsageError: The controller or the safe command does not have one entry for each joint.
     """
-    count = len(joints)
+    joint_count = len(joints)
     joint_order: list[int] = []
     for controller_name in controller:
         for index, names in enumerate(joints):
             if controller_name in names:
                 joint_order.append(index)
     # Each joint occurs exactly once if the sorted indices are 0, 1, ... count - 1.
-    all_indices = list(range(count))
+    all_indices = list(range(joint_count))
     has_each_joint = sorted(joint_order) == all_indices
-    is_controller_valid = has_each_joint and len(controller) == count
-    is_safe_complete = len(safe_command) == count
-    is_safe_valid = is_safe_complete and all(map(math.isfinite, safe_command))
+    is_controller_valid = has_each_joint and len(controller) == joint_count
+    has_safe_numbers = len(safe_command) == joint_count
+    is_safe_valid = has_safe_numbers and all(map(math.isfinite, safe_command))
+
     if not is_controller_valid or not is_safe_valid:
-        known = ", ".join(names[0] for names in joints)
+        known_joints = ", ".join(names[0] for names in joints)
         raise UsageError(
             "--names: `controller` and `safe` must each have one entry for every joint "
-            f"({known}), and the numbers of `safe` must be finite"
+            f"({known_joints}), and the numbers of `safe` must be finite"
         )
     return joint_order
 
@@ -537,11 +547,11 @@ def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
         raise ValueError(f"has {name_count} and {position_count}")
 
     message_names = set(state.names)
-    missing = [names[0] for names in joints if message_names.isdisjoint(names)]
-    if missing:
-        present = ", ".join(state.names[:9]) or "no names"
-        missing_text = ", ".join(missing)
-        raise ValueError(f"lacks {missing_text}; the message has {present}")
+    missing_joints = [names[0] for names in joints if message_names.isdisjoint(names)]
+    if missing_joints:
+        present_names = ", ".join(state.names[:9]) or "no names"
+        missing_text = ", ".join(missing_joints)
+        raise ValueError(f"lacks {missing_text}; the message has {present_names}")
     for names in joints:
         for name in names:
             if state.names.count(name) > 1:
@@ -555,11 +565,13 @@ def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
 
 
 def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
-    """Reads target angles from a `JointState` message.
+    """Returns the joint angles to which a ROS program commands an arm, from its message.
+
+    The program names the joints, so that their order need not be that of the scenario.
 
     Args:
         joints: Names that each joint may have, in the order of the arm.
-        data: The message, encoded in CDR, the binary format of ROS 2.
+        data: The `JointState` message, encoded in CDR, the binary format of ROS 2.
 
     Returns:
         The angles in rad, in the order of the arm's joints.
@@ -589,7 +601,9 @@ def read_vector_target(
     count: int,
     data: bytes,
 ) -> list[float]:
-    """Reads the position in a `PoseStamped` message, or the force in a `WrenchStamped`.
+    """Returns the position or the force with which a ROS program commands an arm.
+
+    The message is a `PoseStamped` for a position, and a `WrenchStamped` for a force.
 
     Args:
         frame: Name of the coordinate frame in which the arm expects the vector.
@@ -605,6 +619,7 @@ def read_vector_target(
             is not finite.
     """
     message_frame, numbers = cdr.read_frame_vectors(data, count)
+    # An empty name stands for the default frame.
     if message_frame not in ("", frame):
         raise ValueError(
             f"is in the frame {message_frame[:80]!r}, but this site uses {frame!r}"
@@ -694,6 +709,7 @@ class _Bridge:
         shares = self._sites[site].shares
         for event in list_past_events(ends.bus, ends.clock, ends.session, site):
             shares.add_change(event.command)
+
         topic = ends.topic(site, "set_dominance")
         change = partial(running.set_dominance, site)
         peers = self._scenario.peers(site)
@@ -703,6 +719,8 @@ class _Bridge:
 
     def _subscribe_target(self, site: str) -> None:
         """Subscribes to the topic with which a ROS program moves an arm, as its operator.
+
+        A person or a program in ROS can thus move an arm of the session.
 
         Args:
             site: Name of the arm's site, whose scenario must allow a live hand.
@@ -741,7 +759,7 @@ class _Bridge:
         clock = self._ends.clock
         is_connected = True
         now_ns = clock.monotonic_ns()
-        wake_ns = now_ns
+        wake_up_ns = now_ns
         checked_ns = now_ns
         diagnosed_ns = now_ns
         polls_hz = POLLS_PER_RECORD * rate_hz
@@ -764,8 +782,8 @@ class _Bridge:
                 diagnosed_ns = now_ns
                 self._publish_diagnostics()
 
-            wake_ns = max(wake_ns + poll_ns, now_ns)
-            clock.sleep_until(wake_ns)
+            wake_up_ns = max(wake_up_ns + poll_ns, now_ns)
+            clock.sleep_until(wake_up_ns)
         return False
 
     def _have_sites_left(self) -> bool:
@@ -774,6 +792,9 @@ class _Bridge:
 
     def _publish_messages(self, rate_hz: float) -> bool:
         """Publishes the records, events and statistics that have arrived from the session.
+
+        The bridge calls this repeatedly, so that ROS programs see the newest states of the
+        arms.
 
         Returns:
             True if another session has begun under the same name.
@@ -796,6 +817,7 @@ class _Bridge:
         for stats in read_messages(self._links, LinkStats):
             if stats.site in self._sites:
                 self._sites[stats.site].publish_statistics(stats)
+
         for parts, is_present in topics.read_presence(self._presence):
             if parts.member in self._sites:
                 self._has_seen_site = True
@@ -849,13 +871,16 @@ def _describe_target(
     initial_q = scenario.sites[site].q0_rad
     end_effector = scenario.arms[site].end_effector(initial_q)
     axes = len(end_effector)  # 2 for an arm in a plane, 3 in space
+
     if operator.mode == "joint":
         read_joints = partial(read_joint_target, _list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read_joints, hand.turn
+
     if operator.mode == "force":
         wrench_length = 6  # force and moment
         read_force = partial(read_vector_target, frame, axes, wrench_length)
         return "target_wrench", cdr.WRENCH, read_force, hand.push
+
     pose_length = 7  # position and quaternion
     read_position = partial(read_vector_target, frame, axes, pose_length)
     return "target_pose", cdr.POSE, read_position, hand.move
@@ -875,6 +900,7 @@ def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
     topic_names = Ros2SiteChannels(scenario, site).joints
     scenario_names = scenario.arms[site].joint_names
     pairs = zip(topic_names, scenario_names, strict=True)
+    # Often both names are equal. A dictionary removes the duplicate.
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
@@ -910,7 +936,7 @@ def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str
 
 
 def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
-    """Sends an order to sites, and returns the response of the service.
+    """Sends an order, such as "stop", to sites, and returns the response of the ROS service.
 
     Args:
         order: Method of `RunningSession` that sends the order.
@@ -931,7 +957,7 @@ def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
 def _repeat_in_thread(
     period_s: float, act: Callable[[], None], finish: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
-    """Calls a function regularly in a thread, as a context manager.
+    """Calls a function at regular intervals in a thread, while a `with` block runs.
 
     Args:
         period_s: Time between two calls, in s.
@@ -986,6 +1012,7 @@ def serve_ros2(
     clock = SystemClock()
     if rviz is not None:
         refuse_existing(rviz, force=False)
+
     with running.reach(BRIDGE, timeout_s) as bus:
         has_new_epoch = True
         is_announced = False
@@ -998,6 +1025,7 @@ def serve_ros2(
                 is_announced = True
                 clock.sleep_until(clock.monotonic_ns() + LOOK_PERIOD_NS)
                 continue
+
             with graph:
                 ends = BridgeEnds(
                     graph=graph,
@@ -1189,19 +1217,22 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
                 f"--names: sites.{site}: no site of this name has an external arm; sites with "
                 f"an external arm: {outside}"
             )
+
         if has_external_arm and robot.joints:
             joints = scenario.arms[site].joint_names
             if len(robot.joints) != len(joints):
-                names = count_nouns(len(robot.joints), "name")
-                count = count_nouns(len(joints), "joint")
+                names_text = count_nouns(len(robot.joints), "name")
+                joints_text = count_nouns(len(joints), "joint")
                 raise UsageError(
-                    f"--names: sites.{site}.joints has {names}, but the arm of {site} has "
-                    f"{count}: {', '.join(joints)}"
+                    f"--names: sites.{site}.joints has {names_text}, but the arm of {site} has "
+                    f"{joints_text}: {', '.join(joints)}"
                 )
 
 
 def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:
     """Waits until any site of the session replies to a query for its identity.
+
+    A session that has not started yet, or is on another machine, may take a while to appear.
 
     Args:
         ends: Connections to ROS and to the session.

@@ -113,15 +113,18 @@ class SiteTopics:
             rate_hz: Largest number of records that are published per second of the session.
         """
         newest = self.newest
+        # At most one record is published in each period of the rate.
         if newest is not None and record.boot == newest.boot:
             period = int(record.t_ns * rate_hz) // NS_PER_S
             newest_period = int(newest.t_ns * rate_hz) // NS_PER_S
             if period <= newest_period:
                 return
+
         self.newest = record
         shares = self.shares.advance_to(record.t_ns)
         for topic, data in self._messages.pack_record(record, shares, self._has_listener):
             self._publishers[topic].put(data)
+
         if self._frames.has_subscribers:
             for data in self._messages.pack_frames(record):
                 self._frames.put(data)

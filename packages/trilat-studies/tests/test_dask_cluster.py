@@ -40,12 +40,11 @@ class Cluster:
         self.processes: list[subprocess.Popen[bytes]] = []
         file = folder / "scheduler.json"
         self._start("scheduler", "--port", "0", "--no-show", "--scheduler-file", str(file))
-        self.address: str = (
-            until(lambda: file.exists() and file.read_text(), 60)
-            and json.loads(file.read_text())["address"]
-        )
+        until(lambda: file.exists() and file.read_text(), 60)
+        self.address: str = json.loads(file.read_text())["address"]
 
     def _start(self, *arguments: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
+        """Starts a process of Dask with the program of a folder, and returns the process."""
         log = (self.folder / f"{len(self.processes)}.log").open("wb")
         command = [
             sys.executable,
@@ -73,6 +72,7 @@ class Cluster:
         return self._start("worker", self.address, "--nthreads", "1", "--no-nanny", path=path)
 
     def close(self) -> None:
+        """Ends the scheduler and all workers."""
         for process in self.processes:
             process.kill()
             process.wait()
@@ -80,28 +80,27 @@ class Cluster:
 
 @pytest.fixture
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    cluster_made = Cluster(tmp_path_factory.mktemp("cluster"))
-    yield cluster_made
-    cluster_made.close()
+    started_cluster = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield started_cluster
+    started_cluster.close()
 
 
 def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
-    """Returns a sweep on two workers, one of which is killed half way, and the same sweep in
-    this process.
-    """
+    """Checks that losing one of two workers half way changes no byte of a sweep's results."""
     (folder / "trio.toml").write_text(SHORT.replace("duration_s = 0.5", "duration_s = 4.0"))
     sweep = plan_quick_sweep(
         folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0
     )
     assert sweep.cells == count
     alone = run_sweep(prepare_sweep_folder(sweep, folder / "alone"), 1)
+
     killed, *_ = [cluster.add_worker() for _ in range(2)]
-    alive_at: list[int] = []
+    done_at_kill: list[int] = []
 
     def kill_half_way(done: int, total: int) -> None:
-        if done >= total // 2 and not alive_at:
+        if done >= total // 2 and not done_at_kill:
             os.kill(killed.pid, signal.SIGKILL)
-            alive_at.append(done)
+            done_at_kill.append(done)
 
     until(lambda: workers_of(cluster) == 2, 60)
     shared = run_sweep(
@@ -110,14 +109,16 @@ def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
         on=cluster.address,
     )
     assert killed.wait(10) == -signal.SIGKILL
-    assert alive_at[0] < count
+    assert done_at_kill[0] < count
     assert (shared.runs, shared.jobs) == (count, 2)
-    assert (shared.folder.path / RESULTS_FILE).read_bytes() == (
-        alone.folder.path / RESULTS_FILE
-    ).read_bytes()
+    results, expected = (
+        (sweep_run.folder.path / RESULTS_FILE).read_bytes() for sweep_run in (shared, alone)
+    )
+    assert results == expected
 
 
 def workers_of(cluster: Cluster) -> int:
+    """Returns how many workers a cluster has."""
     with dask_cluster.DaskCluster(cluster.address) as opened:
         return opened.workers
 
@@ -138,43 +139,35 @@ def test_losing_a_worker_of_2000_cells_changes_nothing(
 
 @pytest.mark.long
 def test_trials_margins_and_tuning_run_on_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
+    """Each study gives the same bytes or outcomes on a cluster and in a process of its own."""
     cluster.add_worker()
     (tmp_path / "trio.toml").write_text(SHORT)
-    on = ("--on", cluster.address)
-    for n, words in enumerate(
-        [
-            (
-                "sweep",
-                "trio.toml",
-                "--margin",
-                "control.d=0.2:3",
-                "--set",
-                "control.law=p_d",
-                "-o",
-            ),
-            ("compare", "--tune", "trio.toml", "--law", "p_d", "--budget", "4", "--out"),
-        ]
-    ):
-        for name, more in (("here", ("--jobs", "1")), ("there", on)):
-            trilat(*words, f"{name}{n}", *more, cwd=tmp_path).succeeds()
-    for file in ("0/margin.json", "1/front.json"):
-        assert (tmp_path / f"here{file}").read_bytes() == (
-            tmp_path / f"there{file}"
-        ).read_bytes()
-    batch = trilat_net.trials(quick(), [5, 2, 9])
-    here_results, cluster_results = (
-        trilat_net.check(quick(), [5, 2, 9], **how) for how in ({"jobs": 1}, {"on": on[1]})
-    )
-    assert [result.outcomes for result in here_results.results] == [
-        result.outcomes for result in cluster_results.results
+    margin = ("--margin", "control.d=0.2:3", "--set", "control.law=p_d")
+    tuning = ("--tune", "trio.toml", "--law", "p_d", "--budget", "4")
+    studies = [
+        (("sweep", "trio.toml", *margin, "-o"), "margin.json"),
+        (("compare", *tuning, "--out"), "front.json"),
     ]
-    assert len(batch) == len(cluster_results.results)
+    for command, file in studies:
+        here, there = (f"{place}-{command[0]}" for place in ("here", "there"))
+        trilat(*command, here, "--jobs", "1", cwd=tmp_path).succeeds()
+        trilat(*command, there, "--on", cluster.address, cwd=tmp_path).succeeds()
+        assert (tmp_path / here / file).read_bytes() == (tmp_path / there / file).read_bytes()
+
+    seeds = [5, 2, 9]
+    here_report = trilat_net.check(quick(), seeds, jobs=1)
+    cluster_report = trilat_net.check(quick(), seeds, on=cluster.address)
+    assert [result.outcomes for result in here_report.results] == [
+        result.outcomes for result in cluster_report.results
+    ]
+    assert len(trilat_net.trials(quick(), seeds)) == len(cluster_report.results)
 
 
 @pytest.mark.long
 def test_workers_with_another_program_are_refused_even_later(
     cluster: Cluster, tmp_path: Path
 ) -> None:
+    """A worker whose source files differ is refused, also if it joins during a study."""
     shutil.copytree(
         ROOT / "trilat_net",
         tmp_path / "trilat_net",
@@ -182,6 +175,7 @@ def test_workers_with_another_program_are_refused_even_later(
     )
     with (tmp_path / "trilat_net" / "errors.py").open("a") as file:
         file.write("# another one\n")
+
     first = cluster.add_worker()
     sources = describe_worker()["source files"]
     with open_worker_pool(None, cluster.address) as pool:
@@ -194,6 +188,7 @@ def test_workers_with_another_program_are_refused_even_later(
             match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {sources}",
         ):
             pool.map(abs, range(-99, 0))
+
     with (
         pytest.raises(UsageError, match=f"source files .* {sources}"),
         open_worker_pool(None, cluster.address),

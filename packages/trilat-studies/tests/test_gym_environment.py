@@ -45,6 +45,7 @@ def episode(env: Any, seed: int, steps: int = 25) -> tuple[list[Any], list[float
 
 
 def assert_same(a: Any, b: Any) -> None:
+    """Asserts that two sequences of observations consist of the same bits."""
     for one, other in zip(a, b, strict=True):
         assert one.keys() == other.keys()
         for name, value in one.items():
@@ -78,31 +79,36 @@ def test_an_episode_is_a_function_of_its_seed() -> None:
 
 @pytest.mark.filterwarnings("ignore:the action")
 def test_the_vector_form_gives_the_same_bits() -> None:
+    """Environments that Gymnasium steps together give the results of single ones."""
     keys = {"scenario": "paper", "duration_s": 2, "vary": VARY}
     several = gymnasium.make_vec(ENV_ID, 2, "sync", **keys)
-    seen, _ = several.reset(seed=[5, 6])
-    single = [TeleoperationEnv(**keys) for _ in range(2)]
-    firsts = [env.reset(seed=seed)[0] for env, seed in zip(single, (5, 6), strict=True)]
+    observations, _ = several.reset(seed=[5, 6])
+    single_envs = [TeleoperationEnv(**keys) for _ in range(2)]
+    single_observations = [
+        env.reset(seed=seed)[0] for env, seed in zip(single_envs, (5, 6), strict=True)
+    ]
+
     for _ in range(5):
-        actions = seen["pose"] + 0.03
-        seen, rewards, *_ = several.step(actions)
-        for n, env in enumerate(single):
-            firsts[n], reward, *_ = env.step(actions[n])
+        actions = observations["pose"] + 0.03
+        observations, rewards, *_ = several.step(actions)
+        for n, env in enumerate(single_envs):
+            single_observations[n], reward, *_ = env.step(actions[n])
             assert reward == rewards[n]
-            for name, value in firsts[n].items():
-                assert value.tobytes() == seen[name][n].tobytes()
+            for name, value in single_observations[n].items():
+                assert value.tobytes() == observations[name][n].tobytes()
     several.close()
 
 
 @pytest.mark.filterwarnings("ignore:the action")
 def test_a_saved_episode_is_a_log_that_verifies(tmp_path: Path) -> None:
+    """The log of an episode has the observed angles, and passes the check of its ticks."""
     env = tn.make_env("paper", duration_s=1, vary=VARY)
     with pytest.raises(UsageError, match="before its first step"):
         env.save(tmp_path / "none.mcap")
-    seen, _ = episode(env, 3)
+    observations, _ = episode(env, 3)
     log = tn.open_log(env.save(tmp_path / "episode.mcap"))
     assert tn.verify(log, virtual=True).passed
-    for n, observation in enumerate(seen[:-1]):
+    for n, observation in enumerate(observations[:-1]):
         assert np.array_equal(log["m2"].q[20 * n], observation["q"])
     with pytest.raises(UsageError, match="exists"):
         env.save(tmp_path / "episode.mcap")
@@ -117,6 +123,7 @@ def test_saved_episodes_name_a_program_as_mover(tmp_path: Path) -> None:
     assert (taken.member, taken.text) == ("m2", "m2: policy takes hold at t = 0.000 s")
     assert find_program(log) == "m2"
     assert find_program(tn.simulate("paper", duration_s=0.1)) == ""
+
     summary = Exporter("lerobot", tmp_path / "set").export(log)
     assert "the program is m2 (found in the log)" in summary
     frames = pl.read_parquet(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
@@ -171,14 +178,17 @@ def test_info_tells_what_an_episode_drew() -> None:
 
 @pytest.mark.parametrize("normalize", [False, True])
 def test_clipped_actions_are_counted_and_warned_of_once(*, normalize: bool) -> None:
+    """Actions beyond the bounds are counted, and only the first of an episode warns."""
     env = tn.make_env("paper", BENT, mode="force", duration_s=1, normalize=normalize)
     _, info = env.reset(seed=1)
     assert info["clipped_actions"] == 0
+
     bound = env.action_space.high
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        counts = [env.step(factor * bound)[4] for factor in (1.0, 1.5, -2.0, 0.5)]
-    assert [info["clipped_actions"] for info in counts] == [0, 1, 2, 2]
+        infos = [env.step(factor * bound)[4] for factor in (1.0, 1.5, -2.0, 0.5)]
+    assert [info["clipped_actions"] for info in infos] == [0, 1, 2, 2]
+
     (warning,) = caught
     assert "is clipped" in str(warning.message)
     assert env.reset()[1]["clipped_actions"] == 0
@@ -223,6 +233,7 @@ def test_a_users_own_task_judges() -> None:
 
 
 def test_reach_draws_places_evenly_and_detects_staying() -> None:
+    """Goals are uniform over a disc, and a task succeeds after some time at its goal."""
     task, random = ReachTask(radius_m=0.3), np.random.default_rng(1)
     start = np.array([1.0, 0.5])
     scene = Scene(0.0, {}, {"s": start}, None, {})  # type: ignore[arg-type]
@@ -230,13 +241,16 @@ def test_reach_draws_places_evenly_and_detects_staying() -> None:
     for _ in range(2000):
         task.begin(random, scene)
         goals.append(task.goal - start)
+
     distances = np.linalg.norm(goals, axis=1)
     assert distances.max() <= 0.3
     assert np.mean(distances < 0.15) == pytest.approx(0.25, abs=0.03)
-    there = [
+
+    scenes_at_goal = [
         scene._replace(t_s=t_s, end_effector_m={"s": task.goal}) for t_s in (0.1, 0.2, 0.3)
     ]
-    assert [task.judge(one).succeeded for one in there] == [False, False, True]
+    judgements = [task.judge(scene_at_goal) for scene_at_goal in scenes_at_goal]
+    assert [judgement.succeeded for judgement in judgements] == [False, False, True]
 
 
 @pytest.mark.parametrize(
@@ -276,22 +290,25 @@ def test_refused_actions_leave_no_trace() -> None:
         [0.1, 0.2, 0.3],
         5.0,
     )
+
     for n in range(6):
         for action in refused:
             with pytest.raises(UsageError, match="action"):
                 env.step(action)
         action = np.array([0.5, 0.5 + 0.01 * n])
-        seen, again = env.step(action), other.step(action)
-        assert_same([seen[0]], [again[0]])
-        assert seen[1:4] == again[1:4]
+        result, expected = env.step(action), other.step(action)
+        assert_same([result[0]], [expected[0]])
+        assert result[1:4] == expected[1:4]
 
 
 def test_steps_need_a_reset_first() -> None:
+    """Neither a new environment nor one with a finished episode takes a step."""
     env = tn.make_env("paper", BENT, duration_s=0.1, render_mode="rgb_array")
     for order in (lambda: env.step(np.zeros(2)), env.render):
         with pytest.raises(UsageError, match="call reset first") as error:
             order()
         assert isinstance(error.value, gymnasium.error.ResetNeeded)
+
     for seed in (1, 2):
         env.reset(seed=seed)
         ended = False
@@ -316,6 +333,7 @@ def test_a_refused_reset_needs_another_one() -> None:
 
 @pytest.mark.parametrize("start", [{}, BENT], ids=["straight", "bent"])
 def test_every_goal_lies_within_reach(start: dict[str, Any]) -> None:
+    """Goals lie in the disc around the start, and no farther away than the arm is long."""
     env = tn.make_env("paper", start, user="m2", duration_s=1, vary=VARY)
     length_m = sum(env.scenario.arms["s"].lengths_m)
     goals = [env.reset(seed=seed)[0]["goal"] for seed in range(40)]
@@ -348,17 +366,20 @@ def test_a_task_without_reachable_goal_is_refused() -> None:
 
 
 def test_pictures_show_the_motion() -> None:
+    """A picture is an array of pixels that changes as the arms move."""
     env = tn.make_env("paper", BENT, duration_s=1, render_mode="rgb_array")
     env.reset(seed=1)
     pictures = [env.render()]
     for _ in range(10):
         env.step(np.array([0.3, 1.2]))
     pictures.append(env.render())
+
     for picture in pictures:
         assert picture.shape == (240, 720, 3)
         assert picture.dtype == np.uint8
     assert (pictures[0] != pictures[1]).any()
     assert env.metadata["render_fps"] == 50
+
     silent = tn.make_env("paper", BENT, duration_s=1)
     silent.reset(seed=1)
     assert silent.render() is None
@@ -367,42 +388,46 @@ def test_pictures_show_the_motion() -> None:
 
 
 def test_flat_observations_are_the_same_numbers() -> None:
-    env, parts = (
+    """The flat vector contains the numbers of the named arrays, with a name for each."""
+    env, env_with_names = (
         tn.make_env("paper", BENT, duration_s=1, vary=VARY, flat=flat) for flat in (True, False)
     )
-    flat, seen = env.reset(seed=3)[0], parts.reset(seed=3)[0]
+    flat, by_array = env.reset(seed=3)[0], env_with_names.reset(seed=3)[0]
     for _ in range(5):
         assert flat.dtype == np.float32
         assert flat in env.observation_space
         by_name = dict(zip(env.observation_names, flat.tolist(), strict=True))
-        assert by_name["peer_q[1][0]"] == np.float32(seen["peer_q"][1, 0])
-        assert by_name["goal[1]"] == np.float32(seen["goal"][1])
-        assert sum(part.size for part in seen.values()) == len(flat)
+        assert by_name["peer_q[1][0]"] == np.float32(by_array["peer_q"][1, 0])
+        assert by_name["goal[1]"] == np.float32(by_array["goal"][1])
+        assert sum(part.size for part in by_array.values()) == len(flat)
         action = env.action_space.sample()
         assert action.dtype == np.float32
-        flat, seen = env.step(action)[0], parts.step(action)[0]
+        flat, by_array = env.step(action)[0], env_with_names.step(action)[0]
 
 
 @pytest.mark.parametrize("mode", ["tip", "force"])
 def test_scaled_observations_are_of_order_one(mode: str) -> None:
+    """Random episodes stay within three times the scales that the environment states."""
     env = tn.make_env("paper", BENT, mode=mode, duration_s=1, vary=VARY, flat=True)
     limits = env.scenario.sites["m2"].limits
     scales = dict(zip(env.observation_names, env.observation_scales.tolist(), strict=True))
     assert scales["qd[0]"] == limits.qd_limit_rad_s
     assert scales["tau_x[1]"] == limits.tau_limit_nm
+
     space = env.observation_space
     bounds = dict(
         zip(env.observation_names, zip(space.low, space.high, strict=True), strict=True)
     )
     assert bounds["pose[0]"][1] == pytest.approx(2.0)  # two links of 1 m
     assert bounds["grip[0]"] == (0.0, 1.0)
+
     env.action_space.seed(4)
     for seed in range(3):
-        seen, ended = env.reset(seed=seed)[0], False
+        observation, ended = env.reset(seed=seed)[0], False
         while not ended:
-            assert seen in space
-            assert np.abs(seen / env.observation_scales).max() < 3.0
-            seen, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            assert observation in space
+            assert np.abs(observation / env.observation_scales).max() < 3.0
+            observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
             ended = terminated or truncated
 
 
@@ -436,16 +461,17 @@ def test_normalized_episodes_equal_scaled_ones(mode: str) -> None:
         for normalize in (False, True)
     )
     limit = env.action_space.high[0]
-    seen, normal = env.reset(seed=2)[0], scaled.reset(seed=2)[0]
+    observation, scaled_observation = env.reset(seed=2)[0], scaled.reset(seed=2)[0]
     random = np.random.default_rng(6)
     for _ in range(20):
-        wanted = seen / env.observation_scales
-        assert np.abs(wanted).max() <= 1.0
-        assert normal == pytest.approx(wanted, abs=1e-5)
+        expected = observation / env.observation_scales
+        assert np.abs(expected).max() <= 1.0
+        assert scaled_observation == pytest.approx(expected, abs=1e-5)
         action = random.uniform(-0.2, 0.2, size=2)
-        seen, reward = env.step(limit * action)[:2]
-        normal, same_reward = scaled.step(action)[:2]
+        observation, reward = env.step(limit * action)[:2]
+        scaled_observation, same_reward = scaled.step(action)[:2]
         assert same_reward == pytest.approx(reward, abs=1e-6)
+
     with pytest.warns(UserWarning, match="exceeds the bound 1"):
         beyond = scaled.step(np.array([5.0, -5.0]))[0]
     assert beyond in scaled.observation_space
@@ -480,12 +506,13 @@ class BufferedEnvs:
 
 
 def test_a_buffer_of_environments_runs_over_ends() -> None:
+    """Environments that share a buffer of observations go on after the ends of episodes."""
     several = BufferedEnvs([lambda: tn.make_env("paper", BENT, duration_s=0.2, flat=True)] * 2)
-    seen, ends = several.reset(seed=7), 0
+    observations, ends = several.reset(seed=7), 0
     for _ in range(25):
         actions = np.stack([env.action_space.sample() for env in several.envs])
-        seen, rewards, done = several.step(actions)
-        assert np.isfinite(seen).all()
+        observations, rewards, done = several.step(actions)
+        assert np.isfinite(observations).all()
         assert np.isfinite(rewards).all()
         ends += int(done.sum())
     assert ends == 4

@@ -81,15 +81,12 @@ def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:
 
 
 def test_trial_of_distribution_names_its_repeating_command(file: Path) -> None:
+    """The printed command draws the same numbers again, because it states the seed."""
     trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
     arguments = shlex.split(trial.look)
     settings = [arguments[n + 1] for n, word in enumerate(arguments) if word == "--set"]
-    assert (
-        load_scenario(
-            arguments[2], [*settings, f"seed={arguments[arguments.index('--seed') + 1]}"]
-        )
-        == trial.scenario
-    )
+    seed = arguments[arguments.index("--seed") + 1]
+    assert load_scenario(arguments[2], [*settings, f"seed={seed}"]) == trial.scenario
     assert len(set(trial.scenario.sites["m"].control.d)) == 2
 
 
@@ -97,9 +94,11 @@ def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
     plan = plan_sweep(file, over=["link.delay_ms=20,50"], seeds=list(SEEDS), longest_s=2.0)
     results = run_sweep(prepare_sweep_folder(plan, file.parent / "o"), 1).results
     point = collect_grid_points(results)[1]
+
     runs = [FusedRun(load_scenario(file, [f"seed={seed}"])) for seed in SEEDS]
     for run in runs:
         run.advance_to(2.0)
+
     totals = list_totals(plan)
     for key, mean in zip(totals, point.means, strict=True):
         assert mean == MeanInterval.of_values([getattr(run.totals, key) for run in runs])
@@ -109,6 +108,7 @@ def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
 
 
 def test_a_candidate_is_the_mean_of_its_seeds(file: Path) -> None:
+    """The score of a candidate averages its scores in the scenarios of all seeds."""
     plan = plan_tuning(file, laws=["p_d"], budget=4, seeds=3)
     (law,) = plan.run(jobs=1).found
     assert plan.runs == (4 + 2) * 3
@@ -138,17 +138,18 @@ def test_the_outcome_of_a_candidate_is_its_worst() -> None:
 
 
 def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
+    """Means over logs are given only if the logs are repetitions of one experiment."""
+    folder = file.parent
     for seed in (1, 2, 3):
-        trilat(
-            "sim", file.name, "--seed", str(seed), "-o", f"{seed}.mcap", cwd=file.parent
-        ).succeeds()
-    trilat(
-        "sim", file.name, "--set", "link.delay_ms=60", "-o", "4.mcap", cwd=file.parent
-    ).succeeds()
-    text = trilat("compare", "1.mcap", "2.mcap", "3.mcap", "--json", cwd=file.parent).succeeds()
-    facts = json.loads(text)
+        options = ("--seed", str(seed), "-o", f"{seed}.mcap")
+        trilat("sim", file.name, *options, cwd=folder).succeeds()
+    other_delay = ("--set", "link.delay_ms=60", "-o", "4.mcap")
+    trilat("sim", file.name, *other_delay, cwd=folder).succeeds()
+
+    repeats = trilat("compare", "1.mcap", "2.mcap", "3.mcap", "--json", cwd=folder).succeeds()
+    facts = json.loads(repeats)
     row = next(row for row in facts["rows"] if row["key"] == "rms_error_rad")
     assert facts["means"]["rms_error_rad"] == MeanInterval.of_values(row["values"])._asdict()
-    assert "means" not in json.loads(
-        trilat("compare", "1.mcap", "4.mcap", "--json", cwd=file.parent).succeeds()
-    )
+
+    others = trilat("compare", "1.mcap", "4.mcap", "--json", cwd=folder).succeeds()
+    assert "means" not in json.loads(others)

@@ -37,13 +37,16 @@ def test_fixed_gains_include_defaults_of_own_laws() -> None:
 
 
 def load_own_gains(control: dict[str, Any]) -> list[str]:
+    """Returns the description of the gains that a sweep of the delay leaves fixed."""
     plan = plan_sweep({**TABLES, "control": control}, over=["link.delay_ms=10,20"])
     return describe_fixed_gains(plan)
 
 
 def test_studies_take_tables_or_a_scenario() -> None:
+    """Sweeps and tunings of a user's law take a mapping as well as a loaded scenario."""
     scenario = tn.load_scenario(TABLES)
     assert {site.control.code for site in scenario.sites.values()} == {"tests.own_laws:PD"}
+
     for source in (TABLES, scenario):
         swept = plan_sweep(source, ["control.d=4"], over=["control.K=10,30"], laws=[PD, "p_d"])
         cells = [swept.scenario(*swept.cell(n).overrides) for n in range(4)]
@@ -55,6 +58,7 @@ def test_studies_take_tables_or_a_scenario() -> None:
             (10.0, 4.0),
             (30.0, 4.0),
         ]
+
         tuned = plan_tuning(source, laws=[PD], budget=2)
         candidate = tuned.base.with_gains(
             tuned.spaces[0], tuned.knowledge, {"K": 11.0, "d": 2.0}
@@ -97,6 +101,7 @@ def test_users_laws_are_tuned_like_built_in_ones(tmp_path: Path) -> None:
     ours, theirs = (law.scores for law in tuning.found)
     assert tuning.found[0].space.law == "tests.own_laws:CompiledPD"
     assert all(score.error_rad is not None for score in [*ours, *theirs])
+
     swept = tn.sweep(
         "p_d_margin",
         ["control.d=0.3,3"],
@@ -108,9 +113,10 @@ def test_users_laws_are_tuned_like_built_in_ones(tmp_path: Path) -> None:
     verdicts = [row["verdict"] for row in swept.rows]
     assert verdicts[:2] == verdicts[2:]
     assert {row["law"] for row in swept.rows} == {"p_d", "tests.own_laws:CompiledPD"}
+
     edges = tn.margin(
         tn.load_scenario("p_d_margin"), "control.d=0.2:3", laws=[CompiledPD, "p_d"], tolerance=0.2, jobs=1,
         duration_s=4,
     )  # fmt: skip
-    ours_at, theirs_at = (edge.margin.spans[0].low for edge in edges.found)
-    assert ours_at == theirs_at
+    our_edge, their_edge = (edge.margin.spans[0].low for edge in edges.found)
+    assert our_edge == their_edge

@@ -84,6 +84,7 @@ LONG_CASES: dict[str, dict[str, Any]] = {
 
 
 def assert_same(one: Any, other: Any, path: str = "") -> None:
+    """Asserts that two results have the same types and bits, also inside of containers."""
     assert type(one) is type(other), path
     if isinstance(one, dict):
         assert one.keys() == other.keys(), path

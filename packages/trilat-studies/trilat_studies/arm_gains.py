@@ -173,6 +173,7 @@ class ArmGains(Result):
             f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
             f"{self.delay}, damping ratio {self.damping:g}, margin {self.margin:g}"
         )
+
         first_joint = self.joints[0]
         header = [key.replace("_", " ") for key in first_joint]
         rows = []
@@ -180,11 +181,13 @@ class ArmGains(Result):
             row = [_format_cell(value) for value in joint.values()]
             rows.append(row)
         yield TextTable(header, rows, align="lr")
+
         yield from self._describe_edge()
         for run in self.runs:
             outcome = "ok" if run["agrees"] else "fail"
             mark = MARKS[outcome]
             yield MarkedText(mark, _describe_run(run))
+
         yield "to paste above the first table of a scenario:"
         yield self.line
 
@@ -210,6 +213,7 @@ class ArmGains(Result):
             f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia "
             f"({motion}; {edge['omega_rad_s']:.4g} rad/s)"
         )
+
         continuous_text = "none"
         continuous_per_s2 = edge["continuous_per_s2"]
         if continuous_per_s2 is not None:
@@ -219,6 +223,7 @@ class ArmGains(Result):
             f"{continuous_text} in continuous time; the {edge['bound']} bounds K"
         )
         yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
+
         pose_text = ", ".join(f"{q:.3g}" for q in edge["pose"])
         yield f"  least in the pose {pose_text}"
 
@@ -392,11 +397,13 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
         lower = max(joint.lower, middle - half_range)
         upper = min(joint.upper, middle + half_range)
         ranges.append((lower, upper))
+
     low, high = np.transpose(ranges)
-    bits = np.random.Philox(seed)
-    random = np.random.Generator(bits)
+    bit_generator = np.random.Philox(seed)
+    random = np.random.Generator(bit_generator)
     shape = (count, len(low))
     fractions = random.uniform(_SLACK, 1.0 - _SLACK, shape)
+
     width = high - low
     return np.asarray(low + width * fractions)
 
@@ -448,6 +455,7 @@ class _GainSearch:
             ages = np.concatenate(ages_by_link)
             age_ticks = float(np.quantile(ages, quantile, method="higher"))
             self.constant_conditions = self.fix_age(age_ticks / self.rate_hz)
+
         largest_age_s = self.constant_conditions.age_s.max()
         self.age_s = float(largest_age_s)
         # The heaviest mass is stable up to k = (2 zeta / T)^2, where T is the age. At this k
@@ -460,6 +468,7 @@ class _GainSearch:
         largest_factor = 1.0 if scenario.scheme == "second_order" else 2.0
         # A motion swings from tick to tick if its damping per inertia exceeds this value.
         self._largest_damping_per_s = largest_factor * self.rate_hz
+
         self._M = [model.inertia(q) for q in poses]
         diagonals = [np.diag(M) for M in self._M]
         self.inertia: Array = np.max(diagonals, axis=0)
@@ -557,11 +566,11 @@ class _GainSearch:
         gains = {"K": stiffness}
         for name, default in default_damping.items():
             gains[name] = default * damping_scale
-        rounded = {}
+        rounded_gains = {}
         for name, values in gains.items():
             texts = [f"{value:.4g}" for value in values]
-            rounded[name] = tuple(map(float, texts))
-        return msgspec.structs.replace(law, **rounded)
+            rounded_gains[name] = tuple(map(float, texts))
+        return msgspec.structs.replace(law, **rounded_gains)
 
     def find_root(
         self, law: Any, pose: Array, loop: OperatingConditions, *, sampled: bool = True
@@ -586,9 +595,9 @@ class _GainSearch:
             sites.append(site._replace(gains=gains))
         poses = np.tile(pose, (len(sites), 1))
         theta = np.array([site.theta for site in sites])
-        rest = Equilibrium(poses, theta, "a pose", 0.0)
+        equilibrium = Equilibrium(poses, theta, "a pose", 0.0)
         loop_with_gains = loop._replace(sites=tuple(sites))
-        root = find_rightmost_root(loop_with_gains, rest, sampled=sampled)
+        root = find_rightmost_root(loop_with_gains, equilibrium, sampled=sampled)
         if root is None:
             return CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
         return root
@@ -623,7 +632,7 @@ class _GainSearch:
         Raises:
             UsageError: In one of the poses motions grow even for tiny gains.
         """
-        edge = math.inf
+        least_edge = math.inf
         worst_pose = self._poses[0]
         log_steps = np.arange(24) * math.log(2.0)
         if loop.varying:
@@ -634,14 +643,16 @@ class _GainSearch:
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
+                """Returns the rate at which small motions grow with the gain k, in 1/s."""
                 law = self.build_law(math.exp(log_k))
                 root = self.find_root(law, pose, loop, sampled=sampled)
                 return root.s.real
 
             candidates: Iterable[float] = math.log(start) + log_steps
-            if edge != math.inf:
+            if least_edge != math.inf:
                 # Only a pose whose edge is lower than the least edge so far matters.
-                candidates = [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
+                candidates = [math.log(least_edge) - 10.0 * _EDGE_TOLERANCE]
+            # bracket the edge: first a value that grows, then one below it that does not
             high = next((log_k for log_k in candidates if growth(log_k) > 0.0), None)
             if high is None:
                 continue
@@ -650,9 +661,9 @@ class _GainSearch:
             if low is None:
                 raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
             log_edge = brentq(growth, low, high, xtol=_EDGE_TOLERANCE)
-            edge = math.exp(log_edge)
+            least_edge = math.exp(log_edge)
             worst_pose = pose
-        return edge, worst_pose
+        return least_edge, worst_pose
 
     def find_edge(self) -> dict[str, Any]:
         """Finds the largest gains with which small motions of the arms still decay.
@@ -917,7 +928,7 @@ def tune_arm(
 def _tabulate_joints(
     scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
 ) -> list[dict[str, Any]]:
-    """Returns the rows of `ArmGains.joints`: what each joint gets, with units.
+    """Returns the rows of `ArmGains.joints`: inertia and gains of each joint, with units.
 
     A row also has the position error at which the spring reaches the torque limit of the joint.
     It is None for a joint without a limit.
@@ -928,17 +939,17 @@ def _tabulate_joints(
         gains: Values of each gain, one per joint, by the name of the gain.
     """
     first_site = scenario.names[0]
-    model = scenario.arms[first_site]
-    errors = np.divide(model.efforts, gains["K"]).tolist()
-    effort_units = model.joint_units("N m")
-    angle_units = model.joint_units("rad")
+    arm_model = scenario.arms[first_site]
+    limit_errors = np.divide(arm_model.efforts, gains["K"]).tolist()
+    effort_units = arm_model.joint_units("N m")
+    angle_units = arm_model.joint_units("rad")
     units = zip(effort_units, angle_units, strict=True)
     columns = {
-        "joint": model.joint_names,
+        "joint": arm_model.joint_names,
         "inertia": inertia.tolist(),
         **gains,
         "unit": ["/".join(pair) for pair in units],
-        "error_at_effort_limit": [finite_or_none(error) for error in errors],
+        "error_at_effort_limit": [finite_or_none(error) for error in limit_errors],
     }
     rows = zip(*columns.values(), strict=True)
     return [dict(zip(columns, row, strict=True)) for row in rows]

@@ -216,11 +216,11 @@ class LogComparison(Result):
         shown_keys = _UNDELAYED_KEYS if self.links_differ else ()
         rows = _select_most_different(self.metrics.rows, shown_keys)
         if rows:
-            chosen = set(rows)
+            shown_rows = set(rows)
             means = [
                 mean
                 for row, mean in zip(self.metrics.rows, self.means, strict=False)
-                if row in chosen
+                if row in shown_rows
             ]
             yield ""
             yield _tabulate_quantities(rows, self.metrics.columns, means)
@@ -228,6 +228,7 @@ class LogComparison(Result):
         yield self._sum_up(rows)
         count = count_nouns(len(self.metrics.rows), "metric")
         yield f"--all prints all {count}, and why numbers are missing"
+
         first, *others = (log.source for log in self.logs)
         if others:
             files = " ".join(f"--with {file}" for file in others)
@@ -243,6 +244,7 @@ class LogComparison(Result):
         if len(names) > 1:
             sorted_names = ", ".join(sorted(names))
             yield f"logs of different scenarios: {sorted_names}"
+
         if self.differences:
             header = ("differs", *self.metrics.columns)
             rows = [(str(difference), *difference.values) for difference in self.differences]
@@ -272,7 +274,7 @@ class LogComparison(Result):
         )
 
     def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
-        """Returns the judgements and the largest difference of the runs in one sentence.
+        """Returns a sentence with the judgement of each run and the metric that differs most.
 
         Args:
             rows: The metrics that differ most.
@@ -281,15 +283,18 @@ class LogComparison(Result):
         for name, lines in self.remarks.items():
             verdict = lines[0].partition("; rests on")[0].partition(":")[0]
             verdicts.append(f"{name} is {verdict}")
+
         text = f"in short: {join_words(verdicts)}"
         if not rows:
             return f"{text}; no metric differs"
-        most = max(rows, key=_measure_difference)
-        if _measure_difference(most) == 0.0:
+        widest = max(rows, key=_measure_difference)
+        if _measure_difference(widest) == 0.0:
             return f"{text}; no metric differs by more than a negligible amount"
-        values = [format_number(value, 4) for value in most.values]
-        unit = f" {most.quantity.unit}" if most.quantity.unit else ""
-        text += f"; the largest difference: {most.quantity.name}, {join_words(values)}{unit}"
+
+        values = [format_number(value, 4) for value in widest.values]
+        unit = f" {widest.quantity.unit}" if widest.quantity.unit else ""
+        name = widest.quantity.name
+        text += f"; the largest difference: {name}, {join_words(values)}{unit}"
         if self.links_differ:
             text += self._describe_undelayed_errors()
         return text
@@ -367,13 +372,16 @@ def compare(*logs: str | Path | Log) -> LogComparison:
         raise UsageError(
             "name at least two logs; or a scenario, as in: trilat compare --tune free"
         )
+
     files = [Path(log.sources[0]) for log in opened]
     names = _name_columns(files)
+
     remarks = {}
     for name, log in zip(names, opened, strict=True):
         judgement = certify_run(log, own_laws=may_run_user_laws(log.scenario))
         verdict = describe_judgement(judgement)
         remarks[name] = [verdict, *check_final_posture(log)]
+
     metrics = compare_metrics(opened, names)
     scenarios = [log.scenario for log in opened]
 
@@ -400,12 +408,12 @@ def _measure_difference(row: _ComparisonRow) -> float:
         The relative difference. 0 if fewer than two values are known, or if all values are
         negligible.
     """
-    known = [value for value in row.values if value is not None]
-    largest = max(map(abs, known), default=0.0)
+    known_values = [value for value in row.values if value is not None]
+    largest = max(map(abs, known_values), default=0.0)
     negligible = _NEGLIGIBLE[row.quantity.unit]
     if largest < negligible:
         return 0.0
-    return (max(known) - min(known)) / (negligible + largest)
+    return (max(known_values) - min(known_values)) / (negligible + largest)
 
 
 def _select_most_different(
@@ -422,8 +430,8 @@ def _select_most_different(
     """
     differences = {}
     for index, row in enumerate(rows):
-        known = {value for value in row.values if value is not None}
-        is_notable = len(known) > 1 and row.quantity.key not in _ROUNDING_KEYS
+        known_values = {value for value in row.values if value is not None}
+        is_notable = len(known_values) > 1 and row.quantity.key not in _ROUNDING_KEYS
         if is_notable or row.quantity.key in shown_keys:
             differences[index] = _measure_difference(row)
 
@@ -431,8 +439,8 @@ def _select_most_different(
         """Returns the place of a row: those of `shown_keys` first, then by difference."""
         return rows[index].quantity.key not in shown_keys, -differences[index], index
 
-    ranked = sorted(differences, key=rank)
-    return [rows[index] for index in sorted(ranked[:MOST_METRICS])]
+    ranked_rows = sorted(differences, key=rank)
+    return [rows[index] for index in sorted(ranked_rows[:MOST_METRICS])]
 
 
 def _name_columns(files: Sequence[Path]) -> list[str]:

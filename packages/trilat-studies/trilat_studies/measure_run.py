@@ -217,6 +217,7 @@ def run_in_batches(
         records = pending[name]
         if not records:
             return
+
         times_ns = [record.t_ns for record in records]
         samples_in_use = [record.used for record in records]
         t_ns = np.array(times_ns, dtype=np.int64)
@@ -225,6 +226,7 @@ def run_in_batches(
         for key in _VECTORS:
             rows = [getattr(record, key) for record in records]
             vectors.append(np.array(rows))
+
         axes = scenario.arms[name].axes
         batch = _build_batch(axes, t_ns, used, *vectors)
         receive = receivers[name]
@@ -308,7 +310,10 @@ class _CompiledRun:
         return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
 
     def pass_records(self) -> None:
-        """Passes the records since the last call to the receiver of each site."""
+        """Passes the records since the last call to the receiver of each site.
+
+        The batches do not contain which samples of the peers were in use.
+        """
         no_columns = slice(0, 0)  # for vectors that the site does not have
         records_of_sites = self.run.pop_records()
         for name, site_records in zip(self._scenario.names, records_of_sites, strict=True):
@@ -342,11 +347,12 @@ class WholeRun(NamedTuple):
 
 
 def run_whole(scenario: Scenario) -> WholeRun:
-    """Runs a scenario in the compiled loop and keeps all records in memory.
+    """Runs a scenario in the compiled loop, and keeps all records in memory.
+
+    Measures of the whole run, such as an impedance, need all records at once.
 
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
-
     """
     batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
     receivers = {name: batches[name].append for name in batches}
@@ -374,7 +380,7 @@ def run_whole_together(
         of which it was computed alone, or an empty text. The order is that of groups of runs,
         of which one is in memory at a time.
     """
-    # A single run must not load the code of lanes.
+    # imported late: a single run must not load the code for several runs side by side (lanes)
     from trilat_net.execution import group_runs
 
     batches: list[dict[str, list[RecordBatch]]] = []
@@ -383,22 +389,28 @@ def run_whole_together(
         batches.append({name: [] for name in scenario.names})
         receivers = {name: records.append for name, records in batches[-1].items()}
         compiled.append(_CompiledRun(scenario, receivers))
-    for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
-        members = [compiled[index] for index in group.members]
-        while running := [member for member in members if not member.is_finished]:
+    for group in group_runs([member_run.run for member_run in compiled], _RECORD_ROWS):
+        member_runs = [compiled[index] for index in group.members]
+        while running := [
+            member_run for member_run in member_runs if not member_run.is_finished
+        ]:
             # Runs of a group have the same duration, and are at the same time.
             group.advance_to(running[0].find_next_end())
-            for member in running:
-                member.pass_records()
-        for index, member in zip(group.members, members, strict=True):
-            yield index, _join_run(scenarios[index], member.run, batches[index]), group.obstacle
+            for member_run in running:
+                member_run.pass_records()
+        for index, member_run in zip(group.members, member_runs, strict=True):
+            yield (
+                index,
+                _join_run(scenarios[index], member_run.run, batches[index]),
+                group.obstacle,
+            )
             batches[index].clear()
 
 
 def _join_run(
     scenario: Scenario, run: FusedRun, batches: Mapping[str, Sequence[RecordBatch]]
 ) -> WholeRun:
-    """Returns a finished run with all of its records.
+    """Joins the batches of records of a finished run, and judges how the run ends.
 
     Args:
         scenario: Its scenario.
@@ -446,16 +458,20 @@ class WindowStats:
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
         self._walls = list_walls(spec)
+
         self._last_ns = -1
         self._records = 0
         self._peaks = {"error_peak_rad": 0.0, "speed_peak_rad_s": 0.0, "torque_peak_nm": 0.0}
+
         joints = len(spec.q0_rad)
         self._q_least = np.full(joints, math.inf)
         self._q_most = np.full(joints, -math.inf)
         self._push_sum = np.zeros(joints)
+
         self._force_sum = 0.0
         self._force_squares = 0.0
         self._force_peak = 0.0
+
         self._was_touching: bool | None = None
         self._hits = 0
 
@@ -468,28 +484,29 @@ class WindowStats:
             rows: The records, at least one. They must follow the records of the previous call.
         """
         self._last_ns = int(rows.t_ns[-1])
-        inside = rows.between(self._from_ns, self._to_ns)
-        if not len(inside.t_ns):
+        rows_inside = rows.between(self._from_ns, self._to_ns)
+        if not len(rows_inside.t_ns):
             return
-        self._records += len(inside.t_ns)
-        self._raise_peak("error_peak_rad", inside.e)
-        self._raise_peak("speed_peak_rad_s", inside.qd)
-        self._raise_peak("torque_peak_nm", inside.tau)
-        q_least = inside.q.min(axis=0)
-        q_most = inside.q.max(axis=0)
+        self._records += len(rows_inside.t_ns)
+        self._raise_peak("error_peak_rad", rows_inside.e)
+        self._raise_peak("speed_peak_rad_s", rows_inside.qd)
+        self._raise_peak("torque_peak_nm", rows_inside.tau)
+
+        q_least = rows_inside.q.min(axis=0)
+        q_most = rows_inside.q.max(axis=0)
         self._q_least = np.minimum(self._q_least, q_least)
         self._q_most = np.maximum(self._q_most, q_most)
-        self._push_sum -= inside.tau_x.sum(axis=0)
+        self._push_sum -= rows_inside.tau_x.sum(axis=0)
 
         if self._walls:
-            tip = self._arm.place_end_effector(inside.q, inside.qd)
-            t_s = inside.t_ns / NS_PER_S
+            tip = self._arm.place_end_effector(rows_inside.q, rows_inside.qd)
+            t_s = rows_inside.t_ns / NS_PER_S
             forces = [wall_force(wall, t_s, tip) for wall in self._walls]
             total_force = np.sum(forces, axis=0)
             self._add_wall_force(total_force)
 
     def _raise_peak(self, key: str, values: Array) -> None:
-        """Raises a peak of the window to the largest absolute value of new records, if larger.
+        """Updates a peak value of the window with the absolute values of new records.
 
         Args:
             key: Name of the peak.
@@ -514,6 +531,7 @@ class WindowStats:
             was_touching = touches[0]
         previous = np.append(was_touching, touches[:-1])
         begins_contact = touches & ~previous
+
         squares = force * force
         peak = float(force.max())
         self._hits += int(begins_contact.sum())
@@ -597,6 +615,7 @@ class SiteStats:
             peer_rates.append(peer_spec.rate_hz)
         peer_count = len(peer_rates)
         self._peer_rates = np.array(peer_rates, dtype=np.int64)
+
         expect = scenario.expect
         self._synchronised_rad = expect.synchronised_rad
         self.windows: list[WindowStats | None] = []
@@ -604,14 +623,17 @@ class SiteStats:
             applies = window.site in ("", site)
             stats = WindowStats(window, scenario, site) if applies else None
             self.windows.append(stats)
+
         self.records = 0
         self.peak_error_rad = 0.0
         self.peak_torque_nm = 0.0
         self.peak_speed_rad_s = 0.0
         self.unsynchronised_ns = -1
+
         self.age_max_ms = np.zeros(peer_count)
         self._age_sum_ms = np.zeros(peer_count)
         self._age_records = np.zeros(peer_count, dtype=np.int64)
+
         self._squares = np.zeros(1)
         self._buckets = NO_BUCKETS
         self._tail: list[RecordBatch] = []
@@ -625,6 +647,7 @@ class SiteStats:
         """
         if not len(rows.t_ns):
             return
+
         error = np.abs(rows.e)
         largest_error = error.max(axis=1)
         torque_nm = np.abs(rows.tau)
@@ -633,11 +656,13 @@ class SiteStats:
         batch_torque_nm = float(torque_nm.max())
         batch_speed_rad_s = float(speed_rad_s.max())
         squares = error * error
+
         self.records += len(largest_error)
         self.peak_error_rad = max(self.peak_error_rad, batch_error_rad)
         self.peak_torque_nm = max(self.peak_torque_nm, batch_torque_nm)
         self.peak_speed_rad_s = max(self.peak_speed_rad_s, batch_speed_rad_s)
         self._squares = self._squares + squares.sum(axis=0)
+
         unsynchronised = np.flatnonzero(largest_error >= self._synchronised_rad)
         if len(unsynchronised):
             last = unsynchronised[-1]
@@ -655,10 +680,13 @@ class SiteStats:
             del self._tail[0]
 
     def _add_ages(self, rows: RecordBatch) -> None:
-        """Updates the statistics of the ages of the samples in use.
+        """Updates the statistics of the ages of the samples (received states) in use.
 
         The age of a sample is the time since its peer sent it. Records from before the first
         sample of a peer do not count.
+
+        Args:
+            rows: The next records of the arm.
         """
         is_known = rows.used >= 0
         sent_ns = rows.used * NS_PER_S // self._peer_rates
@@ -958,11 +986,13 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
     first_common_ns = max(end.t_ns[0] for end in ends)
     first_site_ns = ends[0].t_ns
     times_ns = first_site_ns[first_site_ns >= first_common_ns]
+
     poses = []
     for end in ends:
         next_indices = np.searchsorted(end.t_ns, times_ns, side="right")
         latest = next_indices - 1
         poses.append(end.q[latest])
+
     largest = np.max(poses, axis=0)
     smallest = np.min(poses, axis=0)
     spread: Array = largest - smallest
@@ -1168,7 +1198,7 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
 
 
 def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
-    """Compares a metric with a smallest or largest value.
+    """Compares a metric with the smallest or largest value that the scenario permits.
 
     Args:
         key: Key of [expect]. It contains "_min_" for a smallest value, and ends in the unit.
@@ -1181,6 +1211,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
     limit_text = f"{relation} {limit:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(key, False, "never", limit_text)
+
     distance = measured - limit if is_minimum else limit - measured
     return ExpectationResult(
         key=key,
@@ -1203,6 +1234,7 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
         key = f"end_pose_rad.{site}"
         expected_angles = ", ".join(f"{angle:g}" for angle in expected)
         limit = f"({expected_angles}) ± {tolerance_rad:g} rad"
+
         reached = metrics.end_pose_rad.get(site)
         if reached is None:
             yield ExpectationResult(key, False, "never", limit)
@@ -1212,6 +1244,7 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
             distances_rad.append(abs(angle - expected_angle))
         error_rad = max(distances_rad)
         margin_rad = tolerance_rad - error_rad
+
         angles = ", ".join(f"{angle:.4f}" for angle in reached)
         yield ExpectationResult(
             key=key,
@@ -1287,8 +1320,10 @@ def _compare_with_range(
     limit_text = f"{least:g} to {most:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(name, False, missing_text, limit_text)
+
     distinct_values = dict.fromkeys(measured)  # a single value is printed once
     text = " to ".join(f"{value:.4g}" for value in distinct_values)
+
     distance_to_lower = measured.least - least
     distance_to_upper = most - measured.most
     distance = min(distance_to_lower, distance_to_upper)

@@ -85,8 +85,8 @@ def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
 
         J = _compute_jacobian(arm, q, end_effector_m)
         identity = np.eye(len(end_effector_m))
-        damped = J @ J.T + _DAMPING * identity
-        step = J.T @ np.linalg.solve(damped, error_m)
+        damped_matrix = J @ J.T + _DAMPING * identity
+        step = J.T @ np.linalg.solve(damped_matrix, error_m)
         largest_rad = float(np.abs(step).max())
         largest_rad = max(largest_rad, 1e-12)  # avoids a division by zero
         step *= min(1.0, _LARGEST_STEP_RAD / largest_rad)

@@ -120,10 +120,12 @@ def parse_seeds(text: str | None) -> list[int]:
         match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
         if match is None:
             raise UsageError(wrong_form)
+
         first = int(match[1])
         last = int(match[2] or match[1])
         if last < first:
             raise UsageError(wrong_form)
+
         if len(seeds) + last - first >= MAX_SEEDS:
             raise UsageError(
                 f"--seeds {text} names more than {MAX_SEEDS} seeds; at most {MAX_SEEDS} are "
@@ -458,13 +460,15 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
         stopped=lambda: False,
     )
     assert measurement is not None  # nothing stops the measurement
-    half_trips_us = [
+    one_way_us = [
         0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
     ]
+
+    # Half a round trip stands for the delay only if no delays of links were reported.
     delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in measurement.links]
     if delays_us:
         return f"{max(delays_us):.0f}us"
-    longest_us = max(half_trips_us, default=0.0)
+    longest_us = max(one_way_us, default=0.0)
     return f"{longest_us:.0f}us"
 
 

@@ -190,8 +190,8 @@ def _run_sweep(
     if plan.judge != "linear":
         terminal.print_texts(filter(None, [f"  {find_cell_groups(plan).sentence}".rstrip()]))
     if existing_folder is not None:
-        done = count_nouns(len(finished_runs), "run is", "runs are")
-        terminal.print_text(f"  {done} done already")
+        done_text = count_nouns(len(finished_runs), "run is", "runs are")
+        terminal.print_text(f"  {done_text} done already")
 
     workers = count_workers(jobs, on)
     estimate = sweep_run.estimate_sweep(plan, finished_runs, workers)
@@ -233,9 +233,9 @@ def _run_in_folder(
             )
     except KeyboardInterrupt:
         resume = join_arguments(["trilat", "sweep", "--resume", str(folder.path)])
-        done = count_nouns(len(folder.read_done()), "run is", "runs are")
+        done_text = count_nouns(len(folder.read_done()), "run is", "runs are")
         terminal.err.print(
-            f"{done} done and kept; continue with: {resume}", markup=False, soft_wrap=True
+            f"{done_text} done and kept; continue with: {resume}", markup=False, soft_wrap=True
         )
         raise
 

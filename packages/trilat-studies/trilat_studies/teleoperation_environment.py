@@ -208,6 +208,7 @@ class ReachTask:
             # The root makes the density uniform over the area or the volume.
             relative_radius = random.uniform() ** (1.0 / dimensions)
             distance_m = self._radius_m * relative_radius
+
             length = np.linalg.norm(direction)
             offset_m = distance_m * direction / length
             position_m = start_m + offset_m
@@ -414,6 +415,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             # Rates and forces of shared poses are those of an end effector 1 m from its base.
             scales["peer_qd"][index] = limits.qd_limit_rad_s
             scales["peer_tau_x"][index] = limits.tau_limit_nm
+
         reach_m = self._find_reach_m()
         if base.arms[self.user].shares_pose:
             # Entries of a rotation matrix follow the position.
@@ -422,6 +424,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         else:
             scales["q_des"][:] = math.pi
             scales["peer_q"][:] = math.pi
+
         scales["q"][:] = math.pi
         scales["target"][:] = self.action_limit
         hand = self.build_hand_site(base).describe()
@@ -471,7 +474,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             load_scenario(self._base, {key: values[end] for key, values in self._vary.items()})
 
     def build_hand_site(self, scenario: Scenario) -> HandSite:
-        """Returns the site and the settings of the operator that applies the actions."""
+        """Returns the site and the settings of the operator that applies the actions.
+
+        Args:
+            scenario: The experiment of one episode, in which the user's site has such an
+                operator.
+        """
         spec = scenario.sites[self.user]
         hand = spec.find_live_hand()
         assert hand is not None
@@ -591,7 +599,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return can_reach(arm, start_rad, position_m)
 
     def _format_observation(self, scene: Scene) -> Any:
-        """Returns the user's observation of a state, in the form of the observation space."""
+        """Returns what the user observes of a state, in the form of the observation space."""
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
@@ -614,9 +622,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Returns the parts of the user's observation of a state, by name.
+        """Collects what the user can observe of a state, as arrays by name.
 
-        Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer.
+        Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer (other
+        site).
         """
         view = scene.view
         peers = view.peers
@@ -625,6 +634,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         peer_tau_x = [peer.tau_x for peer in peers]
         alpha = [peer.alpha for peer in peers]
         age_s = [peer.age_s for peer in peers]
+
         parts = {
             "q": view.q,
             "qd": view.qd,
@@ -640,6 +650,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             "grip": np.array([view.grip]),
             "goal": np.array(self.task.goal, dtype=np.float64),
         }
+
         user_arm = self._base.arms[self.user]
         if user_arm.shares_pose:
             # A rotation vector jumps where it passes half a turn.
@@ -665,11 +676,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         peers = self.scenario.peers(self.leads)
         factors = links["alpha"].tolist()
         dominance = dict(zip(peers, factors, strict=True))
+
         user_dominance = dominance.get(self.user, 0.0)
+
         teachers = dict(dominance)
         teachers.pop(self.user, None)
         teacher = max(teachers, key=lambda name: teachers[name], default=self.user)
         teacher_dominance = teachers.get(teacher, 0.0)
+
         return {
             "is_intervention": teacher_dominance > user_dominance,
             "teleop_action": scene.end_effector_m[teacher],
@@ -698,16 +712,19 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         self._runs = False
         super().reset(seed=seed)
+
         overrides = {}
         for key, values in self._vary.items():
             overrides[key] = _draw(self.np_random, values)
         seed_of_run = self.np_random.integers(2**31)
         overrides["seed"] = int(seed_of_run)
         overrides |= options or {}
+
         scenario = load_scenario(self._base, overrides)
         self._begin(scenario)
         scene = self._build_scene()
         self.task.begin(self.np_random, scene)
+
         self._runs = True
         observation = self._format_observation(scene)
         info = self._describe_step(scene, succeeded=False)
@@ -729,10 +746,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             UsageError: The action is not valid. The episode does not advance.
             EpisodeError: There is no episode, or it has ended.
         """
-        checked = self._check_action(action)
+        valid_action = self._check_action(action)
         if not self._runs:
             raise EpisodeError("there is no episode, or it has ended: call reset first")
-        self._actions.append(checked)
+        self._actions.append(valid_action)
         self._k += self.ticks_per_step
         next_ns = tick_ns(self._k, self._tick_rate_hz)
         try:
@@ -809,6 +826,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         except (TypeError, ValueError):
             size = count_nouns(self.action_size, "number")
             raise UsageError(f"an action must be {size}, not {action!r:.80}") from None
+
         if values.shape != (self.action_size,):
             content = f"an array of shape {values.shape}"
             if values.ndim == 1:
@@ -817,6 +835,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             raise UsageError(f"an action must have {size}, but this one has {content}")
         if not np.isfinite(values).all():
             raise UsageError(f"the action {values.tolist()} is not finite")
+
         clipped, exceeds = self.clip_actions(values)
         if exceeds:
             self._clipped_actions += 1
@@ -946,7 +965,7 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
 def _check_arguments(
     *, mode: str, rate_hz: int, delay_ms: float, task: EpisodeTask | None
 ) -> None:
-    """Refuses arguments of an environment that can have no meaning.
+    """Refuses arguments of an environment that are not valid, before anything is simulated.
 
     Args:
         mode: Meaning of an action.
@@ -970,15 +989,15 @@ def _check_arguments(
 
 
 def _draw(random: np.random.Generator, values: Sequence[Any]) -> Any:
-    """Draws a value for a key that varies from episode to episode.
+    """Draws a value at random for a scenario key that varies from episode to episode.
 
     Args:
         random: Source of random numbers.
         values: A tuple of two numbers, which are bounds, or a sequence of possible values.
     """
-    are_numbers = all(isinstance(value, int | float) for value in values)
+    has_numbers = all(isinstance(value, int | float) for value in values)
     is_pair = isinstance(values, tuple) and len(values) == 2
-    if is_pair and are_numbers:
+    if is_pair and has_numbers:
         return float(random.uniform(*values))
     index = int(random.integers(len(values)))
     return values[index]

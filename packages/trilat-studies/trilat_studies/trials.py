@@ -427,6 +427,7 @@ class TrialReport(Result):
                 reasons = "; ".join(result.failures)
                 lines.append(f"{trial.source}, seed {trial.scenario.seed}: {reasons}")
                 lines += [f"  {line}" for line in _list_repeat_commands(result)]
+
             further = failed[MAX_FAILURES_SHOWN:]
             if further:
                 seeds = ", ".join(str(result.trial.scenario.seed) for result in further)
@@ -484,8 +485,9 @@ class TrialReport(Result):
         header, *lines = self.table()
         yield header
         for line in lines:
-            mark, _, rest = line.partition(" ")
-            yield MarkedText(f"[{'green' if mark == 'ok' else 'red'}]{mark}[/]", rest)
+            mark, _, other_columns = line.partition(" ")
+            colour = "green" if mark == "ok" else "red"
+            yield MarkedText(f"[{colour}]{mark}[/]", other_columns)
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
@@ -570,11 +572,11 @@ def run_trials(
     laws = list_imported_code(trial.scenario for trial in batch)
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
-        for n, result in _iterate_results(pool, batch):
+        for index, result in _iterate_results(pool, batch):
             # The result names the trial of the batch, and not the copy that a worker received.
-            results[n] = result._replace(trial=batch[n])
-            done(results[n])
-    ordered_results = [results[n] for n in range(len(batch))]
+            results[index] = result._replace(trial=batch[index])
+            done(results[index])
+    ordered_results = [results[index] for index in range(len(batch))]
     return TrialReport(ordered_results, (clock.monotonic_ns() - start_ns) * 1e-9)
 
 
@@ -588,19 +590,21 @@ def _iterate_results(
         batch: The trials.
     """
     if pool.is_local:
-        for n, trial in enumerate(batch):
-            yield n, trial.run()
+        for index, trial in enumerate(batch):
+            yield index, trial.run()
         return
 
     if not is_core_cached():
         # The first step compiles the simulation kernel, once for all processes.
         next(execute_virtual(batch[0].scenario))
     # The longest trials run first, so that no worker is left with a long trial at the end.
-    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
-    queue = [batch[n] for n in longest_first]
+    longest_first = sorted(
+        range(len(batch)), key=lambda index: -batch[index].scenario.duration_s
+    )
+    queue = [batch[index] for index in longest_first]
     lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
-    for index, result in pool.iterate_results(_run_trial, queue, lost, len(queue)):
-        yield longest_first[index], result
+    for queue_index, result in pool.iterate_results(_run_trial, queue, lost, len(queue)):
+        yield longest_first[queue_index], result
 
 
 def check(
@@ -662,9 +666,9 @@ def format_margin(margin: float | None) -> str:
 
 
 def _list_repeat_commands(result: TrialResult) -> list[str]:
-    """Returns two lines with the commands that repeat a failed run and show what happened.
+    """Returns two lines with the commands that repeat a failed run and show its motion.
 
-    A live run has its log already, so that it is shown by a report of the log.
+    A live run has a log already, so that a report of this log shows the motion.
     """
     look = f"trilat report {result.log}" if result.log else result.trial.look
     return [f"again: {result.trial.again}", f"look:  {look}"]
@@ -735,7 +739,7 @@ def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:
 
 
 def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
-    """Returns the XML attributes with the numbers of tests, failures and errors, and the time.
+    """Returns the attributes of a JUnit element: tests, failures, errors and time.
 
     A run without a result counts as an error, and a run with an unmet expectation as a failure.
     """
@@ -750,7 +754,7 @@ def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
-    """Adds the test case of a run to a suite, with its problem if there is one.
+    """Adds a run to its JUnit suite as a test case, with the problem of the run if it has one.
 
     A run without a result is an error. Unmet expectations together are one failure, whose text
     has the commands that repeat the run.
@@ -767,6 +771,7 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
         classname=f"trilat.{trial.scenario.name}",
         time=f"{result.wall_s:.3f}",
     )
+
     if not result.held:
         tag = "error" if result.error else "failure"
         problem_type = "error" if result.error else "expectation"
@@ -774,6 +779,7 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
         problem = Xml.SubElement(case, tag, type=problem_type, message=message)
         lines = [*result.failures, *_list_repeat_commands(result)]
         problem.text = _replace_forbidden("\n".join(lines))
+
     output = [_describe_outcome(outcome) for outcome in result.outcomes]
     Xml.SubElement(case, "system-out").text = _replace_forbidden("\n".join(output))
 

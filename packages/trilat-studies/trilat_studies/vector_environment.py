@@ -1,9 +1,9 @@
-"""Advances several Gymnasium environments together, in SIMD vector lanes of one core.
+"""Advances several Gymnasium environments together, on the SIMD vector unit of one core.
 
 Training a policy needs millions of steps. Processors compute the same operation on several
 numbers at once. Therefore environments that differ in numbers only are simulated side by side:
-each has its lane, a position in the vector registers. NumPy computes the observations and
-rewards of all environments together.
+each has its lane, which is its position in the vector registers. NumPy computes the
+observations and rewards of all environments together.
 
 Each sub-environment is a `TeleoperationEnv`, which begins its episodes and can draw and save
 them.
@@ -75,10 +75,12 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         if autoreset_mode not in modes:
             names = ", ".join(map(repr, modes))
             raise UsageError(f"autoreset_mode must be one of {names}, not {autoreset_mode!r}")
+
         envs = [env, *(_copy_env(env) for _ in range(num_envs - 1))]
         super().__init__(
             [partial(_return, member) for member in envs], autoreset_mode=autoreset_mode
         )
+
         self._members = envs
         self._parts: list[_LaneEnvs] = []
         self.obstacle = _explain_steps(env)
@@ -182,11 +184,17 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         )
 
     def _read_actions(self, actions: Any, is_needed: Flags) -> Array:
-        """Returns actions as an array.
+        """Converts the actions of all environments to an array, and checks them.
+
+        An environment that is about to begin an episode ignores its action, which need not be
+        finite.
 
         Args:
             actions: The actions, one per environment.
             is_needed: True for environments that use their action.
+
+        Returns:
+            The actions, shape (environments, numbers of an action).
 
         Raises:
             UsageError: The shape is wrong, or a value is not finite.
@@ -200,52 +208,58 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
             ) from None
         if values.shape != shape:
             raise UsageError(f"actions must have the shape {shape}, not {values.shape}")
-        if not np.isfinite(values).all():
-            bad = ~np.isfinite(values).all(axis=1) & is_needed
-            if bad.any():
-                i = int(np.flatnonzero(bad)[0])
-                raise UsageError(f"action {i}, {values[i].tolist()}, is not finite")
+        is_finite = np.isfinite(values).all(axis=1)
+        invalid = np.flatnonzero(~is_finite & is_needed)
+        if len(invalid):
+            first = int(invalid[0])
+            raise UsageError(f"action {first}, {values[first].tolist()}, is not finite")
         return values
 
     def _join(self, batched: Any, single: Mapping[int, Any]) -> Any:
-        """Returns the observations of all environments.
+        """Inserts observations of single environments into those of all environments.
 
         Args:
-            batched: Observations of all environments, of which some are undefined; None: all of
-                them are. Changed.
-            single: The undefined observations, by environment.
+            batched: Observations of all environments, which are changed in place. None for the
+                observations of the previous step.
+            single: The observations to insert, by index of the environment.
+
+        Returns:
+            The observations of all environments.
         """
         if batched is None:
             batched = self._observations
-        is_flat = isinstance(batched, np.ndarray)
-        for i, observation in single.items():
-            if is_flat:
-                batched[i] = observation
+        is_array = isinstance(batched, np.ndarray)
+        for index, observation in single.items():
+            if is_array:
+                batched[index] = observation
             else:
                 for name, values in observation.items():
-                    batched[name][i] = values
+                    batched[name][index] = values
         return batched
 
     def _reset_ended(self, batch: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Begins the next episodes of environments whose episodes ended in this step.
+        """Begins the next episode of each environment whose episode ended in this step.
+
+        This is Gymnasium's reset mode "SameStep".
 
         Args:
-            batch: Observations of all environments; changed.
+            batch: Observations of all environments, which are changed in place.
             infos: Information of all environments.
 
         Returns:
-            The observations and the information, with "final_obs" and "final_info".
+            The observations, in which those of new episodes replace the last ones.
+            The information, with "final_obs" and "final_info" of the ended episodes.
         """
         observations = {}
-        for i in np.flatnonzero(self._autoreset_envs).tolist():
-            last = {
-                "final_obs": _copy_observations(_select_observation(batch, i)),
-                "final_info": _select(infos, i),
+        for index in np.flatnonzero(self._autoreset_envs).tolist():
+            final = {
+                "final_obs": _copy_observations(_select_observation(batch, index)),
+                "final_info": _select(infos, index),
             }
-            infos = self._add_info(infos, last, i)
-            observations[i], info = self._members[i].reset()
+            infos = self._add_info(infos, final, index)
+            observations[index], info = self._members[index].reset()
             # The first information of the next episode replaces the last one of this episode.
-            infos = self._add_info(infos, info, i)
+            infos = self._add_info(infos, info, index)
         return self._join(batch, observations), infos
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -263,7 +277,10 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return super().render()
 
     def _write_back(self) -> None:
-        """Copies the states of jointly simulated episodes into their environments."""
+        """Copies the states of jointly simulated episodes into their environments.
+
+        The environments can then draw and save their episodes.
+        """
         for part in self._parts:
             part.write_back()
 
@@ -287,7 +304,7 @@ class _Results:
         self.observations: Any = None
         self.infos: dict[str, Any] = {}
 
-    def put_info(self, infos: dict[str, Any], key: str, where: Any, values: Any) -> None:
+    def put_info(self, infos: dict[str, Any], key: str, indices: Any, values: Any) -> None:
         """Writes one entry of the information dictionary of all environments.
 
         Gymnasium stores next to each entry, under its key with a leading "_", an array of
@@ -296,25 +313,25 @@ class _Results:
         Args:
             infos: The dictionary, or a dictionary in it.
             key: Key of the entry.
-            where: Environments of the values, an index of arrays.
+            indices: Environments of the values, an index of arrays.
             values: The values, one per environment; a dictionary has several entries.
         """
-        mask = infos.setdefault(f"_{key}", np.zeros(self.count, np.bool_))
-        mask[where] = True
+        has_entry = infos.setdefault(f"_{key}", np.zeros(self.count, np.bool_))
+        has_entry[indices] = True
         if isinstance(values, dict):
-            inner = infos.setdefault(key, {})
+            nested_infos = infos.setdefault(key, {})
             for name, numbers in values.items():
-                self.put_info(inner, name, where, numbers)
+                self.put_info(nested_infos, name, indices, numbers)
             return
         if key not in infos:
             infos[key] = np.zeros((self.count, *values.shape[1:]), values.dtype)
-        infos[key][where] = values
+        infos[key][indices] = values
 
-    def put_observations(self, where: Any, observations: Any, is_all: bool) -> None:
+    def put_observations(self, indices: Any, observations: Any, is_all: bool) -> None:
         """Writes the observations of some environments into those of all environments.
 
         Args:
-            where: Their environments, an index of arrays.
+            indices: Their environments, an index of arrays.
             observations: The observations, an array or arrays by name.
             is_all: True if these are the observations of all environments.
         """
@@ -324,7 +341,7 @@ class _Results:
             if self.observations is None:
                 shape = (self.count, *observations.shape[1:])
                 self.observations = np.zeros(shape, observations.dtype)
-            self.observations[where] = observations
+            self.observations[indices] = observations
         else:
             if self.observations is None:
                 self.observations = {
@@ -332,11 +349,14 @@ class _Results:
                     for name, values in observations.items()
                 }
             for name, values in observations.items():
-                self.observations[name][where] = values
+                self.observations[name][indices] = values
 
 
 class _LaneEnvs:
     """Environments that are simulated together, each in one lane of the vector registers.
+
+    An episode enters its lane before its first step, if its scenario has the same structure as
+    that of the other lanes. Otherwise the environment makes its steps by itself.
 
     Args:
         envs: The environments, at most `LaneEpisodes.most_runs`.
@@ -351,11 +371,13 @@ class _LaneEnvs:
         self._names = names
         self._user = names.index(env.user)
         self._leads = names.index(env.leads)
+
         hand_site = env.build_hand_site(env.scenario)
         self._is_joint = hand_site.spec.mode == "joint"
         self._delay_ticks = hand_site.make_hand().delay_ticks
         self._period = env.ticks_per_step
         self._rate_hz = env.scenario.sites[env.user].rate_hz
+
         self._lanes = LaneEpisodes(
             env.run,
             len(envs),
@@ -363,16 +385,19 @@ class _LaneEnvs:
             hand_row=_find_hand_row(env),
             period_ticks=self._period,
         )
+
         count = len(envs)
-        # None: the episode is not in the lane.
+        # Runs and tasks of the episodes in the lanes, None for an empty lane.
         self._runs: list[Any] = [None] * count
         self._tasks: list[Any] = [None] * count
         self._is_loaded = np.zeros(count, np.bool_)
         self._is_reach = np.zeros(count, np.bool_)
+
         self._steps = np.zeros(count, np.int64)
         self._total_ticks = np.zeros(count, np.int64)
         self._clipped = np.zeros(count, np.int64)
         self._actions = np.zeros((count, 0, env.action_size))
+
         self._lengths_m = np.zeros((len(names), count, 2))
         self._reach = _ReachTasks(count)
         self._goals: Array = np.zeros((count, *np.shape(env.task.goal)))
@@ -405,27 +430,39 @@ class _LaneEnvs:
         """
         self._runs[lane] = env.run
         self._tasks[lane] = None
+        can_share = not _explain_steps(env, compiles=False)
         self._is_loaded[lane] = (
-            not _explain_steps(env, compiles=False)
-            and self._lanes.find_structure(env.run) == self._lanes.structure
+            can_share and self._lanes.find_structure(env.run) == self._lanes.structure
         )
         if not self._is_loaded[lane]:
             return
+
         rules = env.build_hand_site(env.scenario).make_rules()
         self._lanes.load(lane, env.run, rules)
         self._steps[lane] = 0
         self._clipped[lane] = 0
         self._total_ticks[lane] = env.total_ticks
+        # the array of actions must hold the longest episode
         steps = env.total_ticks // self._period
         if steps > self._actions.shape[1]:
-            more = np.zeros((len(self._envs), steps, env.action_size))
-            more[:, : self._actions.shape[1]] = self._actions
-            self._actions = more
+            longer = np.zeros((len(self._envs), steps, env.action_size))
+            earlier_steps = self._actions.shape[1]
+            longer[:, :earlier_steps] = self._actions
+            self._actions = longer
+
         arms = env.scenario.arms
         self._lengths_m[:, lane] = [arms[name].lengths_m for name in self._names]
 
     def _load_task(self, lane: int, env: TeleoperationEnv) -> None:
-        """Takes over the state of the task of an episode."""
+        """Copies the task of an episode, so that `step` can judge many tasks together.
+
+        Only tasks of the class `ReachTask` are judged together. Other tasks are asked one by
+        one.
+
+        Args:
+            lane: The lane.
+            env: The environment.
+        """
         self._tasks[lane] = env.task
         task = env.task
         self._is_reach[lane] = type(task) is ReachTask
@@ -494,21 +531,26 @@ class _LaneEnvs:
             self._write_lane(lane, ends=True)
 
     def _advance(self, is_active: Flags) -> None:
-        """Advances the runs in lanes by the ticks of a step.
+        """Simulates the control periods (ticks) of one step in all active lanes.
+
+        The operator applies an action only after its delay, which may begin within a step. The
+        step is then simulated in two parts.
 
         Args:
             is_active: True for lanes that are stepped.
         """
-        # The decision of a step acts after the delay, in this step or in a later one, always at
-        # the same tick of a step.
-        steps_later, offset = divmod(self._delay_ticks, self._period)
-        decisions = self._steps - steps_later
-        acts = decisions >= 0
+        # The action of a step takes effect after the delay, in this step or in a later one,
+        # always at the same tick of a step.
+        delay_steps, offset = divmod(self._delay_ticks, self._period)
+        effective_steps = self._steps - delay_steps
+        has_action = effective_steps >= 0
         lanes = np.arange(len(self._envs))
-        goals = self._actions[lanes, np.maximum(decisions, 0)]
-        spans = [(self._period, acts)]
+        goals = self._actions[lanes, np.maximum(effective_steps, 0)]
+
+        spans = [(self._period, has_action)]
         if offset:
-            spans = [(offset, np.zeros_like(acts)), (self._period - offset, acts)]
+            no_action = np.zeros_like(has_action)
+            spans = [(offset, no_action), (self._period - offset, has_action)]
         for ticks, is_acting in spans:
             self._lanes.advance(
                 ticks,
@@ -519,21 +561,25 @@ class _LaneEnvs:
             )
 
     def _locate(self, q: Array) -> Array:
-        """Returns the poses of the user's arm in the coordinates of an action.
+        """Returns the pose of the user's arm in the coordinates of an action, for each lane.
+
+        The compiled operators call it to find the position from which an action starts. The
+        coordinates are joint angles, or the position of the end effector.
 
         Args:
-            q: Its joint angles in each lane, rad, shape (lanes, 2).
+            q: Joint angles in each lane, shape (lanes, 2), in rad.
         """
         return q if self._is_joint else self.place_end_effectors(self._user, q)
 
     def place_end_effectors(self, i: int, q: Array) -> Array:
-        """Returns the position of a site's end effector in each lane, m, shape (lanes, 2).
+        """Returns the position of a site's end effector in each lane, shape (lanes, 2), in m.
 
         Args:
             i: Index of the site.
-            q: Joint angles in each lane, rad, shape (lanes, 2).
+            q: Joint angles in each lane, shape (lanes, 2), in rad.
         """
-        # The functions and the order of `ArmModel.end_effector`. NumPy's sine has other bits.
+        # The functions and the order of `ArmModel.end_effector`, for equal bits: NumPy's sine
+        # differs in the last bits.
         upper_arm = q[:, 0].tolist()
         forearm = (q[:, 0] + q[:, 1]).tolist()
         lengths_m = self._lengths_m[i]
@@ -545,7 +591,10 @@ class _LaneEnvs:
         return position_m
 
     def _describe(self, state: "_State", succeeded: Flags) -> dict[str, Any]:
-        """Returns the information of a step, see `TeleoperationEnv._describe_step`.
+        """Returns the information of a step for all lanes, as `TeleoperationEnv` does for one.
+
+        A teacher is a user other than the policy. The teacher whom the site of the task follows
+        most intervenes while this site follows the teacher more than the policy.
 
         Args:
             state: State after the step.
@@ -555,19 +604,25 @@ class _LaneEnvs:
         peers = env.scenario.peers(env.leads)
         alpha = state.read_links("alpha", self._leads)[:, :, 0]
         dominance = {name: alpha[:, p] for p, name in enumerate(peers)}
+
         count = len(self._envs)
+        lanes = np.arange(count)
         user_dominance = dominance.get(env.user, np.zeros(count))
+
         teachers = [p for p, name in enumerate(peers) if name != env.user]
         if teachers:
-            largest = np.argmax(alpha[:, teachers], axis=1)
-            of_teachers = alpha[:, teachers][np.arange(count), largest]
-            sites = np.array([self._names.index(peers[p]) for p in teachers])[largest]
+            teacher_alpha = alpha[:, teachers]
+            strongest = np.argmax(teacher_alpha, axis=1)
+            teacher_dominance = teacher_alpha[lanes, strongest]
+            site_of_teacher = np.array([self._names.index(peers[p]) for p in teachers])
+            teacher_sites = site_of_teacher[strongest]
         else:
-            of_teachers = np.zeros(count)
-            sites = np.full(count, self._user)
+            teacher_dominance = np.zeros(count)
+            teacher_sites = np.full(count, self._user)
+
         return {
-            "is_intervention": of_teachers > user_dominance,
-            "teleop_action": state.end_effectors_m[sites, np.arange(count)],
+            "is_intervention": teacher_dominance > user_dominance,
+            "teleop_action": state.end_effectors_m[teacher_sites, lanes],
             "dominance": dominance,
             "t_s": state.t_s,
             "success": succeeded,
@@ -582,7 +637,7 @@ class _LaneEnvs:
                 self._write_lane(lane, ends=False)
 
     def _write_lane(self, lane: int, *, ends: bool) -> None:
-        """Writes the state of an episode into its environment.
+        """Copies the state of one episode from its lane into its environment.
 
         Args:
             lane: The lane.
@@ -649,18 +704,23 @@ class _State:
         self._new: list[list[bool]] = []
 
     def read_links(self, name: str, i: int) -> Array:
-        """Returns a field of the links of site `i`, shape (lanes, P, numbers)."""
+        """Returns one field of all links to site `i`, shape (lanes, peers, numbers)."""
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
-        """Returns the parts of the observations that are not of the task, see `HandView`."""
+        """Returns what the user's operator sees in each lane, by the names of `HandView`.
+
+        The arrays have one row per lane. They are computed once per step.
+        """
         if self._view:
             return self._view
+
         user = self._envs.user
         lanes = self._lanes
         now_ns = _tick_ns(self._envs.k, self._envs.rate_hz)
         used = np.maximum(self.read_links("used", user)[:, :, 0], 0)
         stamps_ns = _tick_ns(used, self._envs.rate_hz)
+
         q = self.q[user]
         count = self._count
         self._view = {
@@ -787,38 +847,39 @@ class _ReachTasks:
         """
         lanes = np.arange(len(self._sites))
         from_goals_m = state.end_effectors_m[self._sites, lanes] - self._goals_m
-        # As np.linalg.norm: the norms of many rows at once have other bits.
+        # Row by row, as in np.linalg.norm of one vector, for equal bits.
         distances_m = np.sqrt([row.dot(row) for row in from_goals_m])
-        steps_s = state.t_s - self._last_s
+        step_lengths_s = state.t_s - self._last_s
         reached_s = np.where(distances_m > self._within_m, state.t_s, self._reached_s)
         succeeded = state.t_s - reached_s >= self._stay_s
-        rewards = -distances_m * steps_s + succeeded.astype(np.float64)
+        rewards = -distances_m * step_lengths_s + succeeded.astype(np.float64)
         self._reached_s[is_judged] = reached_s[is_judged]
         self._last_s[is_judged] = state.t_s[is_judged]
         return rewards, succeeded
 
 
 def _tick_ns(ticks: NDArray[np.int64], rate_hz: int) -> NDArray[np.int64]:
-    """Returns the nominal times of ticks, ns, by the equation of `tick_ns`."""
+    """Returns the nominal times of ticks, in ns, by the same equation as `tick_ns`."""
+    # the Python function behind the compiled one, because it accepts arrays
     plain: Any = getattr(tick_ns, "py_func", tick_ns)
     times: NDArray[np.int64] = plain(ticks, rate_hz)
     return times
 
 
 def _take(values: Any, where: NDArray[np.int64], is_all: bool) -> Any:
-    """Returns the values of some lanes; those of a dictionary one by one."""
+    """Selects the values of some lanes, from an array or from each array of a dictionary."""
     if isinstance(values, dict):
         return {name: _take(numbers, where, is_all) for name, numbers in values.items()}
     return values if is_all else values[where]
 
 
 def _return(env: TeleoperationEnv) -> TeleoperationEnv:
-    """Returns its argument, as a function that makes an environment."""
+    """Returns its argument. With `partial` it is a function that makes an environment."""
     return env
 
 
 def _copy_env(env: TeleoperationEnv) -> TeleoperationEnv:
-    """Returns an environment with the same settings, and with a task of its own."""
+    """Returns an environment with the same settings, but with its own copy of the task."""
     other = copy.copy(env)
     other.task = copy.deepcopy(env.task)
     return other
@@ -853,37 +914,39 @@ def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
     return LaneEpisodes.explain_run(env.run, env.scenario.names.index(env.user))
 
 
-def _select(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Returns the information of one environment, as the environment itself returns it.
+def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """Returns the information of one environment in the form that the environment itself uses.
 
     Args:
         infos: Information of all environments.
-        i: Index of the environment.
+        index: Index of the environment.
     """
     info: dict[str, Any] = {}
     for key, values in infos.items():
         # An ended episode has no entries of the episode before it.
-        is_of_another = key.startswith(("_", "final_"))
-        if is_of_another or not infos[f"_{key}"][i]:
+        is_internal = key.startswith(("_", "final_"))
+        if is_internal or not infos[f"_{key}"][index]:
             continue
         if isinstance(values, dict):
-            info[key] = _select(values, i)
+            info[key] = _select(values, index)
         elif values.ndim > 1:
-            info[key] = values[i].copy()
+            info[key] = values[index].copy()
         else:
-            info[key] = values[i].item() if isinstance(values[i], np.generic) else values[i]
+            info[key] = (
+                values[index].item() if isinstance(values[index], np.generic) else values[index]
+            )
     return info
 
 
 def _copy_observations(batch: Any) -> Any:
-    """Returns a copy of observations, an array or arrays by name."""
+    """Returns a copy of observations, which are one array or a dictionary of arrays."""
     if isinstance(batch, np.ndarray):
         return batch.copy()
     return {name: values.copy() for name, values in batch.items()}
 
 
 def _select_observation(batch: Any, i: int) -> Any:
-    """Returns the observation of one environment."""
+    """Returns the observation of one environment out of those of all environments."""
     if isinstance(batch, np.ndarray):
         return batch[i]
     return {name: values[i] for name, values in batch.items()}

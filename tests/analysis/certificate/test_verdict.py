@@ -318,7 +318,11 @@ def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
     )
     assert not certificate.accepts(("bounded",))
     assert certificate.accepts(("open",))
-    assert certify_bytes(taken.bytes(), min_coverage=0.9).passed
+    # A gap in between leaves a part of V unjudged, so that the theorem is no proof.
+    is_in_between = cut.start > 0 and cut.stop < 3000
+    tolerant = certify_bytes(taken.bytes(), min_coverage=0.9)
+    assert tolerant.evidence.reasons == []
+    assert tolerant.passed is not is_in_between
 
 
 def test_only_recorded_periods_count_for_v() -> None:

@@ -85,9 +85,9 @@ class SiteEnergy:
         In the other periods some motion had to be interpolated, because records are missing.
         These periods do not count in the energy balance.
         """
-        known_views = [view.known for view in self.followed.values()]
+        peer_periods = [peer_motion.known for peer_motion in self.followed.values()]
         known_periods = self.motion.records.known_periods
-        known = [known_periods, *known_views]
+        known = [known_periods, *peer_periods]
         is_judged = np.logical_and.reduce(known)
         return np.asarray(is_judged)
 
@@ -99,12 +99,12 @@ class SiteEnergy:
         Only changes in judged periods are summed. It still contains the work that arises
         because the control law is executed in ticks, see `unexplained`.
         """
-        dissipated = [kind.total for kind in self.dissipation.values()]
-        worked = [source.total for source in self.work.values()]
+        dissipated_energies = [kind.total for kind in self.dissipation.values()]
+        work_of_sources = [source.total for source in self.work.values()]
         change_of_energy = np.diff(self.parts.total)
         change = change_of_energy + self.transfer.total
-        change += np.sum(dissipated, axis=0)
-        change -= np.sum(worked, axis=0)
+        change += np.sum(dissipated_energies, axis=0)
+        change -= np.sum(work_of_sources, axis=0)
         return _accumulate(change, self.judged)
 
     @cached_property
@@ -143,8 +143,8 @@ class SiteEnergy:
         """
         t_s = self.motion.records.t_s
         largest_s = []
-        for view in self.followed.values():
-            age_s = t_s - view.stamp_s
+        for peer_motion in self.followed.values():
+            age_s = t_s - peer_motion.stamp_s
             if np.isfinite(age_s).any():
                 largest_s.append(float(np.nanmax(age_s)))
         return max(largest_s, default=0.0)
@@ -158,8 +158,8 @@ class SiteEnergy:
         time is infinite.
         """
         known = []
-        for view in self.followed.values():
-            is_known = view.delayed.known & view.now.known
+        for peer_motion in self.followed.values():
+            is_known = peer_motion.delayed.known & peer_motion.now.known
             known.append(is_known)
         all_known = np.logical_and.reduce(known)
         known_rows = np.flatnonzero(all_known)
@@ -179,18 +179,19 @@ class SiteEnergy:
         the joint velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged
         periods, the whole energy counts as uncertain.
         """
-        dissipated = [self.transfer, *self.dissipation.values()]
-        worked = list(self.work.values())
+        outflows = [self.transfer, *self.dissipation.values()]
+        inflows = list(self.work.values())
         if self.judged.sum() < MIN_PERIODS:
             sizes = []
-            for increment in [*dissipated, *worked]:
+            for increment in [*outflows, *inflows]:
                 left_size = np.abs(increment.left).sum()
                 right_size = np.abs(increment.right).sum()
                 sizes.append(left_size + right_size)
             return float(sum(sizes))
 
-        powers = [increment.left for increment in dissipated]
-        powers += [-increment.left for increment in worked]
+        # error of the trapezoid rule, from the second differences of the total power
+        powers = [increment.left for increment in outflows]
+        powers += [-increment.left for increment in inflows]
         power = np.sum(powers, axis=0)
         judged_power = power[self.judged]
         curvature = np.diff(judged_power, 2)
@@ -208,19 +209,19 @@ class SiteEnergy:
         records = self.motion.records
         ends = self.motion.ends
         change_of_r = ends.r_right - ends.r_left
-        coupled = 0.0
+        error_j = 0.0
         for torque in (records.tau, records.tau_x):
             change_of_torque = np.diff(torque, axis=0)
             products = change_of_r * change_of_torque
             amounts = records.h_s * products.sum(axis=1)
             energy = _accumulate(amounts, self.judged)
             largest_energy = float(np.abs(energy).max())
-            coupled += 2.0 * largest_energy
-        return coupled
+            error_j += 2.0 * largest_energy
+        return error_j
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Returns the running sum of amounts per period, shape (K,), which starts with 0.
+    """Returns the running sum of the amounts of K - 1 tick periods, shape (K,), from 0 on.
 
     Args:
         amounts: Amount in each period, shape (K - 1,).
@@ -284,10 +285,10 @@ def derive_site_energies(
     constants = {}
     followed_axes = []
     for site in records:
-        c = energy_terms.derive_site_constants(scenario, site)
-        constants[site] = c
-        if c.axes:
-            followed_axes.append(c.axes)
+        site_constants = energy_terms.derive_site_constants(scenario, site)
+        constants[site] = site_constants
+        if site_constants.axes:
+            followed_axes.append(site_constants.axes)
     common_axes: tuple[float, ...] = ()
     if followed_axes:
         # 1 along the axes that all sites follow
@@ -550,32 +551,36 @@ def compute_energy_balance(
     )
 
 
-def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[_EnergyKey, Array]:
-    """Returns a site's weighted contributions to the balance, at its own ticks.
+def _weigh_site(
+    energy: SiteEnergy, weight: Array, weight_at_end: Array
+) -> dict[_EnergyKey, Array]:
+    """Returns the contributions of a site to the energy balance of all sites, with its weight.
 
-    A change of the weight itself does work on V, along a ramp and at a step. That work is
-    booked as the work of the dominance factors, "shares".
+    A change of the weight itself does work on the total energy V, along a ramp and at a step.
+    That work is counted as work of the dominance factors, under the name "shares".
 
     Args:
         energy: Energies of the site over K ticks.
-        left: Weight of the site at every tick, shape (K,).
-        right: Its weight at the end of every period, before a step there, shape (K - 1,).
+        weight: Weight of the site at every tick, shape (K,).
+        weight_at_end: Its weight at the end of every period, before a step there, shape (K -
+            1,).
 
     Returns:
-        Contributions by (kind, name), shape (K,) each, in J.
+        Contributions at the ticks of the site by (kind, name), shape (K,) each, in J.
     """
-    start = left[:-1]
-    after_step = left[1:]
+    weight_at_start = weight[:-1]
+    weight_after_step = weight[1:]
 
     def weigh(increment: Increment) -> Array:
-        at_start = start * increment.left
-        at_end = right * (increment.right + increment.jump)
+        """Returns the sum over time of an energy, times the weight of the site."""
+        at_start = weight_at_start * increment.left
+        at_end = weight_at_end * (increment.right + increment.jump)
         return _accumulate(at_start + at_end)
 
     weighted = {}
     parts = energy.parts._asdict()
     for name, part in parts.items():
-        weighted["parts", name] = left * part
+        weighted["parts", name] = weight * part
     for name, increment in energy.dissipation.items():
         weighted["dissipation", name] = weigh(increment)
     for name, increment in energy.work.items():
@@ -584,8 +589,8 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[_EnergyKe
     V = energy.parts.total
     V_start = V[:-1]
     V_end = V[1:]
-    ramp_work = (right - start) * 0.5 * (V_start + V_end)
-    step_work = (after_step - right) * V_end
+    ramp_work = (weight_at_end - weight_at_start) * 0.5 * (V_start + V_end)
+    step_work = (weight_after_step - weight_at_end) * V_end
     weight_work = _accumulate(ramp_work + step_work)
     weighted["work", "shares"] = weighted["work", "shares"] + weight_work
 
@@ -595,7 +600,7 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[_EnergyKe
 
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
-    """Interpolates values at the times `times`. Equal times return the same values.
+    """Interpolates a curve linearly at other times. At the same times it stays unchanged.
 
     Args:
         times: Times of the result, shape (T,), in s.
@@ -614,7 +619,9 @@ def _trace_weights(
     *,
     paper_weights: bool,
 ) -> tuple[Array, Array]:
-    """Returns the weights beta of all N sites, at the ticks of one site.
+    """Returns the weights beta of all N sites in the total energy V, at the ticks of one site.
+
+    The weights follow from the dominance factors, which may change during the run.
 
     Args:
         energies: Energies of the N sites.
@@ -622,8 +629,8 @@ def _trace_weights(
         paper_weights: True to return the weights of the paper, which are ones.
 
     Returns:
-        beta at the ticks, shape (K, N).
-        beta at the end of every period, before a step there, shape (K - 1, N).
+        beta at the ticks, shape (K, N). beta at the end of every period, before a step there,
+        shape (K - 1, N).
     """
     motions = [energy.motion for energy in energies.values()]
     Kd = np.array([motion.constants.weighing_Kd for motion in motions])
@@ -730,9 +737,11 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
         dominance = motion.dominance
         change_of_rate = np.diff(dominance.rate, axis=0, prepend=0.0)
         ramp_rows = np.flatnonzero(change_of_rate.any(axis=1))
+
         is_step = dominance.alpha[1:] != dominance.before
         periods_with_step = np.flatnonzero(is_step.any(axis=1))
         step_rows = periods_with_step + 1
+
         times.append(t_s[ramp_rows])
         times.append(t_s[step_rows])
     return _interpolate_dominance(energies, np.concatenate(times))

@@ -368,6 +368,7 @@ class SiteMotion:
             v=v,
             a=a,
         )
+
         damping = self.following.compute_joint_torque(rows, c.Kd * ed)
         robust = c.robust_torque(r)
         tau: Array = model - c.Kp * r - damping - robust
@@ -415,9 +416,9 @@ class SiteMotion:
         if records.first != 0:
             # The records start in the middle of the run: the torque before them is unknown.
             largest_change[0] = np.inf
-        lowest = np.maximum(lower, previous_torque - largest_change)
-        highest = np.minimum(upper, previous_torque + largest_change)
-        return lowest, highest
+        lower_with_rate = np.maximum(lower, previous_torque - largest_change)
+        upper_with_rate = np.minimum(upper, previous_torque + largest_change)
+        return lower_with_rate, upper_with_rate
 
     @cached_property
     def limited(self) -> Bools:
@@ -462,13 +463,13 @@ class SiteMotion:
         qd_terms = []
         link_jumps = []
         dominance_jumps = []
-        for j, view in enumerate(self.peers.values()):
+        for j, peer_motion in enumerate(self.peers.values()):
             alpha_right = dominance.before[:, j, np.newaxis]
             alpha_next = dominance.alpha[1:, j, np.newaxis]
             alpha_rate = dominance.rate[:-1, j, np.newaxis]
-            q_end = view.delayed_end.q
-            qd_end = view.delayed_end.qd
-            q_next = view.delayed.q[1:]
+            q_end = peer_motion.delayed_end.q
+            qd_end = peer_motion.delayed_end.qd
+            q_next = peer_motion.delayed.q[1:]
             q_terms.append(alpha_right * q_end)
             qd_terms.append(alpha_right * qd_end + alpha_rate * q_end)
             link_jumps.append(alpha_right * (q_end - q_next))
@@ -565,9 +566,9 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     e_K_e = _dot_rows(stiffness, squared_e)
 
     delay_terms = []
-    for j, view in enumerate(site.peers.values()):
+    for j, peer_motion in enumerate(site.peers.values()):
         alpha = site.dominance.alpha[:, j]
-        delay_terms.append(alpha * _energy_in_transit(c, view))
+        delay_terms.append(alpha * _energy_in_transit(c, peer_motion))
     return FunctionalParts(
         kinetic=0.5 * r_M_r,
         parameter=0.5 * scaled_squares.sum(axis=1),
@@ -579,27 +580,25 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
 def _dot_rows(x: Array, y: Array) -> Array:
     """Returns the scalar product of two vectors in each of K rows, shape (K,).
 
-    Args:
-        x: The first vector of each row, shape (K, n), or (n,) for all rows.
-        y: The second vector of each row, shape (K, n).
+    Both arguments have the shape (K, n), or one of them (n,) if it is the same in all rows.
     """
     products = x * y
     sums: Array = products.sum(axis=1)
     return sums
 
 
-def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
-    """Returns 1/2 int qd_j' Kd qd_j ds from the time of the sample in use to now, in J.
+def _energy_in_transit(constants: SiteConstants, peer_motion: DelayedPeer) -> Array:
+    """Returns the energy of motion that a peer made but that has not reached the site, in J.
+
+    It is 1/2 int qd_j' Kd qd_j ds, from the time at which the sample in use was sent until now,
+    at each of K records.
 
     Args:
-        c: Constants of the site.
-        view: Motion of peer j as the site sees it.
-
-    Returns:
-        The energy at every record, shape (K,).
+        constants: Gains of the site.
+        peer_motion: Motion of peer j as it is and as the site receives it.
     """
-    integral_of_squares = view.now.squares - view.delayed.squares
-    return 0.5 * (integral_of_squares @ c.Kd)
+    integral_of_squares = peer_motion.now.squares - peer_motion.delayed.squares
+    return 0.5 * (integral_of_squares @ constants.Kd)
 
 
 class Increment(NamedTuple):
@@ -637,10 +636,13 @@ def _trapezoid(
 ) -> Increment:
     """Integrates a power over every tick period by the trapezoid rule.
 
+    The energy function jumps at the end of a period, when the next sample comes into use. The
+    power is therefore given at both ends of each of the K - 1 periods.
+
     Args:
-        site: Motion of the site.
+        site: Motion of the site, which gives the length of a period.
         left: Power at the start of every period, shape (K - 1,), in W.
-        right: Power at the end of every period, in W.
+        right: Power at the end of every period, before the jump, in W.
         jump: Energy of the jump after each period, in J. None for no energy.
     """
     half_s = 0.5 * site.records.h_s
@@ -708,9 +710,9 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     periods = len(records.known) - 1
     left = np.zeros(periods)
     right = left
-    for j, view in enumerate(site.peers.values()):
-        difference_left = rate_left - view.delayed.qd[:-1]
-        difference_right = rate_right - view.delayed_end.qd
+    for j, peer_motion in enumerate(site.peers.values()):
+        difference_left = rate_left - peer_motion.delayed.qd[:-1]
+        difference_right = rate_right - peer_motion.delayed_end.qd
         squared_left = _weighted_square(c, difference_left)
         squared_right = _weighted_square(c, difference_right)
         half_alpha_left = 0.5 * dominance.alpha[:-1, j]
@@ -719,10 +721,12 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         right = right + half_alpha_right * squared_right
 
     def damping_power(r: Array) -> Array:
+        """Returns the power that the damping of the control law takes, in W."""
         torque = c.Kp * r + c.robust_torque(r)
         return _dot_rows(r, torque)
 
     def friction_power(r: Array, qd: Array) -> Array:
+        """Returns the power that friction takes beyond what the law compensates, in W."""
         friction = c.arm.friction(qd)
         torque = friction - c.arm.friction(qd - r)
         return _dot_rows(r, torque)
@@ -762,20 +766,21 @@ def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
     dominance = site.dominance
     Kd_of_axes = axes * site.constants.Kd
     c = site.constants._replace(Kd=Kd_of_axes)
+
     site_power = 0.5 * _weighted_square(c, site.records.shared_rate)
     left = site_power[:-1]
     right = site_power[1:]
-    for j, view in enumerate(site.peers.values()):
+    for j, peer_motion in enumerate(site.peers.values()):
         alpha_left = dominance.alpha[:-1, j]
         alpha_right = dominance.before[:, j]
-        peer_power = 0.5 * _weighted_square(c, view.now.qd)
+        peer_power = 0.5 * _weighted_square(c, peer_motion.now.qd)
         left = left - alpha_left * peer_power[:-1]
         right = right - alpha_right * peer_power[1:]
     return _trapezoid(site, left, right)
 
 
 def _weighted_square(c: SiteConstants, x: Array) -> Array:
-    """Returns |x|^2 = x'Kd x of every row, shape (K,)."""
+    """Returns |x|^2 = x'Kd x, weighted with the damping gain, of every row, shape (K,)."""
     weighted_squares = c.Kd * x**2
     square: Array = weighted_squares.sum(axis=1)
     return square
@@ -850,14 +855,14 @@ def link_work(site: SiteMotion, j: int) -> Increment:
         site: Motion of the site.
         j: Index of the peer.
     """
-    view = list(site.peers.values())[j]
-    squares_before_jump = view.delayed_end.squares
-    squares_after_jump = view.delayed.squares[1:]
+    peer_motion = list(site.peers.values())[j]
+    squares_before_jump = peer_motion.delayed_end.squares
+    squares_after_jump = peer_motion.delayed.squares[1:]
     integral_of_squares = squares_before_jump - squares_after_jump
-    stored = 0.5 * integral_of_squares @ site.constants.Kd
+    energy_in_transit = 0.5 * integral_of_squares @ site.constants.Kd
     jump = _energy_of_jump(site, site.ends.link[j])
     alpha = site.dominance.before[:, j]
-    return _jump_alone(jump + alpha * stored)
+    return _jump_alone(jump + alpha * energy_in_transit)
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
@@ -889,25 +894,26 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     qd_left = records.shared_rate[:-1]
     qd_right = records.shared_rate[1:]
 
-    for j, view in enumerate(site.peers.values()):
-        stored = _energy_in_transit(c, view)
-        squares_at_end = view.now.squares[1:]
-        integral_at_end = squares_at_end - view.delayed_end.squares
-        stored_at_end = 0.5 * integral_at_end @ c.Kd
+    for j, peer_motion in enumerate(site.peers.values()):
+        energy_in_transit = _energy_in_transit(c, peer_motion)
+        squares_at_end = peer_motion.now.squares[1:]
+        integral_at_end = squares_at_end - peer_motion.delayed_end.squares
+        energy_in_transit_at_end = 0.5 * integral_at_end @ c.Kd
         alpha_rate = dominance.rate[:-1, j]
         followed_rate = np.where(ends.following, alpha_rate, 0.0)
-        q_left = view.delayed.q[:-1]
-        q_right = view.delayed_end.q
+        q_left = peer_motion.delayed.q[:-1]
+        q_right = peer_motion.delayed_end.q
         ramp_left = _dot_rows(qd_left * c.Kd, q_left)
         ramp_right = _dot_rows(qd_right * c.Kd, q_right)
-        left = left + alpha_rate * stored[:-1]
+        # the two terms of the power in the docstring, at both ends of every period
+        left = left + alpha_rate * energy_in_transit[:-1]
         left = left + followed_rate * ramp_left
-        right = right + alpha_rate * stored_at_end
+        right = right + alpha_rate * energy_in_transit_at_end
         right = right + followed_rate * ramp_right
         alpha_next = dominance.alpha[1:, j]
         alpha_right = dominance.before[:, j]
         alpha_step = alpha_next - alpha_right
-        jump = jump + alpha_step * stored[1:]
+        jump = jump + alpha_step * energy_in_transit[1:]
     return _trapezoid(site, left, right, jump)
 
 
@@ -923,33 +929,34 @@ def _stale_rule_work(site: SiteMotion) -> Increment:
     """
     dominance = site.dominance
     ends = site.ends
-    ruled = ~ends.following
-    if not ruled.any():
+    rule_acts = ~ends.following
+    if not rule_acts.any():
         return _zero_increment(site)
+
     left_terms = []
     right_terms = []
-    for j, view in enumerate(site.peers.values()):
+    for j, peer_motion in enumerate(site.peers.values()):
         alpha_left = dominance.alpha[:-1, j, np.newaxis]
         alpha_right = dominance.before[:, j, np.newaxis]
-        delayed_qd_left = view.delayed.qd[:-1]
+        delayed_qd_left = peer_motion.delayed.qd[:-1]
         left_terms.append(alpha_left * delayed_qd_left)
-        right_terms.append(alpha_right * view.delayed_end.qd)
-    # the rule replaces the reference velocity that Eq. (6) would have
-    replaced_left = ends.qd_des_left - np.sum(left_terms, axis=0)
-    replaced_right = ends.qd_des_right - np.sum(right_terms, axis=0)
+        right_terms.append(alpha_right * peer_motion.delayed_end.qd)
+    # difference from the reference velocity of Eq. (6), with all samples
+    difference_left = ends.qd_des_left - np.sum(left_terms, axis=0)
+    difference_right = ends.qd_des_right - np.sum(right_terms, axis=0)
 
     rate = site.records.shared_rate
     Kd = site.constants.Kd
     rate_left = rate[:-1]
     rate_right = rate[1:]
-    left = _dot_rows(rate_left * Kd, replaced_left)
-    right = _dot_rows(rate_right * Kd, replaced_right)
+    left = _dot_rows(rate_left * Kd, difference_left)
+    right = _dot_rows(rate_right * Kd, difference_right)
     jump = _energy_of_jump(site, ends.rule)
     return _trapezoid(
         site,
-        left=np.where(ruled, left, 0.0),
-        right=np.where(ruled, right, 0.0),
-        jump=np.where(ruled, jump, 0.0),
+        left=np.where(rule_acts, left, 0.0),
+        right=np.where(rule_acts, right, 0.0),
+        jump=np.where(rule_acts, jump, 0.0),
     )
 
 
@@ -991,6 +998,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
+        """Returns the power at given motions, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 
@@ -1046,11 +1054,13 @@ def _singular_pose_power(
     qd_des: Array,
     r: Array,
 ) -> Array:
-    """Returns the power of this damping at one end of every period, shape (K - 1,), in W.
+    """Returns the power of the damping near singular poses, at one end of every period, in W.
+
+    `_singular_pose_work` has the equation and integrates this power, whose shape is (K - 1,).
 
     Args:
         site: Motion of the site.
-        rows: Rows of this end in the records.
+        rows: Rows of this end of the periods in the records.
         e: Errors, shape (K - 1, m).
         qd_des: Velocity of the reference, shape (K - 1, m).
         r: Filtered errors, shape (K - 1, n).
@@ -1111,28 +1121,30 @@ def _estimate_work(site: SiteMotion) -> Increment:
     theta_hat = records.theta_hat
     parameter_error = theta_hat - c.theta
 
+    # while a site rests, it keeps its estimates
     change = np.diff(parameter_error, axis=0)
     is_unchanged = (change == 0.0).all(axis=1)
     keeps_estimates = np.concatenate([[False], is_unchanged])
     is_frozen_row = keeps_estimates & site.rests
     is_frozen = is_frozen_row[:, np.newaxis]
+
     is_at_low = theta_hat <= c.low
     is_at_high = theta_hat >= c.high
-    is_at_edge = is_at_low | is_at_high
+    is_at_limit = is_at_low | is_at_high
     is_adapting = c.adapts & ~is_frozen
-    is_held = is_at_edge[1:] & is_adapting[1:]
+    is_held = is_at_limit[1:] & is_adapting[1:]
     is_wrong = parameter_error != 0.0
     is_fixed = is_wrong & ~is_adapting
     if not (is_held.any() or is_fixed.any()):
         return _zero_increment(site)
-    # the step of Eq. (15) would be -h Gamma Y'r; the box changed it by `correction`
+    # Eq. (15) demands the step -h Gamma Y'r; the limits changed it by `correction`
     correction = change + records.h_s * c.Gamma * site.mean_Yr
     error_left = parameter_error[:-1]
     error_right = parameter_error[1:]
     mean_error = 0.5 * (error_left + error_right)
     with np.errstate(divide="ignore", invalid="ignore"):
-        box_work = mean_error * correction / c.Gamma
-    held_work = np.where(is_held, box_work, 0.0)
+        correction_work = mean_error * correction / c.Gamma
+    held_work = np.where(is_held, correction_work, 0.0)
     jump = held_work.sum(axis=1)
 
     error_power = site.Yr * parameter_error
@@ -1160,17 +1172,19 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     c = site.constants
     ends = site.ends
     digital = site.scheme is Scheme.DIGITAL
-    held = hold_torque(records.tau, c.tau_limit, digital=digital)
-    u = held[:-1]
+    held_torque = hold_torque(records.tau, c.tau_limit, digital=digital)
+    applied_torque = held_torque[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
 
+    # torque: what acted minus the linear course that the trapezoid rule assumes
     tau_left = records.tau[:-1]
     mean_tau = 0.5 * (tau_left + tau_right)
-    torque_error = u - mean_tau
+    torque_error = applied_torque - mean_tau
     mean_r = 0.5 * (ends.r_left + ends.r_right)
     torque_power = _dot_rows(mean_r, torque_error)
     torque_part = records.h_s * torque_power
 
+    # estimates: the trapezoid rule of the adaptive law minus its recorded step
     parameter_error = (records.theta_hat - c.theta) * c.adapts
     error_sum = parameter_error[1:] + parameter_error[:-1]
     trapezoid_Yr = 0.5 * (site.Yr[:-1] + Yr_right)
@@ -1181,11 +1195,13 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
-    """Returns the torque and Y'r at the end of every period, before the jump of e.
+    """Evaluates the control law at the end of every period, before the error e jumps.
+
+    The records contain only the values after the jump, which the next sample of a peer causes.
 
     Returns:
         Torque of the law, Eq. (13), within its limit, shape (K - 1, n), in N m.
-        Y'r of Eq. (15), shape (K - 1, P).
+        Direction Y'r of the adaptation, Eq. (15), shape (K - 1, P).
     """
     records = site.records
     c = site.constants
@@ -1199,14 +1215,14 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     qd_des_next = records.qd_des[1:]
     jump_of_rate = np.abs(ends.qd_des_right - qd_des_next)
     jumps = jump_of_e + jump_of_rate > JUMP_TOLERANCE
-    periods = np.flatnonzero(jumps.any(axis=1))
+    periods_with_jump = np.flatnonzero(jumps.any(axis=1))
 
-    e = e_right[periods]
-    ed = ed_right[periods]
-    r = ends.r_right[periods]
-    rows = periods + 1
+    e = e_right[periods_with_jump]
+    ed = ed_right[periods_with_jump]
+    r = ends.r_right[periods_with_jump]
+    rows = periods_with_jump + 1
     v, a = site.following.compute_reference(rows, e, ed)
-    Yr[periods] = c.arm.gradient(
+    Yr[periods_with_jump] = c.arm.gradient(
         q=records.q[rows],
         qd=records.qd[rows],
         v=v,
@@ -1220,34 +1236,36 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     is_finite = np.isfinite(c.tau_rate)
     has_rate_limit = np.any(is_finite)
     is_rate_limited = site.limited.any(axis=1) & has_rate_limit
-    is_bound = site.rests | is_rate_limited
-    keeps_torque = is_bound[rows, np.newaxis]
-    tau[periods] = np.where(keeps_torque, tau[periods], limited_torque)
+    is_unaffected = site.rests | is_rate_limited
+    keeps_torque = is_unaffected[rows, np.newaxis]
+    tau[periods_with_jump] = np.where(keeps_torque, tau[periods_with_jump], limited_torque)
     return tau, Yr
 
 
 def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
-    """Returns the change of 1/2 (r'M r + e' Lambda Kd e) at every jump, because of `de`.
+    """Returns the energy that a jump of the error e by `de` adds at the end of every period.
 
-    Both terms are quadratic in e. Their change is therefore exactly the gradient half-way
-    through the whole jump, times the jump, and it is linear in `de`.
+    It is the change of 1/2 (r'M r + e' Lambda Kd e), with the filtered error r and the inertia
+    matrix M. Both terms are quadratic in e. Their change is therefore exactly the gradient
+    half-way through the whole jump, times the jump, and the energies of several causes of a
+    jump add up.
 
     Args:
         site: Motion of the site.
-        de: Part of the jump of e, shape (K - 1, n).
+        de: Part of the jump of e that has one cause, shape (K - 1, n).
 
     Returns:
         The change, shape (K - 1,), in J.
     """
-    c = site.constants
+    constants = site.constants
     ends = site.ends
     if not de.any():
         return np.zeros(len(de))
     q_next = site.records.q[1:]
-    momentum = c.arm.multiply_inertia(q_next, ends.r_middle)
+    momentum = constants.arm.multiply_inertia(q_next, ends.r_middle)
     rows_after_jumps = slice(1, None)
     dr = site.following.compute_jump_of_r(rows_after_jumps, de)
     change = _dot_rows(momentum, dr)
-    restoring_force = c.Kd * ends.e_middle * c.Lambda
+    restoring_force = constants.Kd * ends.e_middle * constants.Lambda
     change += _dot_rows(restoring_force, de)
     return change

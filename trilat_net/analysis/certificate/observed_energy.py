@@ -186,9 +186,9 @@ class ObservedEnergy(NamedTuple):
             return None
 
         unjudged = ObservedFinding.NOT_JUDGED
-        silent = [site for site in log.sites if site not in laws]
-        if silent:
-            text = f"{unjudged}: the law of {', '.join(silent)} declares none"
+        undeclared_sites = [site for site in log.sites if site not in laws]
+        if undeclared_sites:
+            text = f"{unjudged}: the law of {', '.join(undeclared_sites)} declares none"
             return ObservedEnergy(unjudged, text)
 
         parts = {site: log[site] for site in log.sites}
@@ -201,20 +201,22 @@ class ObservedEnergy(NamedTuple):
             text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
             return ObservedEnergy(unjudged, text)
 
-        books = {site: _read_books(log, site, law) for site, law in laws.items()}
-        return _judge_books(log, books)
+        accounts = {site: _read_books(log, site, law) for site, law in laws.items()}
+        return _judge_books(log, accounts)
 
 
 class _SiteBooks(NamedTuple):
-    """The energies of a site's law at its ticks, from the first tick on, shape (K,) each, in J.
+    """The energies that a law declares at its ticks, and those that the records show.
+
+    Arrays have the shape (K,) and are in J. They start at the first tick of the site.
 
     Attributes:
         t_s: Times of the ticks, in s.
         declared: The energies that the law declares.
         port: Energy that the arm gave to the law, according to the law.
         taken: Energy that the law dissipated.
-        residual: Error of the law's books.
-        leak: Energy that the arm got beyond what the law books.
+        residual: Part of the dissipated energy that the other declared energies do not explain.
+        leak: Energy that the arm got beyond what the law counts.
     """
 
     t_s: Array
@@ -248,31 +250,33 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
-    """Returns the energies of a site's law, declared by the law and computed from the records.
+    """Computes the energies that a site's law declares, and the same energies from the records.
+
+    A law that is wrong may declare energies that did not flow. The comparison reveals this.
 
     Args:
         log: The log of the run.
         site: Name of the site.
         law: The law, which has a method `energies`.
     """
-    part = log[site]
-    setup = log.scenario.setup(site)
+    site_log = log[site]
+    site_setup = log.scenario.setup(site)
     # no law computed a record with the mode "diverged"
-    count = len(part) - int(part.mode[-1] == "diverged")
-    records = _read_law_records(log, site, law, count)
+    tick_count = len(site_log) - int(site_log.mode[-1] == "diverged")
+    records = _read_law_records(log, site, law, tick_count)
     declared: LawEnergies = law.energies(records)
-    limit_nm = np.array(setup.tau_limit_nm)
-    digital = setup.scheme is Scheme.DIGITAL
+    limit_nm = np.array(site_setup.tau_limit_nm)
+    digital = site_setup.scheme is Scheme.DIGITAL
     held_torque = hold_torque(records.tau, limit_nm, digital=digital)
 
     arm_gave = -sum_work(held_torque, records.q)
-    if setup.theta_known:
+    if site_setup.theta_known:
         # holding the arm against gravity is no work of the law
         potential = build_arm_rows(log.scenario, site).potential_energy(records.q)
         arm_gave += declared.gravity * (potential - potential[0])
     arm_gave *= declared.weight
     port = arm_gave if declared.port is None else declared.port
-    stored = np.zeros(count)
+    stored = np.zeros(tick_count)
     if declared.store is not None:
         stored = _add_parts(declared.store)
     received = sum(map(_add_parts, declared.took))
@@ -284,7 +288,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
     if declared.taken is not None:
         taken = declared.taken - declared.taken[0]
     return _SiteBooks(
-        t_s=part.t_s[:count],
+        t_s=site_log.t_s[:tick_count],
         declared=declared,
         port=port,
         taken=taken,
@@ -294,7 +298,10 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
 
 
 def _add_parts(energy: Array) -> Array:
-    """Returns the sum of an energy's parts at every tick, shape (K,)."""
+    """Returns the sum of an energy over all of its parts at every tick, shape (K,).
+
+    A law may declare an energy in parts, for example one per joint.
+    """
     parts = energy.reshape(len(energy), -1)
     total: Array = parts.sum(axis=1)
     return total
@@ -306,7 +313,9 @@ def _read_law_records(
     law: Any,
     count: int,
 ) -> LawRecords:
-    """Returns the records of a site as the object that a law reads to compute its energies.
+    """Collects the records of a site in the form in which its law reads them.
+
+    A law computes the energies that it declares from these records.
 
     Args:
         log: The log of the run.
@@ -314,17 +323,17 @@ def _read_law_records(
         law: The law.
         count: Number of records, from the first one on.
     """
-    part = log[site]
-    sent = {key: values[:count] for key, values in part.sent.items()}
+    site_log = log[site]
+    sent = {key: values[:count] for key, values in site_log.sent.items()}
     return LawRecords(
-        h_s=1.0 / part.rate_hz,
-        q=part.q[:count],
-        qd=part.qd[:count],
-        tau=part.tau[:count],
-        tau_x=part.tau_x[:count],
+        h_s=1.0 / site_log.rate_hz,
+        q=site_log.q[:count],
+        qd=site_log.qd[:count],
+        tau=site_log.tau[:count],
+        tau_x=site_log.tau_x[:count],
         to_all={key: values for key, values in sent.items() if "[" not in key},
         memory=_read_law_memory(log, site, law, count),
-        peers=[_read_peer_records(log, site, peer, sent, count) for peer in part.peers],
+        peers=[_read_peer_records(log, site, peer, sent, count) for peer in site_log.peers],
     )
 
 
@@ -342,17 +351,17 @@ def _read_law_memory(
         law: The law, which lists these attributes in `remembers`.
         count: Number of records, from the first one on.
     """
-    part = log[site]
+    site_log = log[site]
     rule = log.scenario.sites[site].on_stale.rule
-    life_length = part.layout.count_life_memory(len(part.peers), degrades=rule.degrades)
+    life_length = site_log.layout.count_life_memory(len(site_log.peers), degrades=rule.degrades)
     # the law's memory follows the memory of the session's life, or of the reference
-    first = part.layout.shared + 1
+    first = site_log.layout.shared + 1
     if rule.action is StaleAction.GLIDE:
         first = life_length
 
     attributes = getattr(law, "remembers", ())
     lengths = [np.size(getattr(law, attribute)) for attribute in attributes]
-    memory = part.memory(first, sum(lengths))[:count]
+    memory = site_log.memory(first, sum(lengths))[:count]
     ends = np.cumsum(lengths, dtype=np.int64)
     parts = np.split(memory, ends[:-1], axis=1)
     # without attributes there is one empty part
@@ -397,25 +406,28 @@ def _read_peer_records(
     return PeerRecords(tick, received, sent_to_peer)
 
 
-def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
-    """Yields the energies that must not be below zero, over time.
+def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
+    """Yields the energies over time that a passive law never lets fall below zero.
+
+    They are the energy on the way between two arms (line), the part of it that the receiver
+    knows, stored energy, and the energy that a law dissipated.
 
     Args:
         log: The log of the run.
-        books: Energies of every site's law.
+        accounts: Energies of every site's law.
     """
-    for site, site_books in books.items():
-        declared = site_books.declared
+    for site, account in accounts.items():
+        declared = account.declared
         energies = []
         if declared.store is not None:
             energies.append(("store", "", declared.store))
         for j, peer in enumerate(log[site].peers):
-            peer_books = books[peer]
+            peer_account = accounts[peer]
             index_at_peer = log[peer].peers.index(site)
-            sent_j = peer_books.declared.gave[index_at_peer]
+            sent_j = peer_account.declared.gave[index_at_peer]
             # the peer's last tick at each tick of this site
-            after = np.searchsorted(peer_books.t_s, site_books.t_s + 1e-9, side="right")
-            line_j = sent_j[after - 1] - declared.took[j]
+            next_row = np.searchsorted(peer_account.t_s, account.t_s + 1e-9, side="right")
+            line_j = sent_j[next_row - 1] - declared.took[j]
             energies.append(("line", peer, line_j))
             if declared.observed:
                 energies.append(("known", peer, declared.observed[j]))
@@ -426,7 +438,7 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[_EnergyC
                 kind=kind,
                 site=site,
                 peer=peer,
-                t_s=site_books.t_s,
+                t_s=account.t_s,
                 energy_j=_add_parts(energy),
                 least_j=parts.min(axis=1),
             )
@@ -434,20 +446,21 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[_EnergyC
             kind="taken",
             site=site,
             peer="",
-            t_s=site_books.t_s,
-            energy_j=site_books.taken,
-            least_j=site_books.taken - np.maximum.accumulate(site_books.taken),
+            t_s=account.t_s,
+            energy_j=account.taken,
+            least_j=account.taken - np.maximum.accumulate(account.taken),
         )
 
 
-def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Returns the verdict on the energies of all sites.
+def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:
+    """Judges the declared energies of all sites: contradictory, below zero, or passive.
 
     Args:
         log: The log of the run.
-        books: Energies of every site's law.
+        accounts: Energies of every site's law.
     """
-    curves = list(_find_curves(log, books))
+    curves = list(_find_curves(log, accounts))
+    # the minimum over time of every energy that must not be below zero
     least = []
     for curve in curves:
         row = int(curve.least_j.argmin())
@@ -459,21 +472,21 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
         least.append(minimum)
 
     largest_j = max(float(curve.energy_j.max()) for curve in curves)
-    for site, site_books in books.items():
-        port = site_books.port
+    for site, account in accounts.items():
+        port = account.port
         curve = _EnergyCurve(
             kind="given",
             site=site,
             peer="",
-            t_s=site_books.t_s,
+            t_s=account.t_s,
             energy_j=port,
             least_j=port,
         )
         curves.append(curve)
 
-    ports_j = [float(np.abs(site_books.port).max()) for site_books in books.values()]
-    scale_j = max(largest_j, *ports_j)
-    premises = _check_books(log, books, scale_j)
+    port_sizes_j = [float(np.abs(account.port).max()) for account in accounts.values()]
+    scale_j = max(largest_j, *port_sizes_j)
+    premises = _check_books(log, accounts, scale_j)
 
     lowest = min(least, key=lambda energy: energy.amount_j)
     failed = [premise.name for premise in premises if not premise.holds]
@@ -495,22 +508,22 @@ def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
         premises=premises,
         least=least,
         largest_j=largest_j,
-        residual_j=max(_largest_residual_j(site_books) for site_books in books.values()),
-        sampling_j=max(float(site_books.leak.max()) for site_books in books.values()),
+        residual_j=max(_largest_residual_j(account) for account in accounts.values()),
+        sampling_j=max(float(account.leak.max()) for account in accounts.values()),
         curves=curves,
     )
 
 
-def _largest_residual_j(site_books: _SiteBooks) -> float:
+def _largest_residual_j(account: _SiteBooks) -> float:
     """Returns the largest error over time in the energies that a law declares, in J.
 
     The error is the difference between the energy that the law dissipated and the sum of its
     other energies.
     """
-    return float(np.abs(site_books.residual).max())
+    return float(np.abs(account.residual).max())
 
 
-def _check_books(log: Log, books: Mapping[str, _SiteBooks], scale_j: float) -> list[Premise]:
+def _check_books(log: Log, accounts: Mapping[str, _SiteBooks], scale_j: float) -> list[Premise]:
     """Checks the conditions under which the declared energies count as evidence.
 
     - books: the energies that each law declares add up;
@@ -519,27 +532,29 @@ def _check_books(log: Log, books: Mapping[str, _SiteBooks], scale_j: float) -> l
 
     Args:
         log: The log of the run.
-        books: Energies of every site's law.
+        accounts: Energies of every site's law.
         scale_j: Largest energy that occurs.
     """
-    residual_j = {site: _largest_residual_j(site_books) for site, site_books in books.items()}
-    worst = max(residual_j, key=residual_j.__getitem__)
-    holds = residual_j[worst] <= -LEAST_ENERGY_J + 1e-9 * scale_j
-    books_quantities = BooksQuantities(worst, residual_j[worst], scale_j)
+    residual_j = {site: _largest_residual_j(account) for site, account in accounts.items()}
+    worst_site = max(residual_j, key=residual_j.__getitem__)
+    holds = residual_j[worst_site] <= -LEAST_ENERGY_J + 1e-9 * scale_j
+    books_quantities = BooksQuantities(worst_site, residual_j[worst_site], scale_j)
     premises = [Premise("books", holds, books_quantities)]
 
     limited = []
-    for site in books:
+    for site in accounts:
         limit_nm = np.array(log.scenario.setup(site).tau_limit_nm)
         if (np.abs(log[site].tau) >= limit_nm).any():
             limited.append(site)
-    leak_j = {site: float(site_books.leak.max()) for site, site_books in books.items()}
-    largest_leak_j = SAMPLING_SHARE * scale_j + 1e-9
-    unbooked = tuple(site for site in limited if leak_j[site] > largest_leak_j)
+    uncounted_j = {site: float(account.leak.max()) for site, account in accounts.items()}
+    largest_uncounted_j = SAMPLING_SHARE * scale_j + 1e-9
+    unbooked = tuple(site for site in limited if uncounted_j[site] > largest_uncounted_j)
     torques = BookedTorqueQuantities(tuple(limited), unbooked)
     premises.append(Premise("torque", not unbooked, torques))
 
-    worst = max(leak_j, key=leak_j.__getitem__)
-    sampling = SamplingQuantities(worst, leak_j[worst])
-    premises.append(Premise("sampling", leak_j[worst] <= largest_leak_j, sampling))
+    worst_site = max(uncounted_j, key=uncounted_j.__getitem__)
+    sampling = SamplingQuantities(worst_site, uncounted_j[worst_site])
+    premises.append(
+        Premise("sampling", uncounted_j[worst_site] <= largest_uncounted_j, sampling)
+    )
     return premises

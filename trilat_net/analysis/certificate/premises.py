@@ -209,9 +209,12 @@ def gather_facts(log: Log) -> _RunFacts:
     if not balance.judged.any():
         return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
 
+    # the first dominance matrix with several closed groups, for which beta is not unique
     closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
-    ambiguous = next((groups for groups in closed_groups if len(groups) > 1), ())
-    group_names = tuple(tuple(log.sites[n] for n in group) for group in ambiguous)
+    ambiguous_groups = next((groups for groups in closed_groups if len(groups) > 1), ())
+    group_names = tuple(
+        tuple(log.sites[index] for index in group) for group in ambiguous_groups
+    )
     unjudged_while_present = []
     for from_s, to_s in find_unjudged_spans(balance):
         if not any(span.from_s < to_s and from_s < span.to_s for span in absent):
@@ -260,19 +263,19 @@ def check_premises(run: _RunFacts) -> list[Premise]:
 def _check_parameters(run: _RunFacts) -> Premise:
     """Checks that the adaptive laws can learn the parameters theta of their arms.
 
-    A law keeps its estimates within a box, so theta must lie in that box. Parameters that a law
-    does not adapt must be known from the start, and the law must compensate all friction.
+    A law keeps its estimates within limits, so theta must lie between them. Parameters that a
+    law does not adapt must be known from the start, and the law must compensate all friction.
     """
     faults = []
     for site, constants in run.constants.items():
         theta = constants.theta
-        low = constants.low
-        high = constants.high
-        if ((theta < low) | (theta > high)).any():
+        lower_limit = constants.low
+        upper_limit = constants.high
+        if ((theta < lower_limit) | (theta > upper_limit)).any():
             faults.append((site, ParameterFault.OUTSIDE_BOX))
 
         gains = run.log.scenario.sites[site].control.gains(theta)
-        first_estimate = np.clip(gains.theta_hat0, low, high)
+        first_estimate = np.clip(gains.theta_hat0, lower_limit, upper_limit)
         is_wrong_forever = ~constants.adapts & (first_estimate != theta)
         if is_wrong_forever.any():
             faults.append((site, ParameterFault.NEVER_LEARNT))
@@ -287,13 +290,15 @@ def _check_gains(run: _RunFacts) -> Premise:
     Only then do weights beta exist with which the exchanged energies of all sites cancel in V.
     """
     constants = run.constants
-    Kd = np.array([site_constants.weighing_Kd for site_constants in constants.values()])
+    Kd = np.array([values.weighing_Kd for values in constants.values()])
+
     scales = find_kd_scales(Kd)
     scales_by_site = None
     if scales is not None:
         scales_by_site = dict(zip(constants, map(float, scales), strict=True))
+
     quantities = GainQuantities(
-        Kd={site: tuple(one_site.Kd.tolist()) for site, one_site in constants.items()},
+        Kd={site: tuple(values.Kd.tolist()) for site, values in constants.items()},
         scales=scales_by_site,
         is_positive=bool(Kd.all()),  # NaN (an axis that is not followed) counts as positive
     )
@@ -358,13 +363,14 @@ def _check_delays(run: FunctionalFacts) -> Premise:
     constant_s = []
     for site, energy in run.energies.items():
         records = energy.motion.records
-        for peer, view in energy.followed.items():
-            used = np.isfinite(view.stamp_s) & records.known
-            if not used.any():
+        for peer, peer_motion in energy.followed.items():
+            is_used = np.isfinite(peer_motion.stamp_s) & records.known
+            if not is_used.any():
                 continue
-            age_s = (records.t_s - view.stamp_s)[used]
-            # With a constant delay the first sample in use is the first one that was sent.
-            first_stamp_s = view.stamp_s[used][0]
+            age_s = (records.t_s - peer_motion.stamp_s)[is_used]
+            # With a constant delay the first sample in use is the first one that was sent. A
+            # later first sample shows that the delay was shorter when it was sent.
+            first_stamp_s = peer_motion.stamp_s[is_used][0]
             latest_first_s = records.h_s + CONSTANT_DELAY_TOLERANCE_S
             starts_late = records.first == 0 and first_stamp_s > latest_first_s
             if np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S or starts_late:
@@ -378,7 +384,7 @@ def _check_delays(run: FunctionalFacts) -> Premise:
             else:
                 constant_s.append(float(age_s[0]))
 
-    holds = None
+    holds = None  # no sample of any peer came into use
     if varying or constant_s:
         holds = not varying
     return Premise("delays", holds, DelayQuantities(tuple(varying), tuple(constant_s)))
@@ -424,13 +430,13 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
     return Premise("torque", not cut_off, TorqueQuantities(tuple(cut_off)))
 
 
-def _find_joints(run: FunctionalFacts, site: str, affected: Bools) -> tuple[str, ...]:
+def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
     """Returns the names of affected joints.
 
     Args:
         run: Facts of the run.
         site: Site of the arm.
-        affected: True for each record and joint that is affected, shape (K, n).
+        is_affected: True for each record and joint that is affected, shape (K, n).
 
     Returns:
         The names. Empty for the built-in planar arm, whose joints have no names.
@@ -438,7 +444,8 @@ def _find_joints(run: FunctionalFacts, site: str, affected: Bools) -> tuple[str,
     model = run.log.scenario.arms[site]
     if model.chain is None:
         return ()
-    return tuple(model.joint_names[n] for n in np.flatnonzero(affected.any(axis=0)))
+    affected_joints = np.flatnonzero(is_affected.any(axis=0))
+    return tuple(model.joint_names[joint] for joint in affected_joints)
 
 
 def _check_stops(run: FunctionalFacts) -> Premise | None:
@@ -451,16 +458,21 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
         The premise. None if no joint has stops.
     """
     arms = run.log.scenario.arms.values()
-    chains = [model.chain for model in arms if model.chain is not None]
-    if not any(joint.stop_stiffness for chain in chains for joint in chain.joints):
+    stop_stiffnesses: list[float] = []
+    for model in arms:
+        if model.chain is not None:
+            stop_stiffnesses += [joint.stop_stiffness for joint in model.chain.joints]
+    if not any(stop_stiffnesses):
         return None
+
     touched = []
     for site, energy in run.energies.items():
         records = energy.motion.records
-        pushed = energy.motion.constants.arm.stop_torque(records.q, records.qd) != 0.0
-        if pushed.any():
-            first_s = float(records.t_s[int(np.argmax(pushed.any(axis=1)))])
-            touched.append(TouchedStop(site, _find_joints(run, site, pushed), first_s))
+        touches_stop = energy.motion.constants.arm.stop_torque(records.q, records.qd) != 0.0
+        if touches_stop.any():
+            first_row = int(np.argmax(touches_stop.any(axis=1)))
+            first_s = float(records.t_s[first_row])
+            touched.append(TouchedStop(site, _find_joints(run, site, touches_stop), first_s))
     return Premise("stops", not touched, StopQuantities(tuple(touched)))
 
 
@@ -484,12 +496,13 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
 
     faults = []
     for site, motion in motions.items():
-        free_axes = np.array(motion.constants.axes) == 0.0
-        free_axes &= np.abs(motion.records.xd).max(axis=0) > LEAST_SPEED_M_S
+        is_free = np.array(motion.constants.axes) == 0.0
+        largest_speed = np.abs(motion.records.xd).max(axis=0)
+        axes_in_free_motion = is_free & (largest_speed > LEAST_SPEED_M_S)
         for follower, follower_motion in motions.items():
             is_followed = site in run.energies[follower].followed
             followed_axes = np.array(follower_motion.constants.axes) > 0.0
-            if is_followed and (free_axes & followed_axes).any():
+            if is_followed and (axes_in_free_motion & followed_axes).any():
                 faults.append((follower, site))
     return Premise("axes", not faults, AxisQuantities(tuple(faults)))
 
@@ -552,13 +565,13 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     if weightless:
         return Premise("hands", False, OperatorQuantities(weightless=weightless))
 
-    supplied_j = float(rise_above_minimum(balance.external_work).max())
+    supplied_energy_j = float(rise_above_minimum(balance.external_work).max())
     released_s = float(max(t_s[-1] for t_s in push_times_s.values()))
     ages_s = [energy.largest_age_s for energy in energies.values()]
     supply = Supply(
         sources=tuple(balance.external),
-        energy_j=supplied_j,
-        is_passive=bool(supplied_j <= 1e-9 * balance.scale + ZERO_ENERGY_J),
+        energy_j=supplied_energy_j,
+        is_passive=bool(supplied_energy_j <= 1e-9 * balance.scale + ZERO_ENERGY_J),
         in_task_space=any(energy.motion.constants.axes for energy in energies.values()),
         released_s=released_s,
         free_s=float(balance.t_s[-1]) - released_s,
@@ -595,12 +608,12 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
     run_end_s = recorded_end_s(log)
     absent = []
     for site in log.sites:
-        part = log[site]
-        for first, last in log.absences.get(site, ()):
-            absence_start_s = first / part.rate_hz
-            absence_end_s = (last + 1) / part.rate_hz
+        site_log = log[site]
+        for first_tick, last_tick in log.absences.get(site, ()):
+            absence_start_s = first_tick / site_log.rate_hz
+            absence_end_s = (last_tick + 1) / site_log.rate_hz
             absent.append(AbsentSpan(site, absence_start_s, absence_end_s))
-        last_s = (part.last_tick + 1) / part.rate_hz
+        last_s = (site_log.last_tick + 1) / site_log.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
         has_left = bool(kinds & {"left", "lost"})
         if last_s < run_end_s - LEAST_ABSENCE_S and has_left:
@@ -654,24 +667,23 @@ FUNCTIONAL_CHECKS = (
 def _examine_stretch(
     energies: Mapping[str, SiteEnergy], from_s: float, to_s: float
 ) -> PresentStretch:
-    """Examines a stretch of time during which all sites were present.
+    """Finds from when on all sites follow in a span without absences, and which delays vary.
+
+    The stability theorem applies to such a span if all sites follow their peers with constant
+    delays.
 
     Args:
         energies: Energies of every site.
-        from_s: Start of the stretch, in s.
-        to_s: End of the stretch, in s.
-
-    Returns:
-        The stretch with the time from which all sites follow their peers, and the links whose
-        delay varies from then on.
+        from_s: Start of the span, in s.
+        to_s: End of the span, in s.
     """
     all_follow_s = from_s
     for energy in energies.values():
         records = energy.motion.records
-        inside = (records.t_s >= from_s) & (records.t_s < to_s)
-        not_following = records.known & ~records.follows & inside
-        if not_following.any():
-            last_row = np.flatnonzero(not_following)[-1]
+        is_inside = (records.t_s >= from_s) & (records.t_s < to_s)
+        is_interrupted = records.known & ~records.follows & is_inside
+        if is_interrupted.any():
+            last_row = np.flatnonzero(is_interrupted)[-1]
             all_follow_s = max(all_follow_s, float(records.t_s[last_row]) + records.h_s)
 
     if to_s - all_follow_s < LEAST_ABSENCE_S:
@@ -680,9 +692,11 @@ def _examine_stretch(
     varying = []
     for site, energy in energies.items():
         records = energy.motion.records
-        inside = records.known & (records.t_s >= all_follow_s) & (records.t_s < to_s)
-        for peer, view in energy.followed.items():
-            age_s = (records.t_s - view.stamp_s)[inside & np.isfinite(view.stamp_s)]
+        is_inside = records.known & (records.t_s >= all_follow_s) & (records.t_s < to_s)
+        for peer, peer_motion in energy.followed.items():
+            age_s = (records.t_s - peer_motion.stamp_s)[
+                is_inside & np.isfinite(peer_motion.stamp_s)
+            ]
             if len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
                 varying.append((peer, site))
     return PresentStretch(from_s, to_s, all_follow_s, tuple(varying))

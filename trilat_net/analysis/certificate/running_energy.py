@@ -164,12 +164,13 @@ class RecordWindow:
 
     def _shift_to(self, first: int) -> None:
         """Makes room for newer records: drops those before tick `first`, and moves the rest."""
-        remaining = max(0, self.newest + 1 - first)
-        dropped = first - self.first
+        remaining_count = max(0, self.newest + 1 - first)
+        dropped_count = first - self.first
         for rows in (self._floats, self._used, self._known, self._follows, self._rests):
-            kept_rows = rows[dropped:]
-            rows[:remaining] = kept_rows[:remaining].copy()
-        self._known[remaining:] = False
+            kept_rows = rows[dropped_count:]
+            # a copy, because source and destination overlap
+            rows[:remaining_count] = kept_rows[:remaining_count].copy()
+        self._known[remaining_count:] = False
         self.first = first
 
     def has_record(self, tick: int) -> bool:
@@ -196,18 +197,18 @@ class RecordWindow:
         """
         first_row = first - self.first
         end_row = last + 1 - self.first
-        part = slice(first_row, end_row)
-        known = self._known[part].copy()
-        floats = self._floats[part]
-        used = self._used[part]
-        follows = self._follows[part].copy()
-        rests = self._rests[part].copy()
+        window_rows = slice(first_row, end_row)
+        known = self._known[window_rows].copy()
+        values = self._floats[window_rows]
+        used = self._used[window_rows]
+        follows = self._follows[window_rows].copy()
+        rests = self._rests[window_rows].copy()
 
         if not known.all() and known.any():
-            floats = floats.copy()
+            values = values.copy()
             ticks = np.arange(len(known))
             known_rows = np.flatnonzero(known)
-            for column in floats.T:
+            for column in values.T:
                 known_values = column[known_rows]
                 column[:] = np.interp(ticks, known_rows, known_values)
             # other values than numbers are those of the last record before the gap
@@ -220,7 +221,7 @@ class RecordWindow:
 
         columns: dict[str, Any] = {}
         for name, span in self._columns.items():
-            columns[name] = floats[:, span]
+            columns[name] = values[:, span]
         used_by_peer = {}
         for n, peer in enumerate(self.peers):
             used_by_peer[peer] = used[:, n]
@@ -274,10 +275,12 @@ class RunningEnergy:
         missing = find_missing_functionals(scenario)
         if missing:
             self.reason = str(find_hook("describe missing functionals")(missing))
+
         rules = [spec.on_stale.rule for spec in scenario.sites.values()]
         degrades = any(rule.degrades for rule in rules)
         if degrades and not self.reason:
             self.reason = "shares change when a peer is lost: `trilat certify` computes V"
+
         self._scenario = scenario
         self._windows = windows
         self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
@@ -335,14 +338,14 @@ class RunningEnergy:
         return self._compute_span(begin_s, end_s)
 
     def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns V over a span of time.
+        """Returns V over a span of time, or None if V is not known there.
+
+        It also forgets changes of the dominance factors that ended long before the span, so
+        that a long session needs bounded memory.
 
         Args:
             begin_s: Start of the span, in s.
             end_s: End of the span, in s.
-
-        Returns:
-            V and the supplied work. None if V is not known.
         """
         tick_spans = {}
         for site, window in self._windows.items():
@@ -399,6 +402,7 @@ class RunningEnergy:
             window = self._windows[site]
             records[site] = window.rows(first, last)
             oldest_used[site] = first
+
         for site_records in records.values():
             for peer, used in site_records.used.items():
                 least_used = int(used.min())
@@ -414,7 +418,7 @@ class RunningEnergy:
         return derive_site_energies(self._scenario, records, pasts, self._trace_dominance)
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
-        """Returns the dominance factors of a site at times in s."""
+        """Returns the dominance factors of a site, its weights of the peers, at times in s."""
         start, ramps = self._dominance[site]
         h_s = 1.0 / self._windows[site].rate_hz
         return evaluate_ramps(start, ramps, t_s, h_s)

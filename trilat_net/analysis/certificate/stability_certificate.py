@@ -183,10 +183,10 @@ class Certificate(Result):
 
     @property
     def _doubts(self) -> tuple[str, ...]:
-        """Sentences on findings that contradict a stable run.
+        """Sentences on findings that contradict a stable run. Empty if there are none.
 
-        They are about V that rose, declared energies that are wrong or negative, and the log.
-        Empty if there are none.
+        Such findings are a rise of V, declared energies that are wrong or negative, and a
+        damaged or incomplete log.
         """
         doubts = []
         if self.verdict.finding is StabilityFinding.BROKEN:
@@ -389,34 +389,40 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     energies = run.energies
     scale = run.balance.scale
 
-    def compute_bound_j(site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
-        return share * scale + 2.0 * energies[site].uncertainty + ZERO_ENERGY_J
+    def compute_bound_j(worst_site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
+        return share * scale + 2.0 * energies[worst_site].uncertainty + ZERO_ENERGY_J
 
-    error_j = {site: _largest(energy.unexplained) for site, energy in energies.items()}
-    wrong = [site for site in energies if error_j[site] > compute_bound_j(site)]
-    if not wrong:
+    error_j = {
+        worst_site: _largest(energy.unexplained) for worst_site, energy in energies.items()
+    }
+    unbalanced = [
+        worst_site
+        for worst_site in energies
+        if error_j[worst_site] > compute_bound_j(worst_site)
+    ]
+    if not unbalanced:
         return None
 
     external = run.log.scenario.external
-    simulated = []
-    for site in wrong:
-        involved = {site, *energies[site].followed}
+    simulated_sites = []
+    for worst_site in unbalanced:
+        involved = {worst_site, *energies[worst_site].followed}
         if involved.isdisjoint(external):
-            simulated.append(site)
-    site = max(simulated or wrong, key=error_j.__getitem__)
-    exceeds = np.abs(energies[site].unexplained) > compute_bound_j(site)
+            simulated_sites.append(worst_site)
+    worst_site = max(simulated_sites or unbalanced, key=error_j.__getitem__)
+    exceeds = np.abs(energies[worst_site].unexplained) > compute_bound_j(worst_site)
     first_row = int(np.argmax(exceeds))
-    is_clear = error_j[site] > compute_bound_j(site, CLEAR_BREAK_SHARE)
-    is_known_well = energies[site].uncertainty < CLEAR_BREAK_SHARE * scale
+    is_clear = error_j[worst_site] > compute_bound_j(worst_site, CLEAR_BREAK_SHARE)
+    is_known_well = energies[worst_site].uncertainty < CLEAR_BREAK_SHARE * scale
     facts = UnclosedBalance(
-        site=site,
-        from_s=float(energies[site].motion.records.t_s[first_row]),
-        error_j=error_j[site],
+        site=worst_site,
+        from_s=float(energies[worst_site].motion.records.t_s[first_row]),
+        error_j=error_j[worst_site],
         scale_j=scale,
-        external=() if simulated else tuple(external),
+        external=() if simulated_sites else tuple(external),
         is_certain=bool(is_clear and is_known_well),
     )
-    finding = StabilityFinding.BROKEN if simulated else StabilityFinding.NOT_JUDGED
+    finding = StabilityFinding.BROKEN if simulated_sites else StabilityFinding.NOT_JUDGED
     return StabilityVerdict(finding, facts)
 
 
@@ -429,11 +435,12 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
         records = energy.motion.records
         error_nm = energy_terms.measure_torque_error(energy.motion)
         largest_nm = np.abs(records.tau).max(axis=1)
-        wrong = error_nm > TORQUE_TOLERANCE * (1.0 + largest_nm)
-        if wrong.any():
+        is_wrong = error_nm > TORQUE_TOLERANCE * (1.0 + largest_nm)
+        if is_wrong.any():
+            first_row = int(np.argmax(is_wrong))
             facts = WrongTorque(
                 site=site,
-                from_s=float(records.t_s[int(np.argmax(wrong))]),
+                from_s=float(records.t_s[first_row]),
                 error_nm=float(error_nm.max()),
             )
             return StabilityVerdict(StabilityFinding.BROKEN, facts)
@@ -462,7 +469,9 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     """
     balance = run.balance
     # Energies that are rounding errors are written as zero.
-    first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
+    first_j = balance.V[0] if balance.V[0] > ZERO_ENERGY_J else 0.0
+    last_j = balance.V[-1] if balance.V[-1] > ZERO_ENERGY_J else 0.0
+
     rise = _find_largest_rise(balance, run.tolerance)
     course = FunctionalCourse(
         failed=tuple(premise.name for premise in premises if premise.holds is False),
@@ -470,11 +479,12 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
         external=tuple(balance.external),
         from_s=float(balance.t_s[0]),
         to_s=float(balance.t_s[-1]),
-        first_j=float(first),
-        last_j=float(last),
+        first_j=float(first_j),
+        last_j=float(last_j),
         largest_j=float(balance.V.max()),
         rise=rise,
     )
+
     finding = StabilityFinding.COVERED
     if rise is not None:
         finding = StabilityFinding.ROSE
@@ -509,11 +519,12 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     """
     V = balance.unsupplied
     rise = rise_above_minimum(V)
-    last = int(rise.argmax())
-    if rise[last] <= tolerance:
+    peak_row = int(rise.argmax())
+    if rise[peak_row] <= tolerance:
         return None
-    first = int(V[: last + 1].argmin())
+    start_row = int(V[: peak_row + 1].argmin())
 
+    # work of every source inside the loop: any of them may have caused the rise
     work_by_source = {}
     for name, work in balance.work.items():
         if name not in EXTERNAL_SOURCES:
@@ -524,16 +535,17 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
 
     causes = {}
     for name, work in work_by_source.items():
-        causes[name] = float(work[last] - work[first])
-    least_amount = NOTABLE_CAUSE_SHARE * rise[last]
+        causes[name] = float(work[peak_row] - work[start_row])
+    least_amount = NOTABLE_CAUSE_SHARE * rise[peak_row]
     notable = {}
-    for name in sorted(causes, key=lambda name: -causes[name]):
+    for name in sorted(causes, key=causes.__getitem__, reverse=True):
         if causes[name] > least_amount:
             notable[name] = causes[name]
+
     return FunctionalRise(
-        from_s=float(balance.t_s[first]),
-        at_s=float(balance.t_s[last]),
-        amount=float(rise[last]),
+        from_s=float(balance.t_s[start_row]),
+        at_s=float(balance.t_s[peak_row]),
+        amount=float(rise[peak_row]),
         causes=notable,
     )
 
@@ -554,18 +566,20 @@ def find_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[Uns
         The growth for each rule that is violated.
     """
     V = balance.unsupplied
-    half = len(V) // 2
+    middle_row = len(V) // 2
     growths = []
     gained = float(V[-1] - V[0])
     if gained > tolerance:
         growths.append(UnsuppliedGrowth(gained))
 
-    judged = V[half:]
-    lowest = int(judged.argmin())
-    risen = float(judged[-1] - judged[lowest])
-    fell = float(judged[0] - judged[lowest])
+    judged = V[middle_row:]
+    lowest_row = int(judged.argmin())
+    risen = float(judged[-1] - judged[lowest_row])
+    fell = float(judged[0] - judged[lowest_row])
     if risen > tolerance and risen > 0.5 * fell:
-        growths.append(UnsuppliedGrowth(risen, from_s=float(balance.t_s[half + lowest])))
+        growths.append(
+            UnsuppliedGrowth(risen, from_s=float(balance.t_s[middle_row + lowest_row]))
+        )
     return growths
 
 
@@ -578,6 +592,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
     """
     V = balance.V
     sites = certificate.energies
+
     paper_balance = certificate.paper_balance
     paper_json: JsonObject | None = None
     if paper_balance is not None:
@@ -586,6 +601,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
             "v_max_j": float(paper_balance.V.max()),
             "rise": _rise_to_json(certificate.paper_weights_rise),
         }
+
     return {
         "beta_first": dict(zip(sites, balance.beta[0].tolist(), strict=True)),
         "beta_last": dict(zip(sites, balance.beta[-1].tolist(), strict=True)),

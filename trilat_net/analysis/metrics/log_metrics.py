@@ -178,12 +178,16 @@ class LogMetrics(Result):
         }
 
     def _list_reasons(self) -> dict[str, str]:
-        """Returns the reason for each missing number, by the path of the number in the JSON."""
+        """Returns the reason for each missing number, by the path of the number in the JSON.
+
+        A missing number is null in the JSON, which does not tell why it is missing.
+        """
         metrics_by_path = {"run.": self.run}
         for kind, metrics_by_name in self._subjects.items():
             for name, metrics in metrics_by_name.items():
                 metrics_by_path[f"{kind}.{name}."] = metrics
         metrics_by_path[""] = {"windows_at_rest": self.static_windows}
+
         reasons = {}
         for path, metrics in metrics_by_path.items():
             for key, metric in metrics.items():
@@ -333,12 +337,14 @@ def _find_common_joint_names(scenario: Scenario) -> tuple[str, ...]:
     return all_names.pop()
 
 
-def _measure_subjects(view: RunView, wanted: Iterable[Measure]) -> dict[str, _SubjectValues]:
-    """Computes metrics for all subjects.
+def _measure_subjects(
+    view: RunView, selected_measures: Iterable[Measure]
+) -> dict[str, _SubjectValues]:
+    """Computes metrics for the run and for all of its sites, links and walls.
 
     Args:
         view: The run.
-        wanted: The measures to apply.
+        selected_measures: The functions that measure these metrics.
 
     Returns:
         The metrics by kind of subject, name of the subject, and key.
@@ -347,7 +353,7 @@ def _measure_subjects(view: RunView, wanted: Iterable[Measure]) -> dict[str, _Su
     for kind in ("run", "site", "link", "wall"):
         subjects = view.list_subjects(kind)
         values[kind] = {name: {} for name in subjects}
-    for measure in wanted:
+    for measure in selected_measures:
         metrics_by_name = values[measure.of]
         for name, metrics in metrics_by_name.items():
             measured = measure.measure(view, name)
@@ -389,13 +395,13 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         LogError: A record cannot be read, or names a change that is not valid.
     """
     requested = {key: find_quantity(key) for key in keys}
-    wanted = []
+    needed_measures = []
     for measure in list_measures():
         measured_keys = {quantity.key for quantity in measure.quantities}
         if not measured_keys.isdisjoint(requested):
-            wanted.append(measure)
+            needed_measures.append(measure)
 
-    values = _measure_subjects(RunView(log), wanted)
+    values = _measure_subjects(RunView(log), needed_measures)
     run_values = {}
     for key, quantity in requested.items():
         values_by_subject = {}
@@ -406,9 +412,10 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
-    """Returns the results of static windows and the responses as plain values.
+    """Returns joint loads, force sharing, stiffness and frequency responses as plain values.
 
-    In task space the entries have an axis in place of the joint, and the units of this axis.
+    If the arms follow with their end effectors, the entries have an axis in place of the joint,
+    and the units of this axis.
     """
     details: dict[str, list[_JsonEntry]] = {
         "levers": [_load_to_json(load) for load in metrics.joint_loads],
@@ -432,14 +439,14 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
 
 def _load_to_json(load: JointLoad) -> _JsonEntry:
-    """Returns the load of a joint as plain values."""
+    """Returns the torques that a joint carries at rest, with their weights, as plain values."""
     content = load._asdict()
     content["weight"] = _values_to_json(load.weight)
     return content | _value_and_reason("imbalance", load.imbalance)
 
 
 def _sharing_to_json(ratio: SharingRatio) -> _JsonEntry:
-    """Returns a force sharing as plain values."""
+    """Returns the torque that an operator feels, and the expected torque, as plain values."""
     content = ratio._asdict()
     content["off"] = ratio.off
     return content | _value_and_reason("expected_nm", ratio.expected_nm)
@@ -462,11 +469,11 @@ def _name_axis(metrics: LogMetrics, entry: _JsonEntry) -> _JsonEntry:
     along the axis, for example "force_nm" becomes "force_n".
     """
     number = entry.pop("joint")
-    renamed = {"axis": metrics.label(number)}
+    axis_entry = {"axis": metrics.label(number)}
     for key, value in entry.items():
         new_key = _name_along_axis(key) if number <= POSITION else key
-        renamed[new_key] = value
-    return renamed
+        axis_entry[new_key] = value
+    return axis_entry
 
 
 def _name_along_axis(key: str) -> str:
@@ -480,7 +487,7 @@ def _name_along_axis(key: str) -> str:
 
 
 def _response_to_json(response: FrequencyResponse, unit: str) -> _JsonEntry:
-    """Returns a response as plain values."""
+    """Returns the frequency response at one frequency as plain values."""
     content = response._asdict()
     content["why"] = response.why or None
     content["unit"] = unit

@@ -118,21 +118,22 @@ def estimate_responses(
         return [FrequencyResponse(why=reason)]
 
     D = _compute_spectra(drive, starts, length)
-    power = (np.abs(D) ** 2).mean(axis=0)
-    if not np.isfinite(power).all():
+    drive_power = (np.abs(D) ** 2).mean(axis=0)
+    if not np.isfinite(drive_power).all():
         return [FrequencyResponse(why="the numbers of the drive are too large")]
 
-    strongest = int(power.argmax())
-    if math.sqrt(2.0 * power[strongest]) < least:
+    strongest = int(drive_power.argmax())
+    if math.sqrt(2.0 * drive_power[strongest]) < least:
         return [FrequencyResponse(why="the drive is too weak at every frequency")]
-    least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * power[strongest])
-    driven = np.flatnonzero(power >= least_power)
+    # a sinusoid of amplitude a has the mean square a^2 / 2
+    least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * drive_power[strongest])
+    driven_lines = np.flatnonzero(drive_power >= least_power)
 
     X = _compute_spectra(put_in, starts, length)
     Y = _compute_spectra(came_out, starts, length)
 
     responses = []
-    for line in (strongest, *driven[driven != strongest].tolist()):
+    for line in (strongest, *driven_lines[driven_lines != strongest].tolist()):
         frequency_hz = (line + _LOWEST_LINE) / SEGMENT_S
         response = _estimate_at_line(
             frequency_hz=frequency_hz,
@@ -153,9 +154,10 @@ def _find_segments(usable: Bools, length: int) -> list[int]:
     """
     if length < 4 * _LOWEST_LINE:
         return []
-    unusable_before = np.concatenate([[0], np.cumsum(~usable)])
+    bad_rows_before = np.concatenate([[0], np.cumsum(~usable)])
     first = np.arange(0, len(usable) - length + 1, length // 2)
-    is_usable = unusable_before[first + length] == unusable_before[first]
+    # a segment is usable if the count does not rise within it
+    is_usable = bad_rows_before[first + length] == bad_rows_before[first]
     starts: list[int] = first[is_usable].tolist()
     return starts
 
@@ -177,6 +179,7 @@ def _estimate_at_line(
     power = np.abs(D) ** 2
     square_of_sum = power.sum() ** 2
     sum_of_squares = (power**2).sum()
+    # number of segments of equal power that would drive the line as much
     segments = float(square_of_sum / sum_of_squares) / _OVERLAP_FACTOR
     if segments < MIN_SEGMENTS:
         reason = (
@@ -205,6 +208,7 @@ def _estimate_at_line(
     H = S_dy / S_dx
     input_noise = 1.0 / input_coherence - 1.0
     output_noise = 1.0 / output_coherence - 1.0
+    # random error of a ratio of cross spectra
     noise = max(0.0, input_noise + output_noise)
     error = math.sqrt(noise / (2.0 * segments))
     return FrequencyResponse(
@@ -322,13 +326,13 @@ def _estimate_joints(
     """
     records = runs[site].records
     torque = runs[site].torque
-    usable = _find_still_rows(runs, site, alone=not environment)
-    rows, recorded = find_latest_rows(runs[environment or site].records, records.t_s)
+    is_usable = _find_still_rows(runs, site, alone=not environment)
+    rows, is_recorded = find_latest_rows(runs[environment or site].records, records.t_s)
 
     for joint in range(records.qd.shape[1]):
         responses = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
-        if torque.script is not None and usable is not None:
-            usable = usable & records.known
+        if torque.script is not None and is_usable is not None:
+            is_usable = is_usable & records.known
             operator = torque.operator[:, joint]
             if environment:
                 wall_torque = runs[environment].torque.environment[rows, joint]
@@ -336,7 +340,7 @@ def _estimate_joints(
                     drive=wall_torque,
                     put_in=wall_torque,
                     came_out=-operator,
-                    usable=usable & recorded,
+                    usable=is_usable & is_recorded,
                     rate_hz=records.rate_hz,
                     least=MIN_DRIVE_TORQUE_NM,
                 )
@@ -345,7 +349,7 @@ def _estimate_joints(
                     drive=torque.script[:, joint],
                     put_in=records.qd[:, joint],
                     came_out=operator,
-                    usable=usable,
+                    usable=is_usable,
                     rate_hz=records.rate_hz,
                     least=MIN_DRIVE_TORQUE_NM,
                 )
@@ -379,16 +383,16 @@ def _find_still_rows(
         True for each such tick, shape (K,). None if the plan of some operator is unknown.
     """
     t_s = runs[reference_site].records.t_s
-    still = np.ones(len(t_s), dtype=np.bool_)
+    is_still = np.ones(len(t_s), dtype=np.bool_)
     for site, run in runs.items():
         if alone and site == reference_site:
             continue
-        script = run.torque.script
-        if script is None:
+        plan = run.torque.script
+        if plan is None:
             return None
-        if len(script) > 1:
+        if len(plan) > 1:
             rows, _ = find_latest_rows(run.records, t_s)
-            slopes = np.abs(np.gradient(script, axis=0))
-            rate_nm_s = slopes.max(axis=1) * run.records.rate_hz
-            still &= rate_nm_s[rows] < STILL_SCRIPT_NM_S
-    return still
+            changes_nm = np.abs(np.gradient(plan, axis=0))
+            rate_nm_s = changes_nm.max(axis=1) * run.records.rate_hz
+            is_still &= rate_nm_s[rows] < STILL_SCRIPT_NM_S
+    return is_still

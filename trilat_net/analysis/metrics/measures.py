@@ -112,22 +112,22 @@ def measure_shared(
         The metrics, by quantity.
     """
     columns_by_unit = {"rad": slice(None)}
-    excluded = "sites share angles, not places"
+    why_excluded = "sites share angles, not places"
     if space != "joints":
         columns_by_unit = {"m": slice(0, POSITION)}
-        excluded = "sites share places, not angles"
+        why_excluded = "sites share places, not angles"
         if space == "pose":
             columns_by_unit["rad"] = slice(POSITION, None)
 
-    values = unavailable(group, excluded, applies=False)
+    values = unavailable(group, why_excluded, applies=False)
     for unit, columns in columns_by_unit.items():
-        part = differences[:, columns]
-        part_metrics = (
-            metric(rms(part)),
-            metric(peak(part)),
-            metric(peak(part[at_end]), why_not_at_end),
+        unit_differences = differences[:, columns]
+        unit_metrics = (
+            metric(rms(unit_differences)),
+            metric(peak(unit_differences)),
+            metric(peak(unit_differences[at_end]), why_not_at_end),
         )
-        for key, value in zip(keys, part_metrics, strict=True):
+        for key, value in zip(keys, unit_metrics, strict=True):
             values[f"{key}_{unit}"] = value
     return values
 
@@ -143,11 +143,11 @@ def rms(values: ArrayLike) -> float:
     Returns:
         The largest root mean square. NaN if there are no rows.
     """
-    array = np.asarray(values, dtype=np.float64)
-    if not array.size:
+    numbers = np.asarray(values, dtype=np.float64)
+    if not numbers.size:
         return math.nan
-    square_sums = np.einsum("kj,kj->j", array, array)
-    root_mean_squares = np.sqrt(square_sums / len(array))
+    square_sums = np.einsum("kj,kj->j", numbers, numbers)
+    root_mean_squares = np.sqrt(square_sums / len(numbers))
     return float(root_mean_squares.max())
 
 
@@ -160,8 +160,8 @@ def peak(values: ArrayLike) -> float:
     Returns:
         The largest absolute value. NaN if there are no numbers.
     """
-    array = np.asarray(values, dtype=np.float64)
-    return float(np.abs(array).max()) if array.size else math.nan
+    magnitudes = np.asarray(values, dtype=np.float64)
+    return float(np.abs(magnitudes).max()) if magnitudes.size else math.nan
 
 
 class Quantity(NamedTuple):
@@ -278,6 +278,7 @@ def measures(
     """
 
     def declare(measure: _DeclaredMeasuring) -> _DeclaredMeasuring:
+        """Registers a function, unless one of its quantities is registered already."""
         definitions = {
             quantity.key: declared for declared in _MEASURES for quantity in declared.quantities
         }

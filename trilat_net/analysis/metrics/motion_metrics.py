@@ -98,8 +98,8 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
         site: Name of the site.
     """
     log = view.log
-    part = log[site]
-    if not len(part):
+    site_log = log[site]
+    if not len(site_log):
         return unavailable(TRACKING, f"no records of {site}")
 
     space = log.scenario.sites[site].task.space
@@ -108,11 +108,11 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
         group=TRACKING,
         space=space,
         keys=_ERRORS,
-        differences=site_signals.joint_errors(part),
-        at_end=part.t_s > part.t_s[-1] - END_WINDOW_S,
+        differences=site_signals.joint_errors(site_log),
+        at_end=site_log.t_s > site_log.t_s[-1] - END_WINDOW_S,
     )
     metrics["settle_s"] = metric(
-        site_signals.settling_time_s(part), f"|e| exceeds {limit} in the last record"
+        site_signals.settling_time_s(site_log), f"|e| exceeds {limit} in the last record"
     )
     return metrics
 
@@ -165,7 +165,7 @@ def measure_undelayed_error(
 def _compute_undelayed_error(
     view: RunView, site: str, followed: Mapping[str, Array]
 ) -> tuple[Array, Bools]:
-    """Returns a site's distance from where its peers are at the same time.
+    """Returns a site's distance from the weighted mean of its peers at the same time.
 
     Args:
         view: The run, which has records of the site and of the followed peers.
@@ -173,35 +173,42 @@ def _compute_undelayed_error(
         followed: Dominance factors of the followed peers over time, shape (K,) each.
 
     Returns:
-        The distance in every row, shape (K, n), and whether it is known, shape (K,).
+        The distance at every tick, shape (K, n).
+        True where all positions are known, shape (K,).
     """
     records = view.sites[site].records
     t_s = records.t_s
-    known = records.known.copy()
-    mean = np.zeros_like(records.shared)
+    is_known = records.known.copy()
+    reference = np.zeros_like(records.shared)
     for peer, alpha in followed.items():
         peer_records = view.sites[peer].records
         motion = PeerTrajectory(peer_records).evaluate(t_s)
-        known &= motion.known & (t_s <= peer_records.t_s[-1])
+        is_known &= motion.known & (t_s <= peer_records.t_s[-1])
         positions = motion.q
         if records.x.shape[1] == POSE:
+            # a rotation vector and its other branch must not be averaged
             orientations = choose_nearest_vectors(
                 positions[:, POSITION:], records.x[:, POSITION:]
             )
             positions[:, POSITION:] = orientations
-        mean += alpha[:, np.newaxis] * positions
+        reference += alpha[:, np.newaxis] * positions
     if records.x.size:
-        return compute_task_errors(records.x, mean, records.axes), known
-    return records.q - mean, known
+        return compute_task_errors(records.x, reference, records.axes), is_known
+    return records.q - reference, is_known
 
 
 def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
-    """Returns the dominance factors of the followed peers over time, shape (K,) each."""
+    """Returns the peers that a site follows at some time, with their dominance factors.
+
+    The factors, which are the weights of the peers, have the shape (K,) for K ticks.
+    """
     if site not in view.sites:
         return {}
     alpha = view.sites[site].dominance.alpha
     peers = view.scenario.peers(site)
-    return {peer: alpha[:, n] for n, peer in enumerate(peers) if alpha[:, n].any()}
+    return {
+        peer: factors for peer, factors in zip(peers, alpha.T, strict=True) if factors.any()
+    }
 
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
@@ -274,25 +281,26 @@ def _measure_following(view: RunView, link: str) -> MetricValues:
 
     master = view.sites[peer].records
     slave = view.sites[site].records
+
     used = slave.used[peer]
     master_row = used - master.first
-    row = np.clip(master_row, 0, len(master.known) - 1)
-    is_recorded = (used >= 0) & (row == master_row)
-    known = slave.known & is_recorded & master.known[row]
-    if not known.any():
+    clipped_row = np.clip(master_row, 0, len(master.known) - 1)
+    is_recorded = (used >= 0) & (clipped_row == master_row)
+    is_compared = slave.known & is_recorded & master.known[clipped_row]
+    if not is_compared.any():
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
 
-    master_pose = master.shared[row]
+    master_pose = master.shared[clipped_row]
     if slave.x.size:
-        lag = compute_task_errors(master_pose, slave.x, slave.axes)
+        distance = compute_task_errors(master_pose, slave.x, slave.axes)
     else:
-        lag = master_pose - slave.q
+        distance = master_pose - slave.q
     return measure_shared(
         group=FOLLOWING,
         space=specs[site].task.space,
         keys=_DELAYED_DISTANCES,
-        differences=lag[known],
-        at_end=slave.known_at_end(END_WINDOW_S)[known],
+        differences=distance[is_compared],
+        at_end=slave.known_at_end(END_WINDOW_S)[is_compared],
         why_not_at_end="no sample in the last second",
     )
 
@@ -376,10 +384,11 @@ def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
     touches = force > 0.0
 
     is_known_free = known & ~touches
-    was_free = np.concatenate([[False], is_known_free[:-1]])
-    is_hit = touches & was_free
+    was_known_free = np.concatenate([[False], is_known_free[:-1]])
+    is_hit = touches & was_known_free
     depth = wall_depth(wall, end_effector)[known]
 
+    # depths are negative outside the wall
     metrics = {
         "contact_share": metric(float(touches[known].mean())),
         "depth_max_m": metric(max(0.0, float(depth.max()))),
@@ -473,10 +482,13 @@ def _read_parameter_estimates(
         learnt = (theta_hat != theta_hat[0]).any(axis=0)
 
     at_end = records.known_at_end(LONG_END_S)
-    slope = None
+    slopes = None
     if np.count_nonzero(at_end) >= 2:
-        centred_s = records.t_s[at_end] - records.t_s[at_end].mean()
-        slope = (centred_s @ theta_hat[at_end] / (centred_s @ centred_s)).tolist()
+        # slopes of least-squares lines
+        end_s = records.t_s[at_end]
+        centred_s = end_s - end_s.mean()
+        line_slopes = centred_s @ theta_hat[at_end] / (centred_s @ centred_s)
+        slopes = line_slopes.tolist()
 
     theta = arm.theta.tolist() if spec.arm.known else None
     base = None
@@ -487,7 +499,7 @@ def _read_parameter_estimates(
         theta=theta,
         first=theta_hat[0].tolist(),
         last=theta_hat[-1].tolist(),
-        slope_per_s=slope,
+        slope_per_s=slopes,
         base=base,
     )
 
@@ -527,12 +539,12 @@ def _estimate_base_parameters(
     first_and_last = theta_hat[[0, -1]]
     estimates = base.combination @ first_and_last.T
     first, last = estimates.T.tolist()
-    true_base = None
+    true_values = None
     if theta is not None:
-        true_base = (base.combination @ np.array(theta)).tolist()
+        true_values = (base.combination @ np.array(theta)).tolist()
     return _BaseEstimates(
         parameter=base.kept.tolist(),
-        theta=true_base,
+        theta=true_values,
         first=first,
         last=last,
         consistent_first=find_consistent_links(theta_hat[0]),
@@ -636,9 +648,9 @@ def _compute_parameter_energy(
         energy = 0.5 * (errors**2 / Gamma[learnt]).sum(axis=1)
     else:
         B = find_base_parameters(arm, learnt).combination
-        gain = B * Gamma @ B.T
-        weighted = np.linalg.solve(gain, errors.T)
-        energy = 0.5 * (errors * weighted.T).sum(axis=1)
+        gain = (B * Gamma) @ B.T
+        weighted_errors = np.linalg.solve(gain, errors.T)
+        energy = 0.5 * (errors * weighted_errors.T).sum(axis=1)
     return list(energy.tolist())
 
 
@@ -670,7 +682,7 @@ def _measure_network(view: RunView, name: str) -> MetricValues:
     if link.loss == 0.0:
         burst = Metric(None, "nothing was lost", applies=False)
 
-    late = link.counts.late if link.counts else None
+    late_samples = link.counts.late if link.counts else None
     return {
         "age_mean_ms": metric(age.mean if age else None, unused),
         "age_p99_ms": metric(age.p99 if age else None, unused),
@@ -678,7 +690,7 @@ def _measure_network(view: RunView, name: str) -> MetricValues:
         "silence_ms": metric(link.silence_ms, unused),
         "loss": metric(link.loss, unknown),
         "burst": burst,
-        "late_samples": metric(late, f"no records of {link.site}"),
+        "late_samples": metric(late_samples, f"no records of {link.site}"),
     }
 
 

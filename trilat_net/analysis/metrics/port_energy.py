@@ -75,7 +75,7 @@ def trapezoid_work(torque: Array, q: Array) -> Array:
 
 
 def _held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
-    """Returns the torque that the controller applied during every tick period.
+    """Returns the torque with which the controller drove an arm in every tick period.
 
     For an arm that is not simulated, the torque of the drives between two ticks is unknown. The
     mean of the commands at both ticks is used.
@@ -157,6 +157,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
         return unavailable(ENERGY, "no two records in a row", of="site")
 
     def accumulate(work: Array) -> Array:
+        """Returns the sum of work over time. Periods without records count as zero."""
         known_work = np.where(known, work, 0.0)
         return np.cumsum(known_work)
 
@@ -255,9 +256,9 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
 
     peer_view = view_delayed_peer(records, PeerTrajectory(peer_records))
     is_peer_known = peer_view.delayed.known & peer_view.now.known
-    known = is_peer_known & records.follows
-    judged = records.known_periods & known[:-1] & known[1:]
-    if not judged.any():
+    is_known = is_peer_known & records.follows
+    is_judged = records.known_periods & is_known[:-1] & is_known[1:]
+    if not is_judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
 
     j = list(records.used).index(peer)
@@ -266,13 +267,13 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
         arm=arm,
         records=records,
         peer_records=peer_records,
-        view=peer_view,
+        peer_motion=peer_view,
         alpha=dominance.alpha[:, [j]],
         alpha_rate=dominance.rate[:, [j]],
     )
 
     work = trapezoid_work(torque, records.q)
-    judged_work = np.where(judged, work, 0.0)
+    judged_work = np.where(is_judged, work, 0.0)
     injected = np.cumsum(judged_work)
     return {
         "delay_j": metric(injected[-1]),
@@ -285,11 +286,11 @@ def _compute_delay_torque(
     arm: ArmRows,
     records: AlignedRecords,
     peer_records: AlignedRecords,
-    view: DelayedPeer,
+    peer_motion: DelayedPeer,
     alpha: Array,
     alpha_rate: Array,
 ) -> Array:
-    """Returns the torque that the delay of a link adds to the law's torque.
+    """Returns the torque by which a law's torque differs from its torque without delay.
 
     The effect of the delay on the Coulomb friction that a law compensates is left out.
 
@@ -298,7 +299,7 @@ def _compute_delay_torque(
         arm: Arm of the site.
         records: Records of the site.
         peer_records: Records of the peer.
-        view: Motion of the peer as the site sees it, and at the same time.
+        peer_motion: Motion of the peer as the site sees it, and at the same time.
         alpha: Dominance factor of the peer, shape (K, 1).
         alpha_rate: Time derivative of the dominance factor, shape (K, 1), in 1/s.
 
@@ -306,16 +307,18 @@ def _compute_delay_torque(
         Torque, shape (K, n), in N m.
     """
     all_rows = slice(None)
-    lag = view.delayed.q - view.now.q
-    rate_lag = view.delayed.qd - view.now.qd
-    reference_change = alpha * lag
-    reference_rate_change = alpha * rate_lag + alpha_rate * lag
+    position_lag = peer_motion.delayed.q - peer_motion.now.q
+    rate_lag = peer_motion.delayed.qd - peer_motion.now.qd
+    # the delay shifts the reference, which is the weighted mean of the peers
+    reference_change = alpha * position_lag
+    reference_rate_change = alpha * rate_lag + alpha_rate * position_lag
 
     axes = np.array(records.axes or 1.0)
     Lambda = axes * np.array(gains.Lambda)
     Kd = axes * np.array(gains.Kd)
     following = build_following(arm, records.q, records.qd, Lambda).without_posture()
     if gains.law is Law.ADAPTIVE:
+        # without gravity the torque is linear in v and a: it is the part due to the shift
         v, a = following.compute_reference(all_rows, -reference_change, -reference_rate_change)
         torque = arm.weightless().law_torque(
             theta_hat=records.theta_hat,
@@ -355,13 +358,13 @@ def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords
     has_arrived = is_used[:, np.newaxis]
     last_row = len(peer_records.known) - 1
     row_of_peer = used - peer_records.first
-    row = np.clip(row_of_peer, 0, last_row)
-    arrived = np.where(has_arrived, -peer_torque[row], 0.0)
+    clipped_row = np.clip(row_of_peer, 0, last_row)
+    reflected = np.where(has_arrived, -peer_torque[clipped_row], 0.0)
 
     columns = [
         np.interp(records.t_s, peer_records.t_s, -joint_torque)
         for joint_torque in peer_torque.T
     ]
     present = np.stack(columns, axis=1)
-    lag: Array = arrived - present
+    lag: Array = reflected - present
     return lag

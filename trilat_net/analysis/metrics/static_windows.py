@@ -77,40 +77,41 @@ class _StaticWindow(NamedTuple):
     alpha: Array
 
 
-def _find_static_windows(view: RunView) -> list[_StaticWindow]:
+def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
     """Finds the static windows of a run, in order.
 
     A window is the last `WINDOW_S` of an interval in which all sites rest. Each interval has
     one window at most.
 
     Args:
-        view: The run.
+        run_view: The run.
 
     Returns:
         The windows. Empty if some site has no records.
     """
-    if view.absent:
+    if run_view.absent:
         return []
-    runs = view.shared
+    runs = run_view.shared
     first_records = next(iter(runs.values())).records
     rows_by_site = {}
-    still = first_records.known.copy()
+    is_still = first_records.known.copy()
     for site, run in runs.items():
         row, recorded = find_latest_rows(run.records, first_records.t_s)
         rows_by_site[site] = row
-        still &= recorded & _find_resting_rows(run)[row]
+        is_still &= recorded & _find_resting_rows(run)[row]
 
     window_ticks = int(np.ceil(WINDOW_S * first_records.rate_hz))
-    framed = np.concatenate([[False], still, [False]])
-    # starts and ends of the intervals in turns
-    edges = np.flatnonzero(np.diff(framed))
+    padded = np.concatenate([[False], is_still, [False]])
+    # first tick of each interval and first tick after it, in turns
+    change_ticks = np.flatnonzero(np.diff(padded))
     windows = []
-    for begin, end in edges.reshape(-1, 2).tolist():
+    for begin, end in change_ticks.reshape(-1, 2).tolist():
         if end - begin <= window_ticks:
             continue
         ticks = slice(end - window_ticks - 1, end)
         window_rows = {site: row[ticks] for site, row in rows_by_site.items()}
 
+        # arms may rest although a torque still varies
         largest_nm = []
         variation_nm = []
         for site, row in window_rows.items():
@@ -120,7 +121,7 @@ def _find_static_windows(view: RunView) -> list[_StaticWindow]:
             variation_nm.append(float(ranges.max()))
 
         reference_nm = max(max(largest_nm), MIN_LOAD_NM)
-        # also if the variation is NaN
+        # negated, so that a window whose variation is NaN counts as static
         if not max(variation_nm) > MAX_TORQUE_VARIATION * reference_nm:
             window = _average_window(runs, window_rows, first_records.t_s[ticks])
             windows.append(window)
@@ -141,14 +142,14 @@ def _find_resting_rows(run: SiteRun) -> Bools:
     is_slow = largest_speed < STATIC_SPEED_RAD_S
     shares_change = run.dominance.rate.any(axis=1)
     resting: Bools = records.follows & is_slow & ~shares_change
-    script = run.torque.script
-    # without a script, only the variation of the torque decides
-    if script is not None:
-        largest_change = np.abs(np.diff(script, axis=0)).max(axis=1)
-        moves = largest_change > MOVING_SCRIPT_NM
-        moves_after = np.append(moves, False)
-        moves_before = np.append(False, moves)
-        resting &= ~(moves_after | moves_before)
+    plan = run.torque.script
+    # without a known plan, only the variation of the torque decides
+    if plan is not None:
+        largest_change = np.abs(np.diff(plan, axis=0)).max(axis=1)
+        plan_changes = largest_change > MOVING_SCRIPT_NM
+        changes_after = np.append(plan_changes, False)
+        changes_before = np.append(False, plan_changes)
+        resting &= ~(changes_after | changes_before)
     return resting
 
 
@@ -157,7 +158,7 @@ def _average_window(
     rows: Mapping[str, Ints],
     t_s: Array,
 ) -> _StaticWindow:
-    """Returns a static window with the means over its ticks.
+    """Returns the means of torques and angles over the ticks of a static window.
 
     Args:
         runs: All sites.
@@ -239,7 +240,7 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
         torque_changes = (torque_after - torque_before).tolist()
         angle_changes = (after.q[site] - before.q[site]).tolist()
         for joint, torque_nm in enumerate(torque_changes):
-            # also if it is NaN
+            # negated, so that NaN is left out too
             if not abs(torque_nm) >= MIN_TORQUE_CHANGE_NM:
                 continue
             angle_rad = angle_changes[joint]
@@ -262,18 +263,17 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
 def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
     """Returns the site of the only operator that acted differently in two static windows.
 
-    Returns:
-        Name of the site. Empty if no operator or several operators moved, or if the plan of
-        some operator is unknown.
+    If several operators moved, the stiffness that one of them met cannot be told. The name is
+    then empty, as it is if no operator moved or the plan of an operator is unknown.
     """
-    moved = []
-    for site, script_after in after.script.items():
-        script_before = before.script[site]
-        if script_after is None or script_before is None:
+    moved_sites = []
+    for site, plan_after in after.script.items():
+        plan_before = before.script[site]
+        if plan_after is None or plan_before is None:
             return ""
-        if np.abs(script_after - script_before).max() > STILL_SCRIPT_NM:
-            moved.append(site)
-    return moved[0] if len(moved) == 1 else ""
+        if np.abs(plan_after - plan_before).max() > STILL_SCRIPT_NM:
+            moved_sites.append(site)
+    return moved_sites[0] if len(moved_sites) == 1 else ""
 
 
 class SharingRatio(NamedTuple):
@@ -363,9 +363,11 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
         common_joints = min(map(len, window.torque.values()))
         for joint in range(common_joints):
             torque = {site: float(values[joint]) for site, values in window.torque.items()}
-            largest_nm = max(map(abs, torque.values()))
-            least_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * largest_nm)
-            loaded = {site: value for site, value in torque.items() if abs(value) >= least_nm}
+            largest_torque_nm = max(map(abs, torque.values()))
+            least_load_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * largest_torque_nm)
+            loaded = {
+                site: value for site, value in torque.items() if abs(value) >= least_load_nm
+            }
             if loaded:
                 load = _weigh_load(window, joint, loaded, weights)
                 loads.append(load)
@@ -429,7 +431,9 @@ def _weigh_load(
     torque: dict[str, float],
     weights: Array | str,
 ) -> JointLoad:
-    """Returns the load of a joint, with the weights of its torques.
+    """Computes how well the torques on the arms at a joint balance, weighted with pi_i / K_i.
+
+    The module's docstring has the equation that the torques satisfy at rest.
 
     Args:
         window: The static window.
@@ -446,12 +450,14 @@ def _weigh_load(
         joint_weights = weights[:, joint]
         relative_weights = joint_weights / np.nanmax(joint_weights)
         weight = dict(zip(window.torque, relative_weights.tolist(), strict=True))
+
         weighted = [weight[site] * value for site, value in torque.items()]
         largest = max(map(abs, weighted))
-        share = None
+
+        imbalance_ratio = None
         if largest > 0.0:
-            share = abs(sum(weighted)) / largest
-        imbalance = metric(share, "no site that others follow is loaded")
+            imbalance_ratio = abs(sum(weighted)) / largest
+        imbalance = metric(imbalance_ratio, "no site that others follow is loaded")
         weight_metrics = {site: metric(weight[site]) for site in torque}
 
     return JointLoad(
@@ -478,19 +484,20 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
         The comparisons by time. Empty if there is no joint of this kind.
     """
     static_windows = view.compute_once(_find_static_windows)
-    windows = {window.from_s: window for window in static_windows}
+    window_by_start = {window.from_s: window for window in static_windows}
     ratios = []
     for load in view.compute_once(find_joint_loads):
         if len(load.torque_nm) != 2:
             continue
 
+        # the site that is more likely held by a feeling operator comes last
         ranks = {}
         for site in load.torque_nm:
             ranks[site] = _rank_as_holder(view.scenario, site, load.to_s)
         pushed, holds = sorted(load.torque_nm, key=ranks.__getitem__)
 
         torque = load.torque_nm[pushed]
-        environment = windows[load.from_s].environment[pushed]
+        environment = window_by_start[load.from_s].environment[pushed]
         wall_torque = float(environment[load.joint - 1])
 
         pushed_weight = load.weight[pushed]
@@ -518,10 +525,10 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
 
 
 def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bool]:
-    """Returns a sort key with which the site whose operator feels the torque comes last.
+    """Returns a sort key by which the site whose operator feels the torque comes last.
 
-    Such an operator is a spring that acts at the time, and the site has no environment. Among
-    equal sites, masters come last.
+    That operator holds the arm like a spring at this time, and no environment acts at the site.
+    Among equal sites, masters come last.
 
     Args:
         scenario: Scenario of the run.
@@ -558,7 +565,7 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 
 def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
-    """Returns the stiffness with which a site holds its error e at rest.
+    """Returns the stiffness with which a site's law pulls the arm to its reference at rest.
 
     Returns:
         The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow.
@@ -577,27 +584,27 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
         return unknown, "the law reflects force: its torque does not depend on e alone"
 
     is_adaptive = gains.law is Law.ADAPTIVE
-    gravity = arm.gravity_parameters
+    has_weight = arm.gravity_parameters
     if is_adaptive and arm.task is not None:
         why = "in task space the stiffness of this law changes with the pose: J+'Kp J+ Lambda"
         return unknown, why
 
-    estimate = np.array(gains.theta_hat0 if is_adaptive else gains.known)
+    parameters = np.array(gains.theta_hat0 if is_adaptive else gains.known)
     if is_adaptive:
         adapts = np.array(gains.Gamma) > 0.0
-        if np.any(adapts & gravity):
+        if np.any(adapts & has_weight):
             return unknown, "gravity is learnt: the estimates take up the load"
-    is_wrong = estimate != arm.theta
-    if np.any(is_wrong & gravity) and spec.arm.g_m_s2 > 0.0:
+    is_wrong = parameters != arm.theta
+    if np.any(is_wrong & has_weight) and spec.arm.g_m_s2 > 0.0:
         return unknown, "gravity is not known exactly"
-    K = np.array(gains.K)
+    stiffness = np.array(gains.K)
     if is_adaptive:
-        K = np.array(gains.Kp) * np.array(gains.Lambda)
+        stiffness = np.array(gains.Kp) * np.array(gains.Lambda)
 
     axes = np.array(scenario.arms[site].axes or 1.0)
     is_free = axes == 0.0
-    is_held = (K > 0.0) | is_free
+    is_held = (stiffness > 0.0) | is_free
     why = ""
     if not is_held.all():
         why = "the law has no stiffness along a coordinate that the site follows"
-    return np.where(is_free, np.nan, K), why
+    return np.where(is_free, np.nan, stiffness), why

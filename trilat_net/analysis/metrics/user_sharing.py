@@ -112,13 +112,13 @@ def _measure_authority(view: RunView, site: str) -> MetricValues:
     records = view.sites[site].records
     torque = view.sites[site].torque
     user = users.index(site)
-    slave_row, slave_recorded = find_latest_rows(view.sites[slave].records, records.t_s)
+    slave_row, is_slave_recorded = find_latest_rows(view.sites[slave].records, records.t_s)
 
     share = shared.shares[slave_row, user]
     squared_torque = np.square(torque.operator).sum(axis=1)
-    weighted = share * squared_torque
-    counted = weighted[records.known & slave_recorded]
-    effort = counted.sum() * records.h_s
+    weighted_squares = share * squared_torque
+    counted_squares = weighted_squares[records.known & is_slave_recorded]
+    effort = counted_squares.sum() * records.h_s
 
     motion_shares = view.compute_once(_identify_shares)
     if isinstance(motion_shares, Metric):
@@ -150,17 +150,18 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     """
     slave, users = find_users(view.scenario)
     slave_records = view.sites[slave].records
-    valid = slave_records.known & slave_records.follows
+    is_valid = slave_records.known & slave_records.follows
     user_rates = []
     for user in users:
         records = view.sites[user].records
         used_row = slave_records.used[user] - records.first
-        row = used_row.clip(0, len(records.known) - 1)
-        valid &= (used_row == row) & records.known[row]
-        user_rates.append(records.shared_rate[row])
+        clipped_row = used_row.clip(0, len(records.known) - 1)
+        is_valid &= (used_row == clipped_row) & records.known[clipped_row]
+        user_rates.append(records.shared_rate[clipped_row])
 
-    slave_rate = slave_records.shared_rate[valid].ravel()
-    valid_rates = [rate[valid].ravel() for rate in user_rates]
+    # subtract the last user's velocity to meet the constraint
+    slave_rate = slave_records.shared_rate[is_valid].ravel()
+    valid_rates = [rate[is_valid].ravel() for rate in user_rates]
     *other_rates, last_rate = valid_rates
     relative_rates = np.column_stack([rate - last_rate for rate in other_rates])
     relative_slave_rate = slave_rate - last_rate
@@ -183,7 +184,7 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     # jackknife (Quenouille 1956): (n - 1) / n times the sum of squared deviations, n blocks
     variance = (JACKKNIFE_BLOCKS - 1) * np.var(jackknife_shares, axis=0).max()
     half_width = STUDENT_T * math.sqrt(variance)
-    # also if it is NaN
+    # negated, so that NaN is refused too
     if not half_width <= LARGEST_HALF_WIDTH:
         why = f"the motion does not determine the shares: only within +- {half_width:.2g}"
         return Metric(None, why)
@@ -275,9 +276,9 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     force_columns = POSITION if runs[0].records.x.size else 0
     forces = cancelled[:, :force_columns]
     joint_torques = cancelled[:, force_columns:]
-    for unit, part in {"n": forces, "nm": joint_torques}.items():
-        if part.shape[1]:
-            values[f"internal_rms_{unit}"] = metric(rms(part))
+    for unit, amounts in {"n": forces, "nm": joint_torques}.items():
+        if amounts.shape[1]:
+            values[f"internal_rms_{unit}"] = metric(rms(amounts))
         else:
             values[f"internal_rms_{unit}"] = _not_applicable("the users share none")
     return values
@@ -311,13 +312,14 @@ def _measure_takeover_s(
 
 
 def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, float]]) -> Metric:
-    """Compares the steps of the slave's reference while weights change with all other steps.
+    """Compares the steps of the slave's reference while weights change with its other steps.
 
-    A change of the dominance factors should not make the reference jump.
+    A change of the dominance factors, the weights of the users, should not make the reference
+    jump.
 
     Args:
         records: Records of the slave.
-        ramp_spans_s: (start, end) of every ramp of the dominance factors, in s.
+        ramp_spans_s: (start, end) of every gradual change (ramp) of the weights, in s.
 
     Returns:
         The largest step from tick to tick while a ramp lasts, divided by the largest other
@@ -329,13 +331,14 @@ def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, floa
     steps = differences.max(axis=1)
     period_start_s = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S
     period_end_s = records.t_s[1:] + RAMP_TIME_TOLERANCE_S
-    changing = np.zeros(len(steps), dtype=np.bool_)
+    is_changing = np.zeros(len(steps), dtype=np.bool_)
+    # periods that overlap a ramp
     for start_s, end_s in ramp_spans_s:
-        changing |= (period_end_s >= start_s) & (period_start_s <= end_s)
+        is_changing |= (period_end_s >= start_s) & (period_start_s <= end_s)
 
-    judged = follows[:-1] & follows[1:]
-    judged_changing = judged & changing
-    judged_otherwise = judged & ~changing
+    is_judged = follows[:-1] & follows[1:]
+    judged_changing = is_judged & is_changing
+    judged_otherwise = is_judged & ~is_changing
     if not judged_changing.any():
         return _not_applicable("no share changes")
 

@@ -17,10 +17,6 @@ this module computes the rightmost ones, in two steps:
    does so for multiple roots that have as many vectors v, as in loops of identical arms. Ruhe,
    "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
-`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices. OpenBLAS otherwise
-divides products of a hundred rows among all cores and waits for them actively, which takes a
-hundred times as long if another process occupies a core.
-
 Invariant:
     - A root solves the equation to rounding, for every discretisation that supplies its guess.
     - Some roots are zero for every delay, because the equations do not change if all arms are
@@ -28,20 +24,17 @@ Invariant:
       counted, and never called the rightmost.
 """
 
-import ctypes
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import cache
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.linalg
 from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
 from scipy.linalg import eigvals
 
 from ...core import Array
+from ..blas_threads import limit_blas_threads
 from .linear_loop import LinearLoop
 
 Complex = NDArray[np.complex128]
@@ -80,55 +73,6 @@ MAX_GENERATOR_SIZE = 1600
 """Number of rows of the largest discretisation, whose eigenvalues take some seconds."""
 _ROOT_AGREEMENT = 1e-9
 """Largest difference of roots of two orders that agree, relative to 1 + abs(s)."""
-_BLAS_SYMBOLS = (
-    "scipy_openblas_{}_num_threads64_",
-    "openblas_{}_num_threads64_",
-    "openblas_{}_num_threads",
-)
-"""Names of OpenBLAS's functions in the builds of NumPy; "{}" stands for "get" or "set"."""
-
-
-@contextmanager
-def limit_blas_threads() -> Iterator[None]:
-    """Limits NumPy's linear algebra (BLAS) to one thread while the context is active.
-
-    For the small matrices of a loop, several threads cost more time than they save. The number
-    of threads is restored at the end, also after an exception. If the BLAS library has no
-    functions for this, the context has no effect.
-    """
-    functions = _find_blas_functions()
-    if functions is None:
-        yield
-        return
-    get_threads, set_threads = functions
-    previous_count = get_threads()
-    set_threads(1)
-    try:
-        yield
-    finally:
-        set_threads(previous_count)
-
-
-@cache
-def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | None:
-    """Returns the functions that read and set the number of threads of OpenBLAS.
-
-    Returns:
-        The two functions. None if NumPy uses another library.
-    """
-    module = getattr(numpy.linalg, "_umath_linalg", None)
-    try:
-        library = ctypes.CDLL(module.__file__)  # type: ignore[union-attr]
-    except (AttributeError, OSError, TypeError):
-        return None
-    for name in _BLAS_SYMBOLS:
-        try:
-            get_threads = getattr(library, name.format("get"))
-            set_threads = getattr(library, name.format("set"))
-        except AttributeError:
-            continue
-        return get_threads, set_threads
-    return None
 
 
 class Pencil(NamedTuple):
@@ -448,7 +392,14 @@ def _solve_for_root(
 
 
 def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
-    """Returns the smallest mu of Delta(s) v = mu Delta'(s) v.
+    """Computes by how much Newton's method changes a guess s of a root.
+
+    The step is the eigenvalue mu of smallest modulus of Delta(s) v = mu Delta'(s) v. The next
+    guess is s - mu.
+
+    Args:
+        pencil: Matrices of the loop.
+        s: The guess, in 1/s.
 
     Returns:
         The step. None if there is no finite mu.
@@ -478,9 +429,13 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
 def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
     """Returns the multiplicity of a root, and the participation of each state in its mode.
 
-    Participation is the modulus of the diagonal of the residue of Delta(s)^-1, which is
-    V (W' Delta'(s) V)^-1 W' with the null vectors V and W of Delta(s). It does not depend on
-    the units of the states.
+    Participation is the modulus of the diagonal of the residue of Delta(s)^-1, which is V (W'
+    Delta'(s) V)^-1 W' with the null vectors V and W of Delta(s). It does not depend on the
+    units of the states.
+
+    Args:
+        pencil: Matrices of the loop.
+        s: The root, in 1/s.
 
     Returns:
         The number of null vectors, and the participation, shape (n,). None if s is not a root.
@@ -618,7 +573,9 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
     """Computes the rightmost characteristic roots of a loop with delays, in continuous time.
 
-    The loop is stable if all roots have a negative real part.
+    The loop is stable if all roots have a negative real part. The order of the discretisation
+    that supplies the guesses is doubled, until the roots of two orders agree or the matrix is
+    too large.
 
     Args:
         loop: The loop.
@@ -659,6 +616,9 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
     """Returns guesses of the nonzero roots, by falling real part.
 
+    They are eigenvalues of the discretised loop, of which the smallest are left out: these
+    approximate the roots that are zero by structure.
+
     Args:
         pencil: Matrices of the loop.
         order: Order of the discretisation. 0 for a loop without delays.
@@ -697,7 +657,14 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
 
 
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
-    """Returns True if every root is close to a root of the previous order."""
+    """Returns True if every root is close to a root of the previous order.
+
+    The order of the discretisation is doubled until two successive results agree.
+
+    Args:
+        previous: Roots from the previous order.
+        roots: Roots from this order.
+    """
     if len(roots) < len(previous):
         return False
     for root in roots:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from ...core import Array
 from ...errors import count_nouns
+from ..blas_threads import limit_blas_threads
 from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
@@ -220,14 +221,14 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
     More and more of the rightmost roots are computed, until one of them is stable.
     """
-    wanted = 8
+    requested_roots = 8
     while True:
-        roots = characteristic_roots.compute_delay_spectrum(loop, wanted).roots
+        roots = characteristic_roots.compute_delay_spectrum(loop, requested_roots).roots
         unstable = [root for root in roots if root.s.real > 0.0]
         has_stable_root = len(unstable) < len(roots)
-        if has_stable_root or len(roots) < wanted:
+        if has_stable_root or len(roots) < requested_roots:
             break
-        wanted *= 2
+        requested_roots *= 2
 
     count = 0
     for root in unstable:
@@ -254,7 +255,8 @@ def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
     pencil, *_ = characteristic_roots.find_moving_part(common_loop)
     if not len(pencil.delays):
         return [], False
-    with characteristic_roots.limit_blas_threads():
+
+    with limit_blas_threads():
         sweep = _FrequencySweep(pencil)
         grid = sweep.build_grid()
         moduli = np.abs(sweep.compute_eigenvalues(grid))
@@ -276,7 +278,14 @@ def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
 
 
 def _merge_crossings(crossings: Sequence[_AxisCrossing]) -> list[_AxisCrossing]:
-    """Sorts crossings, and merges those of equal delay and frequency into one."""
+    """Sorts crossings, and merges those that differ in delay and frequency by rounding only.
+
+    Several pairs of roots may cross together, as in loops of equal arms. The sweep lists them
+    one by one, and a merged crossing counts all of them.
+
+    Args:
+        crossings: Crossings of the imaginary axis, each by one pair of roots.
+    """
     merged: list[_AxisCrossing] = []
     for crossing in sorted(crossings):
         if merged and _is_same_crossing(merged[-1], crossing):
@@ -314,9 +323,11 @@ class _FrequencySweep:
         self._delayed = pencil.delayed_states
         self._rate_matrix = pencil.rate_matrix
         self._Ad = Ad[:, self._delayed]
+
         norm = np.linalg.norm(A, 2)
         delayed_norm = np.linalg.norm(Ad, 2)
         self._highest = float(norm + delayed_norm)
+
         modes_without_links = np.linalg.eigvals(A)
         modes_without_delay = np.linalg.eigvals(A + Ad)
         modes = np.concatenate([modes_without_links, modes_without_delay])
@@ -331,12 +342,14 @@ class _FrequencySweep:
         """
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)
+
         oscillates = np.abs(self._modes.imag) > 0.0
         modes = self._modes[oscillates]
         centres = np.abs(modes.imag)[:, np.newaxis]
         widths = np.abs(modes.real)[:, np.newaxis]
         offsets = np.linspace(-3, 3, 13)
         near_modes = centres + widths * offsets
+
         candidates = np.concatenate([even, near_modes.ravel()])
         points = np.unique(candidates)
         is_above = points >= even[0]

@@ -22,9 +22,9 @@ from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution import FusedRun
 from ...own_code import ImportedLaw
 from ...scenario import Chirp, Multisine, Scenario
+from ..blas_threads import limit_blas_threads
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop
-from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
@@ -73,6 +73,7 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     end_s = scenario.duration_s
 
     def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
+        """Leaves out what never rests, and lets springs of the original end stay for ever."""
         extended = []
         for actor in actors:
             starts_later = getattr(actor, "start_s", 0.0) > end_s
@@ -122,7 +123,11 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
 
 
 def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
-    """Returns the states of all sites that are in the loop, in one vector."""
+    """Joins the states of all sites to one vector, without states that never change.
+
+    The states of a site that are not part of the linear loop are the parameters of a law that
+    learns nothing.
+    """
     masks = linear_loop.mask_loop_states(conditions)
     pairs = zip(states, masks, strict=True)
     return np.concatenate([site_states[mask] for site_states, mask in pairs])
@@ -157,25 +162,28 @@ def _find_nearest_equilibrium(
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
         step = _compute_gauss_newton_step(conditions, rest, residual)
-        share = _limit_step(step)
+        fraction = _limit_step(step)
 
-        size = np.linalg.norm(residual)
+        residual_norm = np.linalg.norm(residual)
         # a shorter step if the residual does not fall, as when a wall is touched
         for _ in range(_MAX_HALVINGS):
-            candidate = _shift_equilibrium(conditions, rest, share * step)
+            candidate = _shift_equilibrium(conditions, rest, fraction * step)
             candidate_residual = compute_equilibrium_residual(conditions, candidate)
-            if np.linalg.norm(candidate_residual) < size:
+            if np.linalg.norm(candidate_residual) < residual_norm:
                 break
-            share *= 0.5
+            fraction *= 0.5
         else:
-            break
+            break  # no shorter step helps either
         rest = candidate
         residual = candidate_residual
     return rest._replace(residual=float(np.abs(residual).max()))
 
 
 def _limit_step(step: Array) -> float:
-    """Returns the share of a step with which no state changes by more than `_MAX_STEP`."""
+    """Returns the factor with which no state changes by more than `_MAX_STEP` in a step.
+
+    Long steps would leave the region in which the linearisation is useful.
+    """
     largest = float(np.abs(step).max())
     return _MAX_STEP / max(largest, _MAX_STEP)
 
@@ -185,14 +193,15 @@ def _compute_gauss_newton_step(
     rest: Equilibrium,
     residual: Array,
 ) -> Array:
-    """Returns the least-squares step of the loop's states, of least norm, shape (states,).
+    """Returns the smallest step of the loop's states that solves the linearised equations.
 
-    Velocities stay zero, and so do states that nothing moves: an estimate without a gain, or at
-    an end of its box.
+    Velocities stay zero. States that nothing moves stay too: an estimate without a gain, or at
+    a limit of its range. The shape is (states,).
     """
     loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
     delayed_matrices = [term.A for term in loop.delayed]
     effects = np.hstack([loop.A, *delayed_matrices])
+
     is_moved = effects.any(axis=1)
     is_speed = []
     for name in loop.names:
@@ -200,6 +209,7 @@ def _compute_gauss_newton_step(
         is_speed.append(state.startswith("qd"))
     is_free = is_moved & ~np.array(is_speed)
     free = np.flatnonzero(is_free)
+
     free_columns = loop.static_matrix[:, free]
     solution = np.linalg.lstsq(free_columns, -residual, rcond=_FLAT)
     step = np.zeros(len(loop.names))
@@ -212,20 +222,24 @@ def _shift_equilibrium(
     rest: Equilibrium,
     step: Array,
 ) -> Equilibrium:
-    """Returns an equilibrium shifted by a step of the loop's states. Velocities are ignored."""
+    """Returns the pose and estimates of an equilibrium after a step of the loop's states.
+
+    Velocities in the step are ignored, because all arms rest.
+    """
     masks = linear_loop.mask_loop_states(conditions)
     counts = [np.count_nonzero(mask) for mask in masks]
     ends = np.cumsum(counts)
     site_steps = np.split(step, ends[:-1])
+
     q = np.array(rest.q)
     theta_hat = np.array(rest.theta_hat)
-    for n, site in enumerate(conditions.sites):
+    for index, site in enumerate(conditions.sites):
         layout = lay_out_arguments(site)
-        mask = masks[n]
+        mask = masks[index]
         states = np.zeros(len(mask))
-        states[mask] = site_steps[n]
-        q[n, : layout.joints] += states[layout.q]
-        theta_hat[n, : layout.parameters] += states[layout.estimate]
+        states[mask] = site_steps[index]
+        q[index, : layout.joints] += states[layout.q]
+        theta_hat[index, : layout.parameters] += states[layout.estimate]
     return rest._replace(q=q, theta_hat=theta_hat)
 
 
@@ -245,7 +259,15 @@ def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
 
 
 def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
-    """Raises ScenarioError if a site in task space is in a singular pose."""
+    """Raises an error if a site that follows in task space rests in a singular pose.
+
+    Args:
+        conditions: The sites and gains.
+        rest: The pose of rest.
+
+    Raises:
+        ScenarioError: The pose of a site is singular, so that the loop has no derivative there.
+    """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         layout = lay_out_arguments(site)
@@ -310,14 +332,17 @@ def _compute_deviation(
     start: Equilibrium,
     rest: Equilibrium,
 ) -> Array:
-    """Returns the deviation of a start at rest from an equilibrium, shape (states,)."""
+    """Returns how far the start poses are from an equilibrium, as states of the loop.
+
+    All velocities are zero. The shape is (states,).
+    """
     q_deviation = start.q - rest.q
     estimate_deviation = start.theta_hat - rest.theta_hat
     states = []
-    for n, site in enumerate(conditions.sites):
+    for index, site in enumerate(conditions.sites):
         layout = lay_out_arguments(site)
-        q = q_deviation[n, : layout.joints]
-        estimate = estimate_deviation[n, : layout.parameters]
+        q = q_deviation[index, : layout.joints]
+        estimate = estimate_deviation[index, : layout.parameters]
         velocities = np.zeros(layout.joints)
         site_states = np.concatenate([q, velocities, estimate])
         states.append(site_states)
@@ -327,23 +352,26 @@ def _compute_deviation(
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
     """Returns the part of a constant deviation that remains for ever, shape (states,).
 
-    Returns:
-        The part. None if the roots at zero have too few vectors.
+    `_predict_from_start` has the equation. The result is None if the loop has no roots at zero,
+    or too few vectors for them.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
     is_zero = values <= _FLAT * values[0]
-    count = int(np.sum(is_zero))
-    if not count:
+    zero_roots = int(np.sum(is_zero))
+    if not zero_roots:
         return None
-    W = left[:, -count:]
-    V = right[-count:].T
+
+    W = left[:, -zero_roots:]
+    V = right[-zero_roots:].T
     D = np.eye(len(values))
     for term in loop.delayed:
         D = D + term.delay_s * term.A
+
     W_D = W.T @ D
     inner = W_D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
         return None
+
     projected = W_D @ deviation
     coordinates = np.linalg.solve(inner, projected)
     return V @ coordinates
@@ -466,8 +494,8 @@ def _complete_estimates(
             parameters.
     """
     rows = []
-    for n, site in enumerate(conditions.sites):
-        known = None if theta_hat is None else theta_hat[n]
+    for index, site in enumerate(conditions.sites):
+        known = None if theta_hat is None else theta_hat[index]
         if isinstance(site.law_factory, NumericLaw):
             row = site.law_factory.complete_memory(known)
         elif not has_estimate(site):
@@ -548,7 +576,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
 
 
 def _describe_pose(coordinates: int, *, task: bool) -> str:
-    """Returns the numbers of which a pose consists, for an error message."""
+    """Returns a phrase for an error message on the numbers of which a pose consists."""
     if task:
         rotation = " and a rotation vector in rad" if coordinates > 3 else ""
         return f"a position in m{rotation} of the end effectors"
@@ -617,18 +645,19 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     diverges, the equilibrium is predicted from the start poses.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
-    affordable = _MAX_RUN_TICKS / ticks
-    extension = max(1.0, min(MAX_PROLONGATION, affordable))
-    most_s = scenario.duration_s * extension
-    run = FusedRun(extend_scenario(scenario, most_s))
+    affordable_extension = _MAX_RUN_TICKS / ticks
+    extension = max(1.0, min(MAX_PROLONGATION, affordable_extension))
+    longest_s = scenario.duration_s * extension
+    run = FusedRun(extend_scenario(scenario, longest_s))
     until_s = scenario.duration_s
 
+    # double the length of the run until the arms rest
     while True:
         mean_states = run.run_and_sample(until_s)
         last_speeds = [values[-BUCKETS_PER_S:, 1] for values in run.maxima]
         speed_rad_s = max(float(speeds.max()) for speeds in last_speeds)
         is_at_rest = speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
-        if run.diverged_s is not None or is_at_rest or 2.0 * until_s > most_s:
+        if run.diverged_s is not None or is_at_rest or 2.0 * until_s > longest_s:
             break
         until_s *= 2.0
     if run.diverged_s is not None:
@@ -665,10 +694,10 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
 
 
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns an equilibrium unchanged, if it is one.
+    """Returns the equilibrium that it receives, unless its residual is too large.
 
     Raises:
-        ScenarioError: The residual is too large.
+        ScenarioError: The residual is too large, so that the pose is no equilibrium.
     """
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
@@ -680,7 +709,11 @@ def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 
 
 def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iterator[str]:
-    """Yields remarks on conditions under which the linear loop misses an effect."""
+    """Yields remarks for the user on effects that the linear loop leaves out.
+
+    They are a pose that is no equilibrium, damping near a singular pose, torques at their
+    limits, and points at which the model has different derivatives on both sides.
+    """
     if rest.residual > MAX_EQUILIBRIUM_RESIDUAL:
         yield (
             "the pose is no equilibrium: accelerations or rates of "

@@ -45,10 +45,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, expm
+from scipy.linalg import expm
 
 from ...core import Array, IntArray, Law, Scheme, SiteSetup
 from ...scenario import LinkBase, draw_used_samples
+from ..blas_threads import limit_blas_threads
 from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from .characteristic_roots import (
     NAMED_SHARE,
@@ -58,11 +59,16 @@ from .characteristic_roots import (
     Pencil,
     Spectrum,
     extract_moving_part,
-    limit_blas_threads,
 )
 from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
-from .linear_loop import SiteJacobian, compute_couplings, differentiate_rates
+from .linear_loop import (
+    SiteJacobian,
+    compute_couplings,
+    differentiate_rates,
+    join_diagonal_blocks,
+)
 from .operating_point import Equilibrium, OperatingConditions
+from .tick_recurrence import add_matrix_products
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
@@ -182,6 +188,9 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
     """Returns the matrices of an arm over a tick in which the torque is held.
 
+    The controller computes its torque once per tick, but the arm moves all the time. The free
+    arm moves by its own dynamics, and by environments that act continuously.
+
     Args:
         jacobian: Derivatives of the site's rates.
         h_s: Length of a tick, in s.
@@ -257,7 +266,7 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
         effect[block] = maps[i].Q @ coupling @ maps[j].output
 
     # the moving part is found as for rates; numbers of pairs stand in for their delays
-    S = block_diag(*(tick_map.P for tick_map in maps))
+    S = join_diagonal_blocks([tick_map.P for tick_map in maps])
     changes = S - np.eye(len(owners))
     pair_numbers = np.arange(len(effects))
     changes_pencil = Pencil(changes, pair_numbers, effects)
@@ -380,7 +389,16 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
 
 
 class _TickRun(NamedTuple):
-    """Consecutive ticks of one site that depend on known samples only."""
+    """Consecutive ticks of one site whose used samples have all been computed before the first.
+
+    The received effects of such ticks are computed in one array operation, instead of tick by
+    tick.
+
+    Attributes:
+        site: Index of the site.
+        first: Number of the first tick, counted from the start of the span.
+        ticks: Number of ticks.
+    """
 
     site: int
     first: int
@@ -404,7 +422,11 @@ def _plan_parts(
     used: Mapping[tuple[int, int], IntArray],
     count: int,
 ) -> list[_SpanPart]:
-    """Returns an order of all ticks of a span, in parts.
+    """Plans in which order the ticks of all sites are computed, and where the span is divided.
+
+    A tick can be computed only after all samples that it uses. The plan collects as many
+    consecutive ticks of a site as possible, because their effects are then computed together.
+    After each part of the span the columns are scaled, before they become too large.
 
     Args:
         ticks: Number of ticks of each site.
@@ -426,10 +448,11 @@ def _plan_parts(
     parts = []
     for n in range(1, count + 1):
         runs = []
-        # rounded up
+        # last tick of each site in this part, rounded up
         stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
+                # as far as the peers' samples suffice that have been computed so far
                 known_until = [computable[i, j][done[j]] for j in peers[i]]
                 until = min([stop, *known_until])
                 first = done[i]
@@ -441,12 +464,12 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """The effect of one peer on a site.
+    """The effect of one peer on a site, and which of its samples the site uses at each tick.
 
     Attributes:
         peer: Index of the peer.
-        rows: Row of the peer's track that each tick of the site uses.
-        effect: Effect of the peer's state on the site's next state, shape (n_i, n_j).
+        rows: Row of the peer's sent values that each tick of the site uses.
+        effect: Effect of the peer's sent values on the site's next state, shape (n_i, r_j).
     """
 
     peer: int
@@ -454,11 +477,28 @@ class _PeerEffect(NamedTuple):
     effect: Array
 
 
-class _SpanMap:
-    """The linear loop over a span of time, as an operator on columns.
+class _Tracks(NamedTuple):
+    """Motion of one site over a span of time, with one motion per column.
 
-    A column contains the states of each site at its last ticks, as far back as a peer uses
-    them.
+    Attributes:
+        states: States from the start of the span on, shape (1 + ticks, n_i, columns).
+        sent: Sent values of all ticks that are used, shape (past + 1 + ticks, r_i, columns).
+            The first `past` rows are ticks before the start of the span.
+    """
+
+    states: Array
+    sent: Array
+
+
+class _SpanMap:
+    """The linear map of small motions from the start of a span of time to its end.
+
+    The sites act on each other by few numbers only. The sent values of a site are r_i
+    combinations of its n_i states, from which the effects on all other sites follow. A column
+    contains one motion: for each site, its sent values of the last ticks, as far back as a peer
+    uses them, and then its present states. The matrix of the map would be very large, because
+    it covers the past of all sites. It is therefore never built: the map is applied to columns
+    by computing every tick.
 
     Attributes:
         neutral: Constant motions, orthonormal, shape (size, zeros).
@@ -467,11 +507,15 @@ class _SpanMap:
     """
 
     def __init__(self, loop: CoupledTicks, rates_hz: Sequence[int], uses: SamplesInUse) -> None:
+
         sites = range(len(rates_hz))
         self._states = [np.flatnonzero(loop.owners == i) for i in sites]
-        self._P = [loop.S[np.ix_(states, states)] for states in self._states]
-        # rows of each site's track before the tick at the start of the span, and that tick
-        self._rows = [2] * len(rates_hz)
+        self._P = []
+        for states in self._states:
+            P = loop.S[np.ix_(states, states)]
+            self._P.append(np.ascontiguousarray(P))
+        # ticks of each site before the start of the span whose samples are used
+        self._past = [1] * len(rates_hz)
         used = {}
         for i, j in loop.effects:
             samples = uses.used[i, j]
@@ -480,14 +524,15 @@ class _SpanMap:
             now = -(-ticks * rates_hz[j] // rates_hz[i])
             used[i, j] = np.minimum(samples, now - 1)
             oldest = int((now - used[i, j]).max())
-            self._rows[j] = max(self._rows[j], 1 + oldest)
+            self._past[j] = max(self._past[j], oldest)
 
+        self._sent = [self._find_sent_values(loop, j) for j in sites]
         self._peer_effects: list[list[_PeerEffect]] = [[] for _ in rates_hz]
         for (i, j), samples in used.items():
             block = np.ix_(self._states[i], self._states[j])
-            effect = loop.effects[i, j][block]
-            rows = samples + self._rows[j] - 1
-            self._peer_effects[i].append(_PeerEffect(j, rows, effect))
+            effect = loop.effects[i, j][block] @ self._sent[j].T
+            rows = samples + self._past[j]
+            self._peer_effects[i].append(_PeerEffect(j, rows, np.ascontiguousarray(effect)))
 
         self._ticks = [round(uses.span_s * hz) for hz in rates_hz]
         part_count = -(-max(self._ticks) // _PART_TICKS)
@@ -495,8 +540,37 @@ class _SpanMap:
         self.scales: list[float] = []
         self.neutral = self._find_constant_motions(loop)
 
+    def _find_sent_values(self, loop: CoupledTicks, j: int) -> Array:
+        """Returns the combinations of a site's states that act on other sites.
+
+        They are an orthonormal basis of the row space of all effects of the site.
+
+        Args:
+            loop: The loop.
+            j: Index of the site.
+
+        Returns:
+            Matrix of shape (r_j, n_j).
+        """
+        states = self._states[j]
+        effects = [
+            effect[:, states] for (_, sender), effect in loop.effects.items() if sender == j
+        ]
+        if not effects or not len(states):
+            return np.zeros((0, len(states)))
+        _, values, right = np.linalg.svd(np.vstack(effects), full_matrices=False)
+        acts = values > ZERO_SHARE * values[0]
+        return np.ascontiguousarray(right[acts])
+
     def _find_constant_motions(self, loop: CoupledTicks) -> Array:
-        """Returns an orthonormal basis of the motions that stay constant for any delays."""
+        """Returns an orthonormal basis of the motions that stay constant for any delays.
+
+        A shift of all arms to another common pose is an example. States X stay constant if X =
+        S X + sum_ij E_ij X, where E_ij are the effects of the sites on each other.
+
+        Args:
+            loop: Linear model of all sites over one tick.
+        """
         identity = np.eye(len(loop.names))
         static_map = identity - loop.S - sum(loop.effects.values())
         _, values, right = np.linalg.svd(static_map)
@@ -508,8 +582,8 @@ class _SpanMap:
     def build_constant_columns(self, X: Array) -> Array:
         """Returns columns for motions in which all states have been constant.
 
-        Each column contains the states of all sites at their last ticks, as far back as they
-        are used. Here every past tick of a site has the same states.
+        Each column contains what all sites sent at their last ticks, as far back as it is used,
+        and their states. Here every past tick of a site has the same states.
 
         Args:
             X: The constant states, shape (n, columns), with the n states of all sites.
@@ -518,34 +592,64 @@ class _SpanMap:
             The columns, shape (size, columns).
         """
         blocks = []
-        for states, rows in zip(self._states, self._rows, strict=True):
-            blocks.append(np.tile(X[states], (rows, 1)))
+        for states, sent, past in zip(self._states, self._sent, self._past, strict=True):
+            sent_values = sent @ X[states]
+            blocks.append(np.tile(sent_values, (past, 1)))
+            blocks.append(X[states])
         return np.vstack(blocks)
 
     def divide_out_constant(self, V: Array) -> Array:
-        """Returns columns less their constant motions."""
+        """Returns columns less their constant motions, whose multipliers are exactly 1.
+
+        Args:
+            V: Columns, shape (size, columns).
+        """
         constant_part = self.neutral @ (self.neutral.T @ V)
         return V - constant_part
 
-    def _build_tracks(self, V: Array) -> list[Array]:
-        """Returns the track of each site: its past states, and room for the states of the span.
+    def _build_tracks(self, V: Array) -> list[_Tracks]:
+        """Returns the tracks of each site, with its past and with room for the span.
 
         Args:
-            V: Columns with the past states.
-
-        Returns:
-            Tracks of shape (rows + ticks, n_i, columns).
+            V: Columns with the past, shape (size, columns).
         """
         columns = V.shape[1]
         tracks = []
-        first = 0
-        for states, rows, ticks in zip(self._states, self._rows, self._ticks, strict=True):
-            size = rows * len(states)
-            past = V[first : first + size].reshape(rows, len(states), columns)
-            future = np.empty((ticks, len(states), columns))
-            tracks.append(np.concatenate([past, future]))
-            first += size
+        for sent, past, ticks in zip(self._sent, self._past, self._ticks, strict=True):
+            r, n = sent.shape
+            states = np.empty((1 + ticks, n, columns))
+            sent_values = np.empty((past + 1 + ticks, r, columns))
+            tracks.append(_Tracks(states, sent_values))
+        start = [0] * len(tracks)
+        self._write_columns(V, tracks, start)
+        self._send_present(tracks, start)
         return tracks
+
+    def _list_blocks(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> list[Array]:
+        """Returns the parts of all tracks that a column contains at given ticks.
+
+        Args:
+            tracks: Tracks of all sites.
+            stops: Tick of each site, from the start of the span.
+        """
+        blocks = []
+        for site_tracks, past, stop in zip(tracks, self._past, stops, strict=True):
+            blocks.append(site_tracks.sent[stop : stop + past])
+            blocks.append(site_tracks.states[stop : stop + 1])
+        return blocks
+
+    def _read_columns(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> Array:
+        """Returns the columns at given ticks, shape (size, columns)."""
+        blocks = self._list_blocks(tracks, stops)
+        return np.concatenate([block.reshape(-1, block.shape[2]) for block in blocks])
+
+    def _write_columns(self, V: Array, tracks: Sequence[_Tracks], stops: Sequence[int]) -> None:
+        """Writes columns into the tracks at given ticks."""
+        first = 0
+        for block in self._list_blocks(tracks, stops):
+            size = block.shape[0] * block.shape[1]
+            block[:] = V[first : first + size].reshape(block.shape)
+            first += size
 
     def apply(
         self,
@@ -556,8 +660,7 @@ class _SpanMap:
     ) -> tuple[Array, list[Array]]:
         """Computes how small motions develop over the analysed span of time.
 
-        A column contains the states of all sites at their last ticks, as far back as they are
-        used. For computation the span is split into parts.
+        For computation the span is split into parts.
 
         Args:
             V: Motions at the start of the span, shape (size, columns).
@@ -570,15 +673,11 @@ class _SpanMap:
             For each site i, its n_i states from the start of the span on, shape (ticks + 1,
             n_i, columns).
         """
-        columns = V.shape[1]
         tracks = self._build_tracks(V)
         for n, part in enumerate(self._parts):
             for run in part.runs:
                 self._run_ticks(tracks, run)
-            last_states = []
-            for track, stop, rows in zip(tracks, part.stops, self._rows, strict=True):
-                last_states.append(track[stop : stop + rows])
-            V = np.concatenate([states.reshape(-1, columns) for states in last_states])
+            V = self._read_columns(tracks, part.stops)
 
             if divided:
                 V = self.divide_out_constant(V)
@@ -586,62 +685,72 @@ class _SpanMap:
                     size = float(np.abs(V).max())
                     self.scales.append(1.0 / max(1e-300, size))
                 V *= self.scales[n]
-                _split_into(V, last_states)
+                self._write_columns(V, tracks, part.stops)
+                self._send_present(tracks, part.stops)
             if sizes is not None:
                 sizes.append(np.linalg.norm(V, axis=0))
+        return V, [site_tracks.states for site_tracks in tracks]
 
-        from_start = []
-        for track, rows in zip(tracks, self._rows, strict=True):
-            from_start.append(track[rows - 1 :])
-        return V, from_start
+    def _send_present(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> None:
+        """Computes the sent values of the present states, after these were changed."""
+        for site_tracks, sent, past, stop in zip(
+            tracks, self._sent, self._past, stops, strict=True
+        ):
+            site_tracks.sent[past + stop] = sent @ site_tracks.states[stop]
 
-    def _run_ticks(self, tracks: Sequence[Array], run: _TickRun) -> None:
-        """Computes the states of one site over consecutive ticks, in its track."""
-        track = tracks[run.site]
-        P = self._P[run.site]
-        now = run.first + self._rows[run.site] - 1
-        state = track[now]
-        next_states = track[now + 1 : now + 1 + run.ticks]
-        next_states[:] = 0.0
+    def _run_ticks(self, tracks: Sequence[_Tracks], run: _TickRun) -> None:
+        """Computes the states of one site over consecutive ticks, and what it sends.
+
+        The effects of the peers are known before the first of these ticks, so they are added
+        for all ticks at once. The site's own states follow tick by tick, since each depends on
+        the one before.
+
+        Args:
+            tracks: Motion of each site over the span, filled in up to the first tick.
+            run: The ticks.
+        """
+        i = run.site
         end = run.first + run.ticks
-        for peer, rows, effect in self._peer_effects[run.site]:
+        states, sent_values = tracks[i]
+        next_states = states[run.first + 1 : end + 1]
+        next_states[:] = 0.0
+        for peer, rows, effect in self._peer_effects[i]:
             used_rows = rows[run.first : end]
-            samples = tracks[peer][used_rows]
-            next_states += effect @ samples
-        for next_state in next_states:
-            next_state += P @ state
-            state = next_state
+            add_matrix_products(next_states, effect, tracks[peer].sent, used_rows)
+        # last, because each state needs the complete state of the tick before
+        previous_rows = np.arange(run.first, end)
+        add_matrix_products(next_states, self._P[i], states, previous_rows)
 
-
-def _split_into(V: Array, blocks: Sequence[Array]) -> None:
-    """Writes the rows of V into arrays, one after the other."""
-    first = 0
-    for block in blocks:
-        rows = block.shape[0] * block.shape[1]
-        block[:] = V[first : first + rows].reshape(block.shape)
-        first += rows
+        next_sent = sent_values[self._past[i] + run.first + 1 : self._past[i] + end + 1]
+        next_sent[:] = 0.0
+        add_matrix_products(next_sent, self._sent[i], states, previous_rows + 1)
 
 
 def _find_multipliers(
     span: _SpanMap,
-    n: int,
+    start: Array,
     wanted: int,
+    largest_residual: float,
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Returns the largest multipliers of a span map, by the block Arnoldi method.
 
+    The method applies the map again and again, each time to the block of columns that the last
+    application added, and keeps an orthonormal basis of all columns so far. The eigenvalues of
+    the small matrix H, which is the map in this basis, approach the largest multipliers. It
+    ends when all wanted multipliers are exact, when no new direction is found, or when the
+    basis is full.
+
     Args:
         span: The map.
-        n: Number of states of the loop.
+        start: Columns from which the Krylov space starts, shape (size, columns).
         wanted: Number of distinct moduli. Fewer result if the others are too close to zero.
+        largest_residual: Largest residual of a multiplier, relative to its modulus.
 
     Returns:
         The multipliers, by falling modulus.
         Their vectors, as columns.
-        True for each multiplier that is exact to `_RESIDUAL`.
+        True for each multiplier that is exact to `largest_residual`.
     """
-    random = np.random.default_rng(0)
-    start_states = random.standard_normal((n, min(n, _COLUMNS)))
-    start = span.build_constant_columns(start_states)
     block = np.linalg.qr(span.divide_out_constant(start))[0]
     basis = block
     # the map in the basis
@@ -656,9 +765,12 @@ def _find_multipliers(
             projection = basis.T @ W
             W -= basis @ projection
             H[:, -width:] += projection
-        left, lengths, right = np.linalg.svd(W, full_matrices=False)
+        # what is left of W are the directions that the basis does not contain yet; the
+        # singular values of W are those of its small factor
+        directions, factor = np.linalg.qr(W)
+        left, lengths, right = np.linalg.svd(factor)
         is_new = lengths > ZERO_SHARE * np.abs(H).max()
-        left = left[:, is_new]
+        left = directions @ left[:, is_new]
         remainder = (lengths[:, np.newaxis] * right)[is_new]
 
         mu, y = np.linalg.eig(H)
@@ -668,7 +780,7 @@ def _find_multipliers(
         errors = np.linalg.norm(remainder @ y[-width:], axis=0)
         residual = errors / np.abs(mu)
         is_full = len(H) >= _MAX_COLUMNS
-        limit = _LOOSE_RESIDUAL if is_full else _RESIDUAL
+        limit = _LOOSE_RESIDUAL if is_full else largest_residual
         exact = residual <= limit
         if exact.all() or not is_new.any() or is_full:
             vectors = basis @ y
@@ -722,31 +834,62 @@ def compute_sampled_spectrum(
     """
     if conditions.has_forms:
         return None
-    rates_hz = [site.rate_hz for site in conditions.sites]
-    uses = uses or find_samples_in_use(conditions)
-    span_s: float | None = uses.period_s or uses.span_s
-    if uses.period_s is not None and uses.period_s * max(rates_hz) < 1.5:
-        # every tick is like the tick before
-        span_s = None
+    return SampledLoop(conditions, uses).compute_spectrum(rest, wanted)
 
-    loop = couple_ticks(conditions, rest)
-    deviation_per_s = None
-    if not loop.names:
-        return Spectrum(
-            roots=(),
-            zeros=loop.constant,
-            drifting=0,
-            dropped=0,
-            order=0,
-            span_s=span_s,
-            is_exact=uses.is_exact,
-        )
-    with limit_blas_threads():
-        span = _SpanMap(loop, rates_hz, uses)
-        mu, vectors, exact = _find_multipliers(span, len(loop.names), wanted + 1)
 
-        log_scale = np.log(span.scales).sum()
-        s = (np.log(mu) - log_scale) / uses.span_s
+class SampledLoop:
+    """Coupled arms with controllers in ticks, whose roots can be computed about several poses.
+
+    The modes about a first pose are a good start for the search of those about a second pose
+    nearby, which then takes half of the time.
+
+    Args:
+        conditions: The sites (processes that each run one arm), gains and delays. All control
+            laws can be linearised in ticks.
+        uses: Which samples of the other sites each site uses. None to derive this from the
+            links.
+    """
+
+    def __init__(
+        self, conditions: OperatingConditions, uses: SamplesInUse | None = None
+    ) -> None:
+        self._conditions = conditions
+        self._uses = uses or find_samples_in_use(conditions)
+        self._rates_hz = [site.rate_hz for site in conditions.sites]
+        # modes of the last spectrum as columns of a span map
+        self._modes: Array | None = None
+
+    @limit_blas_threads()
+    def compute_spectrum(self, rest: Equilibrium, wanted: int) -> Spectrum:
+        """Computes the rightmost roots about a rest, see `compute_sampled_spectrum`.
+
+        Args:
+            rest: The pose of rest.
+            wanted: Number of roots.
+        """
+        uses = self._uses
+        span_s: float | None = uses.period_s or uses.span_s
+        if uses.period_s is not None and uses.period_s * max(self._rates_hz) < 1.5:
+            # every tick is like the tick before
+            span_s = None
+
+        loop = couple_ticks(self._conditions, rest)
+        deviation_per_s = None
+        if not loop.names:
+            return Spectrum(
+                roots=(),
+                zeros=loop.constant,
+                drifting=0,
+                dropped=0,
+                order=0,
+                span_s=span_s,
+                is_exact=uses.is_exact,
+            )
+        span = _SpanMap(loop, self._rates_hz, uses)
+        start = _draw_start(span, len(loop.names))
+        s, vectors, exact = _find_roots(span, start, uses.span_s, wanted, _RESIDUAL)
+        self._modes = np.hstack([vectors.real, vectors.imag[:, vectors.imag.any(axis=0)]])
+
         is_still = exact & (np.abs(s) <= _STILL_PER_S)
         # of two conjugate roots the upper one is described
         is_upper = exact & ~is_still & (s.imag >= -_SAME_ROOT)
@@ -761,19 +904,85 @@ def compute_sampled_spectrum(
             # fast modes overflow; their late ticks are unused
             with np.errstate(all="ignore"):
                 _, tracks = span.apply(modes, divided=False)
-                roots = _describe_modes(s, tracks, loop, rates_hz)
+                roots = _describe_modes(s, tracks, loop, self._rates_hz)
 
-    drifting = int(is_still.sum())
-    return Spectrum(
-        roots=tuple(roots[:wanted]),
-        zeros=loop.constant + span.neutral.shape[1] + drifting,
-        drifting=drifting,
-        dropped=int((~exact).sum()),
-        order=0,
-        span_s=span_s,
-        deviation_per_s=deviation_per_s,
-        is_exact=uses.is_exact,
-    )
+        drifting = int(is_still.sum())
+        return Spectrum(
+            roots=tuple(roots[:wanted]),
+            zeros=loop.constant + span.neutral.shape[1] + drifting,
+            drifting=drifting,
+            dropped=int((~exact).sum()),
+            order=0,
+            span_s=span_s,
+            deviation_per_s=deviation_per_s,
+            is_exact=uses.is_exact,
+        )
+
+    @limit_blas_threads()
+    def measure_rightmost_rate(self, pose: Equilibrium, scale_per_s: float) -> float | None:
+        """Computes the real part of the rightmost root about a pose, with limited accuracy.
+
+        Args:
+            pose: The pose about which the loop is linearised.
+            scale_per_s: The error is about a thousandth of this rate or less, in 1/s.
+
+        Returns:
+            The real part, in 1/s. None if no root moves.
+        """
+        loop = couple_ticks(self._conditions, pose)
+        if not loop.names:
+            return None
+        span_s = self._uses.span_s
+        span = _SpanMap(loop, self._rates_hz, self._uses)
+        start = _draw_start(span, len(loop.names))
+        modes = self._modes
+        if modes is not None and len(modes) == len(start):
+            # a few random columns show modes that the first pose does not have
+            start = np.hstack([modes, start])[:, :_COLUMNS]
+        residual = min(max(1e-3 * abs(scale_per_s) * span_s, _RESIDUAL), _LOOSE_RESIDUAL)
+        s, _, exact = _find_roots(span, start, span_s, 1, residual)
+        moves = exact & (np.abs(s) > _STILL_PER_S)
+        rates_per_s: list[float] = s[moves].real.tolist()
+        return max(rates_per_s, default=None)
+
+
+def _draw_start(span: _SpanMap, n: int) -> Array:
+    """Returns random columns from which the search of modes starts, always the same ones.
+
+    Args:
+        span: The map whose modes are searched.
+        n: Number of states of the loop.
+    """
+    random = np.random.default_rng(0)
+    states = random.standard_normal((n, min(n, _COLUMNS)))
+    return span.build_constant_columns(states)
+
+
+def _find_roots(
+    span: _SpanMap,
+    start: Array,
+    span_s: float,
+    wanted: int,
+    largest_residual: float,
+) -> tuple[Complex, Complex, NDArray[np.bool_]]:
+    """Returns the rightmost roots of a span map, with their vectors.
+
+    Args:
+        span: The map.
+        start: Columns from which the search of modes starts, shape (size, columns).
+        span_s: Length of the span, in s.
+        wanted: Number of moving roots. Roots at zero are found in addition.
+        largest_residual: Largest residual of a multiplier, relative to its modulus.
+
+    Returns:
+        Principal values of the roots, by falling real part, in 1/s.
+        Their vectors, as columns.
+        True for each root that is exact to the residual.
+    """
+    mu, vectors, exact = _find_multipliers(span, start, wanted + 1, largest_residual)
+    log_scale = np.log(span.scales).sum()
+    s = (np.log(mu) - log_scale) / span_s
+    return s, vectors, exact
 
 
 def _estimate_deviation(span: _SpanMap, mode: Array, span_s: float) -> float:
@@ -871,7 +1080,12 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first root that equals s within `_SAME_ROOT`, or None."""
+    """Returns the index of the first known root that equals s, or None.
+
+    Args:
+        roots: The known roots.
+        s: A root, in 1/s. It may differ by `_SAME_ROOT`.
+    """
     for index, known in enumerate(roots):
         if abs(known.s - s) <= _SAME_ROOT * (1.0 + abs(s)):
             return index

@@ -101,6 +101,7 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
     steps = round(_PER_DECADE * decades)
     count = max(2, steps + 1)
     points = np.geomspace(low, high, count)
+
     if delay_s > 0.0:
         phase_step = np.pi / (delay_s * _PER_TURN)
         least_step = (high - low) / _MAX_POINTS
@@ -147,6 +148,7 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
+        """Marks the steps between neighbouring frequencies that must be divided."""
         size = np.linalg.norm(Y, axis=(1, 2))
         larger_size = np.maximum(size[1:], size[:-1])
         reference = np.maximum(larger_size, 1e-300)
@@ -164,13 +166,17 @@ def _refine(
     w_rad_s: Array,
     find_coarse: Callable[[NDArray[Any]], NDArray[np.bool_]],
 ) -> tuple[Array, NDArray[Any]]:
-    """Refines a grid of frequencies, and returns it with the function's values.
+    """Adds frequencies to a grid where the values of a function require a finer step.
 
     Args:
         function: Function that returns values, shape (F, ...), for frequencies, shape (F,).
         w_rad_s: First frequencies, rising, shape (F,).
         find_coarse: Function that returns the steps of the grid to halve, shape (F - 1,), for
             the values.
+
+    Returns:
+        The refined frequencies.
+        The values of the function at these frequencies.
     """
     values = function(w_rad_s)
     for _ in range(_ROUNDS):
@@ -178,13 +184,14 @@ def _refine(
         right = w_rad_s[1:]
         closest_right = left * (1.0 + _CLOSEST)
         is_divisible = right > closest_right
-        coarse = find_coarse(values) & is_divisible
+        is_halved = find_coarse(values) & is_divisible
         has_too_many_points = len(w_rad_s) > 2 * _MAX_POINTS
-        if has_too_many_points or not coarse.any():
+        if has_too_many_points or not is_halved.any():
             break
+        # geometric means, because the grid is logarithmic
         all_middles = np.sqrt(left * right)
-        middles = all_middles[coarse]
-        indices = np.flatnonzero(coarse) + 1
+        middles = all_middles[is_halved]
+        indices = np.flatnonzero(is_halved) + 1
         w_rad_s = np.insert(w_rad_s, indices, middles)
         middle_values = function(middles)
         values = np.insert(values, indices, middle_values, axis=0)
@@ -233,6 +240,7 @@ def find_minima(
         return tolerance(w) if tolerance is not None else np.zeros(len(w))
 
     def evaluate(w: Array) -> Array:
+        """Returns the curve and its rounding error at frequencies, shape (F, 2)."""
         values = curve(w)
         rounding = find_rounding(w)
         return np.stack([values, rounding], axis=1)
@@ -262,6 +270,7 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     right = values[2:]
     is_minimum = (middle <= left) & (middle <= right)
     rise = np.maximum(left, right) - middle
+
     depth = abs(values.min())
     size = np.maximum(np.abs(middle), depth)
     settled_rise = _SETTLED * size
@@ -290,22 +299,22 @@ def _find_bands_below(
     is_below = values < level
     crosses_level = is_below[1:] != is_below[:-1]
     edge_steps = np.flatnonzero(crosses_level)
-    low = w_rad_s[edge_steps]
-    high = w_rad_s[edge_steps + 1]
+    lower_ends = w_rad_s[edge_steps]
+    upper_ends = w_rad_s[edge_steps + 1]
     is_low_below = is_below[edge_steps]
     if len(edge_steps):
         for _ in range(30):
-            middle = np.sqrt(low * high)
+            middle = np.sqrt(lower_ends * upper_ends)
             is_middle_below = curve(middle) < level
             is_like_low = is_middle_below == is_low_below
-            low = np.where(is_like_low, middle, low)
-            high = np.where(is_like_low, high, middle)
-    edges = np.sqrt(low * high).tolist()
+            lower_ends = np.where(is_like_low, middle, lower_ends)
+            upper_ends = np.where(is_like_low, upper_ends, middle)
+    band_edges = np.sqrt(lower_ends * upper_ends).tolist()
     # a band may extend beyond the grid
     if is_below[0]:
-        edges.insert(0, float(w_rad_s[0]))
+        band_edges.insert(0, float(w_rad_s[0]))
     if is_below[-1]:
-        edges.append(float(w_rad_s[-1]))
-    hz = [edge / (2.0 * np.pi) for edge in edges]
-    pairs = zip(hz[::2], hz[1::2], strict=True)
+        band_edges.append(float(w_rad_s[-1]))
+    edges_hz = [edge / (2.0 * np.pi) for edge in band_edges]
+    pairs = zip(edges_hz[::2], edges_hz[1::2], strict=True)
     return tuple(FrequencyBand(from_hz, to_hz) for from_hz, to_hz in pairs)

@@ -39,6 +39,7 @@ from ...scenario import (
     lacks_detailed_balance,
     load_scenario,
 )
+from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
@@ -293,9 +294,9 @@ class _AnalysedLoop(NamedTuple):
 
 
 def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
-    """Returns the loop at the end of a run, whose roots a stability certificate states.
+    """Finds the loop at the end of a run, whose roots a stability certificate states as well.
 
-    If it does not exist, the equilibrium is that of a longer run, or a prediction.
+    If the arms have no equilibrium near the end, that of a longer run or a prediction is used.
 
     Args:
         scenario: The scenario of the run.
@@ -322,6 +323,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     return _AnalysedLoop(scenario, conditions, rest, end.uses, end.distance_rad)
 
 
+@limit_blas_threads()
 def analyse_linear_loop(
     source: str | Path | Scenario | Log,
     overrides: Mapping[str, Any] | Sequence[str] = (),
@@ -388,7 +390,11 @@ def analyse_linear_loop(
 
 
 def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
-    """Returns a delay margin as plain values."""
+    """Returns the intervals of stable delays, and the crossings of roots, as plain values.
+
+    Args:
+        margin: The delays at which the loop is stable.
+    """
     intervals = []
     for interval in margin.intervals:
         ends = {"from_s": interval.low_s, "to_s": interval.high_s}
@@ -405,7 +411,11 @@ def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
-    """Returns the roots of a loop as plain values."""
+    """Returns the roots of a loop as plain values.
+
+    Args:
+        spectrum: The rightmost roots of the loop.
+    """
     roots = []
     for root in spectrum.roots:
         values = {

@@ -28,6 +28,7 @@ from scipy.optimize import brentq
 from ...core import Array, Law, TorqueKind
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, load_scenario
+from ..blas_threads import limit_blas_threads
 from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
 from .equilibrium import (
     choose_equilibrium,
@@ -63,6 +64,7 @@ MEAN_POSE_REMARK = (
 )
 
 
+@limit_blas_threads()
 def find_rightmost_root(
     conditions: OperatingConditions,
     rest: Equilibrium,
@@ -103,19 +105,20 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
         Index of the state. None if no wall is touched.
     """
     depth_m = np.full(len(q), -np.inf)
-    for n, name in enumerate(scenario.names):
+    for site_index, name in enumerate(scenario.names):
         site = scenario.setup(name)
-        joint_angles = q[:, n, : site.layout.joints].T
+        joint_angles = q[:, site_index, : site.layout.joints].T
         for wall in site.actors:
             if wall.kind is TorqueKind.WALL and wall.sampled:
                 tip = place_arm(site, joint_angles).end_effector_position()
                 from_surface = np.array(wall.a) - tip.T
                 wall_depth_m = from_surface @ np.array(wall.b)
                 depth_m = np.maximum(depth_m, wall_depth_m)
-    deepest = int(depth_m.argmax())
-    return deepest if depth_m[deepest] > 0.0 else None
+    deepest_state = int(depth_m.argmax())
+    return deepest_state if depth_m[deepest_state] > 0.0 else None
 
 
+@limit_blas_threads()
 def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
     """Returns the growth rate of small motions while an arm touches a wall, in 1/s.
 
@@ -364,7 +367,7 @@ class _GrowthRate:
         return LinearEdge(self._key, 0.5 * (low + high), omega, left.is_unstable)
 
     def _evaluate_finite(self, value: float) -> float:
-        """Returns the growth rate at a value, which is at least `_LEAST_PER_S`."""
+        """Returns the growth rate at a value, limited from below for Brent's method."""
         return max(self.evaluate(value), _LEAST_PER_S)
 
 

@@ -37,6 +37,7 @@ from ...log import Ints, Log
 from ...own_code import ImportedLaw
 from ...records import NS_PER_S
 from ...scenario import ConstantDelay, LinkBase, Scenario, draw_used_samples
+from ..blas_threads import limit_blas_threads
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
@@ -44,7 +45,7 @@ from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
-from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
+from .floquet import DRAWN_SPAN_S, SampledLoop, SamplesInUse
 from .linear_edge import find_deepest_contact
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
@@ -88,18 +89,8 @@ class _EndLoop(NamedTuple):
     last_pose: Equilibrium | None = None
     programs: tuple[str, ...] = ()
 
-    def compute_sampled_roots(self, count: int) -> Spectrum | None:
-        """Computes the rightmost roots of the loop, whose controllers compute once per tick.
 
-        Args:
-            count: Number of roots.
-
-        Returns:
-            The roots. None if a control law can be linearised in continuous time only.
-        """
-        return compute_sampled_spectrum(self.conditions, self.rest, count, self.uses)
-
-
+@limit_blas_threads()
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     """Computes whether small motions about the end pose of a recorded run die away.
 
@@ -121,6 +112,7 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     return _compute_roots(loop)
 
 
+@limit_blas_threads()
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     """Computes whether small motions about the end pose of a simulated run die away.
 
@@ -212,8 +204,11 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         raise ScenarioError("the run diverged", source=scenario.name)
     ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     changes_links = any(change.link for change in ended.timeline)
-    if changes_links and any(_list_unknown_delays(_end_traces(ended)).values()):
-        # Only a log shows which samples are in use while one model of delays replaces another.
+    has_outages = any(link.outages_s for link in ended.links.values())
+    has_unknown_delays = any(_list_unknown_delays(_end_traces(ended)).values())
+    if has_unknown_delays and (changes_links or has_outages):
+        # Only a log shows which samples are in use while one model of delays replaces another,
+        # or during an outage.
         return find_log_loop(simulate_scenario(ended), own_laws=True)
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
@@ -345,8 +340,9 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
     Args:
         loop: The loop at the end of a run.
     """
-    sampled = loop.compute_sampled_roots(_ROOTS)
-    if sampled is not None:
+    if not loop.conditions.has_forms:
+        sampled_loop = SampledLoop(loop.conditions, loop.uses)
+        sampled = sampled_loop.compute_spectrum(loop.rest, _ROOTS)
         laws = loop.scenario.controls
         has_imported_law = any(isinstance(law, ImportedLaw) for law in laws)
         # Roots show growth, but may miss what happens beyond a threshold: in a user's law, or
@@ -357,8 +353,7 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         exact = sampled.is_exact and is_proof_possible and not loop.programs
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
-            last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
-            exact = _has_same_sign(sampled, last_roots)
+            exact = _has_same_sign(sampled_loop, sampled, loop.last_pose)
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
         return roots._replace(
             distance_rad=loop.distance_rad,
@@ -386,20 +381,24 @@ def _name_left_out(programs: Sequence[str]) -> str:
     return f"how the programs at {join_words(programs)} react to the arms"
 
 
-def _has_same_sign(at_rest: Spectrum, at_last_pose: Spectrum | None) -> bool:
+def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium) -> bool:
     """Returns True if the rightmost roots at a rest and at the last pose have the same sign.
 
     At a pose that is no rest, the roots at zero are slightly off. Therefore a root below a
     tenth of the one at the rest counts as zero.
 
     Args:
-        at_rest: The roots at the rest next to the end of a run.
-        at_last_pose: The roots at its last pose. None if they could not be computed.
+        loop: The loop at the end of the run.
+        at_rest: Its roots at the rest next to the end of the run.
+        last_pose: The last pose of the run.
     """
-    if at_last_pose is None or at_rest.rightmost is None or at_last_pose.rightmost is None:
-        return at_last_pose is not None
+    if at_rest.rightmost is None:
+        return True
     rate_per_s = at_rest.rightmost.s.real
-    grows_at_last = at_last_pose.rightmost.s.real > _ZERO_SHARE * abs(rate_per_s)
+    last_rate_per_s = loop.measure_rightmost_rate(last_pose, rate_per_s)
+    if last_rate_per_s is None:
+        return True
+    grows_at_last = last_rate_per_s > _ZERO_SHARE * abs(rate_per_s)
     return grows_at_last == (rate_per_s > 0.0)
 
 
@@ -432,12 +431,23 @@ def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots
 
 
 def _explain_no_roots(reason: str) -> LoopRoots:
-    """Returns a result without roots, with the reason."""
+    """Returns a result without roots, which says why they could not be computed.
+
+    Args:
+        reason: The reason, as a phrase for the user.
+    """
     return LoopRoots("", None, False, f"this rest: no roots: {reason}")
 
 
 def _end_traces(scenario: Scenario) -> Scenario:
-    """Returns a scenario in which traces that have ended at its end are constant delays."""
+    """Returns a scenario in which tables of delays that have ended are constant delays.
+
+    After the end of such a table its last delay stays in force, so the final loop has a
+    constant delay. It replaces the planned changes of the link too.
+
+    Args:
+        scenario: The scenario up to the end of the run.
+    """
     end_us = 1e6 * scenario.duration_s
     links: dict[str, LinkBase] = dict(scenario.links)
     timeline = list(scenario.timeline)
@@ -470,6 +480,9 @@ def _fix_delays(
     find_used: Callable[[int, int, Ints], Ints],
 ) -> _FixedDelays:
     """Returns a scenario with the delays that occurred in its run.
+
+    Random and measured delays cannot be predicted. For them the samples in use in the last
+    quarter of the run stand for all later ones.
 
     Args:
         scenario: The scenario up to the end of the run.
@@ -556,7 +569,12 @@ def _choose_end_state(
 
 
 def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
-    """Returns the last recorded joint angles of all sites, shape (N, n), in rad."""
+    """Returns the last recorded joint angles of all sites, shape (N, n), in rad.
+
+    Args:
+        scenario: Scenario of the run.
+        trace: The reduced data of the run.
+    """
     return pad_rows([q[-1] for q, _ in _iterate_motions(scenario, trace)])
 
 
@@ -602,7 +620,15 @@ class _SiteMotion(NamedTuple):
 
 
 def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
-    """Simulates a scenario, and returns the motion of each site."""
+    """Simulates a scenario again, and returns the motion of each site.
+
+    The run to be judged kept only reduced data and its last records. The state of an arm that
+    chatters at a wall needs all records of the last quarter. They are read in batches, so that
+    a long run does not need memory for whole records.
+
+    Args:
+        scenario: The scenario up to the end of the run.
+    """
     run = FusedRun(scenario, keep=_BATCH_RECORDS + 1)
     fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
     batches: list[list[_SiteMotion]] = [[] for _ in scenario.names]
@@ -629,13 +655,23 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
 
 
 def _has_sampled_wall(scenario: Scenario) -> bool:
-    """Returns True if the force of some environment is computed once per tick and held."""
+    """Returns True if the force of some environment is computed once per tick and held.
+
+    An arm may then chatter at the wall, and its mean pose may be off the wall although it hits
+    it in every cycle.
+
+    Args:
+        scenario: Scenario of the run.
+    """
     environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
     return any(environment.actor.sampled for environment in environments)
 
 
 def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _EndState | None:
     """Finds the deepest state of arms that chatter at a sampled wall, in the last quarter.
+
+    The mean of such a motion may be beside the wall, where the loop is another one. The deepest
+    state is inside the wall, so the wall's stiffness is part of the linearised loop.
 
     Args:
         scenario: Scenario of the run.

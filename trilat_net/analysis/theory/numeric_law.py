@@ -90,6 +90,7 @@ class NumericLaw:
                 "in joint space only",
                 path=path,
             )
+
         assert setup.law_factory is not None
         self._law = setup.law_factory(setup.law_context())
         self._layout = setup.layout
@@ -97,7 +98,9 @@ class NumericLaw:
         self._rate_hz = setup.rate_hz
         self._arrays.site["tau_limit"] = np.inf
         self._arrays.links["alpha"] = shares
+
         self._plugged_law = plug_law(self._law, setup, self._arrays, np.zeros(0))
+
         remembered = np.array(read_memory(self._law))
         self._remembered_count = len(remembered)
         self._uses_previous_tick = False
@@ -110,12 +113,14 @@ class NumericLaw:
         joints = self._layout.joints
         q0 = np.array(setup.q0)
         zeros = np.zeros(joints)
+
         peers = []
         for link in setup.links:
             sample = np.concatenate([link.q0, zeros, zeros])
             peers.append(sample)
         parts = [q0, zeros, self.memory, q0, zeros, zeros, *peers, zeros]
         arguments = np.concatenate(parts)
+
         previous = np.concatenate([zeros, q0])
         shifted = previous + 1e-3
         output = self._evaluate_tick(arguments, previous)
@@ -123,6 +128,7 @@ class NumericLaw:
         self._uses_previous_tick = not np.array_equal(output, output_of_shifted)
         if not self._uses_previous_tick:
             return
+
         self.memory = np.concatenate([self.memory, previous])
         numbers = range(1, joints + 1)
         for name in ("tau_before", "q_before"):
@@ -135,7 +141,7 @@ class NumericLaw:
         return slice(start, start + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:
-        """Returns the law."""
+        """Returns the law. It stands for the function that builds the law of a site."""
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:
@@ -224,7 +230,7 @@ class NumericLaw:
         return outputs[: len(torque)], outputs[len(torque) :]
 
     def _evaluate_rates(self, x: Array) -> tuple[Array, Array]:
-        """Returns the torque and the rate of the memory for real arguments."""
+        """Returns the law's torque and the rate of change of its memory, for real arguments."""
         joints = self._layout.joints
         q = x[:joints]
         memory = x[self._memory_slice]
@@ -233,11 +239,13 @@ class NumericLaw:
         else:
             no_torque = np.zeros(joints)
             previous = np.concatenate([no_torque, q])
+
         output = self._evaluate_tick(x, previous)
         torque = output[:joints]
         next_memory = output[joints:]
         if self._uses_previous_tick:
             next_memory = np.concatenate([next_memory, torque, q])
+
         change = next_memory - memory
         return torque, change * self._rate_hz
 

@@ -279,12 +279,19 @@ class OperatingConditions(NamedTuple):
 
 
 def _describe_laws(scenario: Scenario) -> list[str]:
-    """Returns remarks on how the control laws of a scenario are linearised."""
+    """Returns remarks for the user on how the control laws of a scenario are linearised.
+
+    Laws of the user's own code are differentiated numerically, which is less exact than the
+    derivatives of the shipped laws. Some shipped laws state a remark of their own.
+
+    Args:
+        scenario: The experiment.
+    """
     notes = []
     laws = scenario.controls
-    codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
-    for code in filter(None, dict.fromkeys(codes)):
-        pairs = zip(scenario.names, codes, strict=True)
+    law_codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
+    for code in filter(None, dict.fromkeys(law_codes)):
+        pairs = zip(scenario.names, law_codes, strict=True)
         sites = [name for name, law_code in pairs if law_code == code]
         notes.append(
             f"{code} of {', '.join(sites)} is differentiated numerically, "
@@ -353,7 +360,11 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
 
 
 def _explain_missing_gains(law: Any) -> str:
-    """Returns the reason why a law has no linear loop, as part of a sentence."""
+    """Returns the reason why a law has no linear loop, as part of a sentence.
+
+    Args:
+        law: Settings of the control law.
+    """
     if isinstance(law, ImportedLaw):
         return (
             f"{law.code} is known by its code only, which may not run here; "
@@ -397,12 +408,7 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
 
 def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
-    """Returns True if the delay of a link repeats only after too many ticks to compute them.
-
-    Args:
-        link: Delay model of the link.
-        rate_hz: Ticks per second.
-    """
+    """Returns True if a link's delay repeats only after more ticks than are worth computing."""
     period_s = find_link_period_s(link)
     return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
 
@@ -448,23 +454,24 @@ def compute_effective_delay(
         # ages are complete when the samples of a whole period have arrived
         longest_s = 2e-3 * sum(link.moments())
         duration_s = max(duration_s, period_s + longest_s)
-    used = draw_used_samples(
+    used_samples = draw_used_samples(
         link=link,
         key=link_key(scenario.seed, f"{peer}->{site}"),
         receiver_hz=site_hz,
         sender_hz=peer_hz,
         duration_s=duration_s,
     )
-    if used[-1] < 0:
+    if used_samples[-1] < 0:
         raise ScenarioError(
             "no sample sent over this link ever arrives",
             path=f"links.{peer}->{site}",
             source=scenario.name,
         )
 
-    first = int(np.argmax(used >= 0))
-    tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
-    sample_ns = used[first:] * NS_PER_S // peer_hz
+    # ages from the first tick on that uses a sample
+    first = int(np.argmax(used_samples >= 0))
+    tick_ns = np.arange(first, len(used_samples)) * NS_PER_S // site_hz
+    sample_ns = used_samples[first:] * NS_PER_S // peer_hz
     ages_s = (tick_ns - sample_ns) * 1e-9
     return _EffectiveDelay(
         mean_s=float(ages_s.mean()),
@@ -488,13 +495,15 @@ def has_lasting_delays(scenario: Scenario) -> bool:
             continue
         site, peer = scenario.names[i], scenario.names[j]
         link = find_final_link(scenario, f"{peer}->{site}")
-        points = link.points
-        if is_ending_trace(link) and points is not None:
-            if points[-1, 0] > 1e6 * scenario.duration_s:
+
+        table = link.points
+        if is_ending_trace(link) and table is not None:
+            if table[-1, 0] > 1e6 * scenario.duration_s:
                 return False
             continue
         if find_link_period_s(link) is None or link.random:
             continue
+
         rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
         age = compute_effective_delay(scenario, peer, site, link)
         if age.varies or _has_long_period(link, rate_hz):
@@ -521,12 +530,14 @@ def _find_final_dominance(
         for ramp in site.ramps:
             if ramp.start_ns > end_ns:
                 continue
+
             progress = 1.0
             if ramp.end_ns > end_ns:
                 elapsed_ns = end_ns - ramp.start_ns
                 progress = elapsed_ns / (ramp.end_ns - ramp.start_ns)
-            change = np.array(ramp.alpha) - alpha[i, peers]
-            alpha[i, peers] += progress * change
+
+            remaining_change = np.array(ramp.alpha) - alpha[i, peers]
+            alpha[i, peers] += progress * remaining_change
             notes.append(
                 f"the dominance factors of {site.name} change during the run: "
                 "their values at the end are used"
@@ -547,15 +558,15 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
     """
     setup = scenario.setup(name)
     end_s = scenario.duration_s
-    present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
+    present_actors = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
 
-    hands = [actor for actor in present if actor.kind in _HANDS]
+    hands = [actor for actor in present_actors if actor.kind in _HANDS]
     if any(hand.move_end_s > end_s for hand in hands):
         notes.append(
             f"an operator at {name} still moves at the end: "
             "the end of that motion is used as the operator's target"
         )
-    if any(actor.kind in _PERIODIC for actor in present):
+    if any(actor.kind in _PERIODIC for actor in present_actors):
         notes.append(
             f"an operator at {name} still swings at the end: "
             "this torque is left out, because its mean is zero"
@@ -563,7 +574,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
 
     scripted = [
         actor
-        for actor in present
+        for actor in present_actors
         if actor.kind in SCRIPTED_KINDS and actor.kind not in _PERIODIC
     ]
     constant = [actor._replace(a=_evaluate_script(actor, end_s)) for actor in scripted]
@@ -573,11 +584,11 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
         )
 
     user_written = [
-        actor._replace(move_end_s=end_s) for actor in present if actor.kind in OWN_KINDS
+        actor._replace(move_end_s=end_s) for actor in present_actors if actor.kind in OWN_KINDS
     ]
     special_kinds = (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS)
-    others = [actor for actor in present if actor.kind not in special_kinds]
-    return setup._replace(actors=(*others, *user_written, *constant))
+    other_actors = [actor for actor in present_actors if actor.kind not in special_kinds]
+    return setup._replace(actors=(*other_actors, *user_written, *constant))
 
 
 _HANDS = (TorqueKind.HAND, TorqueKind.TASK_HAND)
@@ -592,8 +603,8 @@ def _evaluate_script(actor: TorqueSource, t_s: float) -> tuple[float, ...]:
         t_s: The time, in s.
     """
     if actor.table is None:
-        x = (t_s - actor.start_s) / (actor.end_s - actor.start_s)
-        return tuple(peak * math.sin(math.pi * x) ** 2 for peak in actor.a)
+        progress = (t_s - actor.start_s) / (actor.end_s - actor.start_s)
+        return tuple(peak * math.sin(math.pi * progress) ** 2 for peak in actor.a)
     times_s, *torques = actor.table.T
     return tuple(
         float(np.interp(t_s, times_s, torque, left=0.0, right=0.0)) for torque in torques

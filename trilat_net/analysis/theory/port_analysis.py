@@ -36,6 +36,7 @@ from ...errors import UsageError, count_nouns
 from ...results import finite_or_none
 from ...scenario import TASK_AXES, Scenario
 from ..arm_rows import build_arm_rows
+from ..blas_threads import limit_blas_threads
 from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, compute_delay_spectrum
@@ -71,9 +72,12 @@ def freeze_external_torques(
     sites = []
     all_rates = conditions.evaluate_rates(arguments)
     for site, rates in zip(conditions.sites, all_rates, strict=True):
-        torque = tuple((rates.external + rates.held).tolist())
-        constant = (TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ()
-        sites.append(site._replace(actors=constant))
+        rest_torque = rates.external + rates.held
+        torque = tuple(rest_torque.tolist())
+        actors: tuple[TorqueSource, ...] = ()
+        if any(torque):
+            actors = (TorqueSource(TorqueKind.RECORDED, a=torque),)
+        sites.append(site._replace(actors=actors))
     return conditions._replace(sites=tuple(sites))
 
 
@@ -153,8 +157,9 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):
-        followed = [n - 1 for n in _list_followed_axes(site)]
-        site_Kd[followed] = np.broadcast_to(site.gains.Kd, site_Kd.shape)[followed]
+        followed = [axis - 1 for axis in _list_followed_axes(site)]
+        all_gains = np.broadcast_to(site.gains.Kd, site_Kd.shape)
+        site_Kd[followed] = all_gains[followed]
     return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
@@ -268,6 +273,7 @@ class PortAnalysis(NamedTuple):
         return f"{linear} and {angular}" if has_rotations else linear
 
 
+@limit_blas_threads()
 def analyse_ports(
     scenario: Scenario,
     rest: Equilibrium,
@@ -398,7 +404,7 @@ def _locate_hands(
     loop: LinearLoop,
     hands: Sequence[HandMatrices],
 ) -> _HeldHands:
-    """Returns the end effectors of the masters, and the measured operators that may hold them.
+    """Finds the end effectors of the masters, which measured operators may hold.
 
     Raises:
         UsageError: An operator was measured along other axes than an end effector has.
@@ -432,7 +438,7 @@ def _locate_hands(
 
 
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
-    """Returns the index of the site of each port, shape (p,)."""
+    """Returns for each port the index of its site in the linear model, shape (p,)."""
     sites = port_response.list_port_sites(loop)
     owners = [sites.index(port_response.parse_port_site(port)) for port in loop.inputs]
     return np.array(owners, dtype=np.int64)
@@ -466,25 +472,23 @@ def _check_two_ports(
     Y: port_response.PortResponse,
     w_rad_s: Array,
 ) -> tuple[TwoPort, ...]:
-    """Returns Llewellyn's criterion for each joint that both sites of a pair have.
+    """Evaluates Llewellyn's criterion for every pair of sites, at each joint that both have.
 
     With three sites, the third one is once free and once clamped.
     """
     two_ports = []
     sites = port_response.list_port_sites(loop)
+    ports_by_joint = port_response.group_ports_by_joint(loop)
+    site_of_port = [port_response.parse_port_site(name) for name in loop.inputs]
     for pair in combinations(sites, 2):
         others = [site for site in sites if site not in pair]
         clamped_sites = ["", *others] if len(others) == 1 else [""]
         for clamped in clamped_sites:
             clamped_ports = port_response.find_site_ports(loop, clamped) if clamped else []
-            for joint, ports in port_response.group_ports_by_joint(loop).items():
-                keep = [
-                    port
-                    for port in ports
-                    if port_response.parse_port_site(loop.inputs[port]) in pair
-                ]
-                if len(keep) == len(pair):
-                    minima = _check_llewellyn(Y, keep, clamped_ports, w_rad_s)
+            for joint, ports in ports_by_joint.items():
+                pair_ports = [port for port in ports if site_of_port[port] in pair]
+                if len(pair_ports) == len(pair):
+                    minima = _check_llewellyn(Y, pair_ports, clamped_ports, w_rad_s)
                     two_ports.append(TwoPort(pair, joint, clamped, minima))
     return tuple(two_ports)
 
@@ -495,7 +499,10 @@ def _check_llewellyn(
     clamped: list[int],
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Returns Llewellyn's parameter of two ports over frequency.
+    """Evaluates Llewellyn's parameter of two ports over frequency.
+
+    The loop is stable with any passive operators at the two ports if the parameter is never
+    below 1.
 
     Args:
         Y: Admittance at all ports.
@@ -557,7 +564,7 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
 
 
 def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
-    """Returns a passivity as plain values."""
+    """Returns whether a loop is passive, and the lacking damping, as plain values."""
     return {
         **_minima_to_json(passivity.minima),
         "lacking_nm_s_rad": finite_or_none(passivity.lacking_nm_s_rad),
@@ -565,7 +572,7 @@ def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
 
 
 def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
-    """Returns the least value of a curve, and the bands in which it fails, as plain values."""
+    """Returns a curve's least value, and the bands in which it fails, as plain values."""
     return {
         "holds": not minima.below,
         "least": minima.least,
@@ -575,7 +582,11 @@ def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
 
 
 def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
-    """Returns a transparency as plain values."""
+    """Returns what an operator feels of another arm, free and clamped, as plain values.
+
+    Args:
+        transparency: The impedances that the operator feels.
+    """
     free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
     return {
         "at": transparency.operator_site,

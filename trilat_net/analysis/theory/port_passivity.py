@@ -122,7 +122,7 @@ class HandMatrices(NamedTuple):
 
 
 def _conjugate_transpose(Y: Complex) -> Complex:
-    """Returns Y^H at each frequency, shape (F, p, p)."""
+    """Returns the conjugate transpose Y^H of the matrix at each frequency, shape (F, p, p)."""
     transposed = np.swapaxes(Y, -1, -2)
     conjugate: Complex = np.conj(transposed)
     return conjugate
@@ -163,9 +163,11 @@ def check_against_hands(
         return None
 
     def find_least(w: Array) -> Array:
+        """Returns the least eigenvalue of Z + Z^H + 2 D over all choices of operators."""
         Y = response(w)
         Z = np.linalg.inv(Y).astype(np.complex128)
         Z += _conjugate_transpose(Z)
+
         resistances = []
         for hands, J in zip(held, places, strict=True):
             at_ports = []
@@ -174,6 +176,7 @@ def check_against_hands(
                 port_resistance = 2.0 * J.T @ resistance @ J
                 at_ports.append(port_resistance)
             resistances.append(at_ports)
+
         least_per_choice = []
         for choice in product(*resistances):
             held_Z = Z + sum(choice)
@@ -183,6 +186,7 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
+        """Returns the rounding error of these eigenvalues."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
@@ -282,6 +286,7 @@ def check_passivity(
     """
 
     def evaluate_weighted(w: Array) -> Complex:
+        """Returns the response, with the weights of the ports if there are any."""
         Y = response(w)
         return Y if weights is None else weight_response(Y, weights)
 
@@ -290,6 +295,7 @@ def check_passivity(
         return find_least_eigenvalue(weighted)
 
     def find_tolerance(w: Array) -> Array:
+        """Returns the rounding error of the least eigenvalue."""
         Y = response(w)
         norm = _find_frobenius_norm(Y)
         return EIGENVALUE_ROUNDING * norm
@@ -319,12 +325,16 @@ def llewellyn_parameter(Y: Complex) -> Array:
     y12 = Y[:, 0, 1]
     y21 = Y[:, 1, 0]
     transmission = y12 * y21
+
     norm = _find_frobenius_norm(Y)
     smallest = 1e-30 * norm**2
     size = np.maximum(np.abs(transmission), smallest)
+
     numerator = 2.0 * y11 * y22 - transmission.real
     quotient = numerator / size
     parameter: Array = np.minimum(quotient, MAX_LLEWELLYN)
+
+    # A port that is active alone fails the criterion, whatever the quotient is.
     limit = -EIGENVALUE_ROUNDING * norm
     first_is_active = y11 < limit
     second_is_active = y22 < limit
@@ -415,19 +425,20 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
         The largest least eigenvalue at each frequency, and the weights that give it.
     """
     scaled = _scale_sites(Y, owner)
-    count = len(Y)
-    free = int(owner.max())
-    centre = np.zeros((count, free))
-    best = np.zeros((count, free))
-    ball = _LOG_REACH**2 * free * np.eye(free)
-    shape = (count, free, free)
+    frequencies = len(Y)
+    free_weights = int(owner.max())
+    centre = np.zeros((frequencies, free_weights))
+    best_logs = np.zeros((frequencies, free_weights))
+    # the first ellipsoid is a ball that contains all weights up to the largest ratio
+    ball = _LOG_REACH**2 * free_weights * np.eye(free_weights)
+    shape = (frequencies, free_weights, free_weights)
     ellipsoids = np.broadcast_to(ball, shape).copy()
-    margin = np.full(count, -np.inf)
+    margin = np.full(frequencies, -np.inf)
     # the mean of the eigenvalues, which no weights change, bounds the least of them
     trace = np.trace(scaled, axis1=1, axis2=2)
-    bound = 2.0 * trace.real / scaled.shape[1]
+    upper_bound = 2.0 * trace.real / scaled.shape[1]
     # the frequencies at which the search continues
-    active = np.arange(count)
+    active = np.arange(frequencies)
 
     for _ in range(_MAX_ROUNDS):
         active_Y = scaled[active]
@@ -436,7 +447,7 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
         is_better = value > margin[active]
         improved = active[is_better]
         margin[improved] = value[is_better]
-        best[improved] = centre[improved]
+        best_logs[improved] = centre[improved]
 
         direction = np.einsum("fij,fj->fi", ellipsoids[active], slope)
         squared_gain = np.einsum("fi,fi->f", slope, direction)
@@ -445,25 +456,28 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
         active_margin = margin[active]
         size = np.maximum(np.abs(active_margin), 1e-6)
         can_gain = gain > _WEIGHT_TOLERANCE * size
-        reserve = bound[active] - active_margin
+        reserve = upper_bound[active] - active_margin
         can_gain &= reserve > EIGENVALUE_ROUNDING
         active = active[can_gain]
-        if not len(active) or free == 0:
+        if not len(active) or free_weights == 0:
             break
 
+        # move the centre along the ascent, and keep the half that may contain the maximum
         gain_column = gain[can_gain, np.newaxis]
         step = direction[can_gain] / gain_column
-        centre[active] += step / (free + 1.0)
+        centre[active] += step / (free_weights + 1.0)
         active_ellipsoids = ellipsoids[active]
         ellipsoids[active] = _shrink_ellipsoids(active_ellipsoids, step)
     # the first site's weight is 1
-    first_site = np.zeros((count, 1))
-    log_weights = np.concatenate([first_site, best], axis=1)
+    first_site = np.zeros((frequencies, 1))
+    log_weights = np.concatenate([first_site, best_logs], axis=1)
     return _BestWeights(margin, np.exp(log_weights))
 
 
 def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
-    """Returns the least ellipsoids around the half of each that can contain the maximum.
+    """Returns the smallest ellipsoid around the half of each that can contain the maximum.
+
+    This is the update of the ellipsoid method after a step along the gradient.
 
     Args:
         ellipsoids: Matrices of the ellipsoids, shape (F, n, n).
@@ -482,15 +496,19 @@ def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
 
 
 def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
-    """Returns the admittance with each site's diagonal block scaled to norm 1."""
+    """Scales the admittance so that the block of each site on the diagonal has norm 1.
+
+    The search for weights then starts with sites of equal size.
+    """
     size = np.ones(Y.shape[:2])
     sites = int(owner.max()) + 1
     for site in range(sites):
         ports = np.flatnonzero(owner == site)
         rows = Y[:, ports]
         block = rows[:, :, ports]
-        norm = _find_frobenius_norm(block)
-        size[:, ports] = norm[:, np.newaxis]
+        block_norm = _find_frobenius_norm(block)
+        size[:, ports] = block_norm[:, np.newaxis]
+
     positive_size = np.maximum(size, 1e-300)
     root = np.sqrt(positive_size)
     row_roots = root[:, :, np.newaxis]

@@ -90,7 +90,7 @@ class LoopOutput(NamedTuple):
 
 
 def _repeat_matrix(matrix: Array, count: int) -> Complex:
-    """Returns complex copies of a matrix of shape (p, m), shape (count, p, m)."""
+    """Returns `count` complex copies of a matrix of shape (p, m), as an array (count, p, m)."""
     shape = (count, *matrix.shape)
     complex_matrix = matrix.astype(np.complex128)
     copies: Complex = np.broadcast_to(complex_matrix, shape).copy()
@@ -98,7 +98,7 @@ def _repeat_matrix(matrix: Array, count: int) -> Complex:
 
 
 def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
-    """Returns e^{-s T} of a delay T, shape (F, 1, 1)."""
+    """Returns the factor e^{-s T} of a delay T at each complex frequency s, shape (F, 1, 1)."""
     shift: Complex = np.exp(-s * delay_s)
     return shift[:, np.newaxis, np.newaxis]
 
@@ -130,8 +130,8 @@ class PoleAtZero(NamedTuple):
         residue = self.residue
         differences = np.abs(residue - residue.T)
         asymmetry = differences.max(initial=0.0)
-        size = np.abs(residue).max(initial=0.0)
-        tolerance = _NEGLIGIBLE * size
+        largest_entry = np.abs(residue).max(initial=0.0)
+        tolerance = _NEGLIGIBLE * largest_entry
         if self.order > 1 or asymmetry > tolerance:
             return False
         eigenvalues = np.linalg.eigvalsh(residue)
@@ -341,21 +341,21 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
     unit_circle = np.exp(angles)
     small_circle = ZERO_ROOT_RADIUS_PER_S * unit_circle
-    values = evaluate_transfer(loop, small_circle)
+    responses = evaluate_transfer(loop, small_circle)
     circle = unit_circle[:, np.newaxis, np.newaxis]
     # the coefficient of 1 / s^k is the mean of Y(s) s^k over the circle
     coefficients = {}
     for power in range(1, _HIGHEST_POWER + 1):
-        products = values * circle**power
+        products = responses * circle**power
         mean = products.mean(axis=0)
         coefficients[power] = mean.real
 
-    largest = np.abs(values).max(initial=0.0)
-    least = _NEGLIGIBLE * largest
+    largest = np.abs(responses).max(initial=0.0)
+    least_size = _NEGLIGIBLE * largest
     powers = []
     for power, coefficient in coefficients.items():
         size = np.abs(coefficient).max(initial=0.0)
-        if size > least:
+        if size > least_size:
             powers.append(power)
 
     residue = np.zeros_like(coefficients[1])
@@ -392,17 +392,18 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
         speeds.append(loop.names.index(speed_name))
         angles.append(loop.names.index(angle_name))
     removed = {*speeds, *angles}
-    kept = [n for n in range(len(loop.names)) if n not in removed]
+    kept_states = [n for n in range(len(loop.names)) if n not in removed]
     undelayed_term = DelayedTerm(0.0, loop.A, loop.B)
     terms = [undelayed_term, *loop.delayed]
     acceleration_block = np.ix_(speeds, ports)
     for term in loop.delayed:
-        reflected = term.B[acceleration_block]
-        if reflected.any():
+        reflected_torque = term.B[acceleration_block]
+        if reflected_torque.any():
             raise UsageError(
                 "clamped sites that reflect force onto each other do not have a finite "
                 f"response: {site}"
             )
+    # the torque of the clamp as a sum of terms with delays
     inverse_inertia = loop.B[acceleration_block]
     inertia = np.linalg.inv(inverse_inertia)
     sums: dict[float, DelayedTerm] = {}
@@ -444,24 +445,24 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
             effect_of_torque = effect @ clamp.B
             add_term(delay_s, effect_of_state, effect_of_torque)
     kept_terms = []
-    kept_block = np.ix_(kept, kept)
+    kept_block = np.ix_(kept_states, kept_states)
     for delay_s in sorted(sums):
         total = sums[delay_s]
         kept_A = total.A[kept_block]
-        kept_B = total.B[kept]
+        kept_B = total.B[kept_states]
         kept_term = DelayedTerm(delay_s, kept_A, kept_B)
         kept_terms.append(kept_term)
     undelayed, *delayed = kept_terms
     active_terms = [term for term in delayed if term.A.any() or term.B.any()]
     return LinearLoop(
-        names=tuple(loop.names[n] for n in kept),
+        names=tuple(loop.names[n] for n in kept_states),
         inputs=tuple(loop.inputs[n] for n in other_ports),
         outputs=tuple(loop.outputs[n] for n in other_ports),
         A=undelayed.A,
         B=undelayed.B,
-        C=loop.C[np.ix_(other_ports, kept)],
+        C=loop.C[np.ix_(other_ports, kept_states)],
         delayed=tuple(active_terms),
-        E=None if loop.E is None else loop.E[kept],
+        E=None if loop.E is None else loop.E[kept_states],
     )
 
 
@@ -563,16 +564,22 @@ class Transparency(NamedTuple):
         return free, clamped
 
     def _average_magnitude(self, Z: Complex) -> float:
-        """Returns the mean magnitude of an impedance over the band, on logarithmic axes."""
+        """Returns the mean magnitude of an impedance over the band, on logarithmic axes.
+
+        On these axes each decade of frequency and each decade of magnitude has the same weight.
+
+        Args:
+            Z: Impedance at the frequencies `w_rad_s`.
+        """
         low, high = (2.0 * np.pi * edge for edge in self.band_hz)
         # the edges of the band belong to it, up to rounding
         w_rad_s = self.w_rad_s
         is_above = w_rad_s >= low * (1.0 - 1e-9)
         is_below = w_rad_s <= high * (1.0 + 1e-9)
-        inside = is_above & is_below
-        magnitudes = np.abs(Z[inside])
+        in_band = is_above & is_below
+        magnitudes = np.abs(Z[in_band])
         log_magnitudes = np.log(magnitudes)
-        log_w = np.log(w_rad_s[inside])
+        log_w = np.log(w_rad_s[in_band])
         width = log_w[-1] - log_w[0]
         integral = np.trapezoid(log_magnitudes, log_w)
         mean = integral / width

@@ -15,6 +15,7 @@ Invariant:
 """
 
 from collections.abc import Iterator
+from functools import cache
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -68,6 +69,7 @@ class ArgumentLayout:
         self.shared = shared
         self.peers = peers
         self.coordinates = m = shared or joints
+        # in the order of the attributes; index 6 are the samples of the single peers
         lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
         ends = accumulate(lengths, initial=0)
         slices = [slice(start, stop) for start, stop in pairwise(ends)]
@@ -78,6 +80,7 @@ class ArgumentLayout:
         self.qd_des = slices[4]
         self.peer_torque = slices[5]
         self.external_torque = slices[7]
+
         self.states = self.estimate.stop
         self.arguments = self.external_torque.stop
         self.inputs = slice(self.states, self.external_torque.start)
@@ -108,16 +111,13 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
     """
     layout = site.layout
     if isinstance(site.law_factory, NumericLaw):
-        return ArgumentLayout(
-            joints=layout.joints,
-            parameters=len(site.law_factory.memory),
-            peers=len(site.links),
-        )
-    return ArgumentLayout(
-        joints=layout.joints,
-        parameters=layout.parameters,
-        shared=layout.shared,
-    )
+        memories = len(site.law_factory.memory)
+        return _make_layout(layout.joints, memories, 0, len(site.links))
+    return _make_layout(layout.joints, layout.parameters, layout.shared, 0)
+
+
+# An analysis evaluates the same few sites hundreds of times.
+_make_layout = cache(ArgumentLayout)
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
@@ -178,14 +178,21 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
         The errors of position and velocity, the reference velocity and acceleration for the
         joints, and the related Jacobian.
     """
-    layout = lay_out_arguments(site)
+    return _follow(site, arm, x, lay_out_arguments(site))
+
+
+def _follow(
+    site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, layout: ArgumentLayout
+) -> Following:
+    """Computes errors and reference motion, see `compute_following`, with a given layout."""
     Lambda = _as_columns(site.gains.Lambda, x)
     q = x[layout.q]
     qd = x[layout.qd]
     reference = x[layout.q_des]
     reference_rate = x[layout.qd_des]
 
-    if site.layout.task and isinstance(arm, PlacedChain):
+    has_task = site.chain is not None and site.chain.task is not None
+    if has_task and isinstance(arm, PlacedChain):
         return follow_in_task(
             site=site,
             arm=arm,
@@ -232,20 +239,20 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])
     qd = x[layout.qd]
-    following = compute_following(site, arm, x)
+    following = _follow(site, arm, x, layout)
 
-    continuous = _sum_actors(site, arm, x, sampled=False)
+    continuous = _sum_actors(site, arm, x, layout, sampled=False)
     external = x[layout.external_torque] + continuous
-    held = _sum_actors(site, arm, x, sampled=True)
+    held = _sum_actors(site, arm, x, layout, sampled=True)
 
     if isinstance(site.law_factory, NumericLaw):
         state_and_inputs = x[: layout.inputs.stop]
         law_arguments = np.concatenate([state_and_inputs, external + held])
         tau, estimate_rate = site.law_factory.evaluate(law_arguments)
     elif has_estimate(site):
-        tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x)
+        tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x, layout)
     else:
-        tau = _evaluate_known_gravity_law(site, arm, following, x)
+        tau = _evaluate_known_gravity_law(site, arm, following, x, layout)
         estimate_rate = 0.0 * x[layout.estimate]
 
     torque = tau + external + held
@@ -261,6 +268,24 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
         xd=following.xd,
         reflected=following.from_joints(external + held),
     )
+
+
+def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
+    """Computes the torque of operators and environments that a site sends to the other sites.
+
+    It is the entry `reflected` of `evaluate_site_rates`, without the other entries.
+
+    Args:
+        site: Setup of the site.
+        x: States and inputs in the order of `lay_out_arguments`, shape (arguments, ...).
+    """
+    layout = lay_out_arguments(site)
+    arm = place_arm(site, x[layout.q])
+    following = _follow(site, arm, x, layout)
+    continuous = _sum_actors(site, arm, x, layout, sampled=False)
+    external = x[layout.external_torque] + continuous
+    held = _sum_actors(site, arm, x, layout, sampled=True)
+    return following.from_joints(external + held)
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
@@ -299,7 +324,15 @@ def has_estimate(site: SiteSetup) -> bool:
 
 
 def _as_columns(values: object, like: Numbers) -> Numbers:
-    """Returns values with a copy for each column of another array, shape (..., columns)."""
+    """Repeats constants, such as gains, for each column of another array.
+
+    Args:
+        values: The constants, of any shape.
+        like: Array whose trailing axes are the columns.
+
+    Returns:
+        The constants, with the trailing axes of `like` behind their own axes.
+    """
     column = np.asarray(values, dtype=np.float64)
     columns = like.shape[1:]
     column_axes = (1,) * len(columns)
@@ -312,12 +345,12 @@ def _evaluate_known_gravity_law(
     arm: PlacedArm | PlacedChain,
     following: Following,
     x: Numbers,
+    layout: ArgumentLayout,
 ) -> Numbers:
     """Returns the torque of a law with known gravity, shape (n, ...), in N m.
 
     The law is tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), with J = 1 in joint space.
     """
-    layout = lay_out_arguments(site)
     gains = site.gains
     q = x[layout.q]
     qd = x[layout.qd]
@@ -325,14 +358,17 @@ def _evaluate_known_gravity_law(
     Kd = _as_columns(gains.Kd, q)
     d = _as_columns(gains.d, q)
     k_f = _as_columns(gains.k_f, q)
+
     known_parameters = np.broadcast_to(gains.known, site.theta.shape)
     theta = _as_columns(known_parameters, q)
     G = arm.gravity_torque(theta)
+
     error_damper = Kd * following.ed
     spring = K * following.e
     reflected = k_f * x[layout.peer_torque]
     pull = error_damper + spring - reflected
     pull_torque = following.to_joints(pull)
+
     damper = d * qd
     torque: Array = G - damper - pull_torque
     return torque
@@ -343,6 +379,7 @@ def _evaluate_adaptive_law(
     arm: PlacedArm | PlacedChain,
     following: Following,
     x: Numbers,
+    layout: ArgumentLayout,
 ) -> tuple[Numbers, Numbers]:
     """Returns the torque of an adaptive law, in N m, and the rate of its estimate.
 
@@ -353,7 +390,6 @@ def _evaluate_adaptive_law(
               - (1 - known) friction(v)
         theta_hat' = -Gamma Y' r
     """
-    layout = lay_out_arguments(site)
     gains = site.gains
     q = x[layout.q]
     qd = x[layout.qd]
@@ -397,7 +433,10 @@ def _evaluate_adaptive_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """Returns True where an estimate is at a limit of its box and its rate points outward."""
+    """Returns True where an estimate is at its limit and its rate points beyond the limit.
+
+    The adaptive law then holds the estimate (projection).
+    """
     low = _as_columns(site.gains.low, estimate)
     high = _as_columns(site.gains.high, estimate)
     is_low = estimate.real <= low + SWITCHING_TOLERANCE
@@ -413,6 +452,7 @@ def _sum_actors(
     site: SiteSetup,
     arm: PlacedArm | PlacedChain,
     x: Numbers,
+    layout: ArgumentLayout,
     *,
     sampled: bool,
 ) -> Numbers:
@@ -422,12 +462,12 @@ def _sum_actors(
         site: Setup of the site, with the operators and environments in force.
         arm: The arm in the pose of x.
         x: Arguments of the site's rates, shape (arguments, ...).
+        layout: Where x contains the angles and velocities.
         sampled: True for those that act once per tick, False for those that act continuously.
 
     Returns:
         Torque on the joints, shape (n, ...), in N m.
     """
-    layout = lay_out_arguments(site)
     q = x[layout.q]
     qd = x[layout.qd]
     total: Numbers = 0.0 * q
@@ -488,7 +528,10 @@ def _evaluate_actor(
 
 
 def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -> Numbers:
-    """Returns the effort of an operator or environment that a user wrote, components first."""
+    """Returns the torque or force of an operator or environment that a user wrote.
+
+    The components are on the first axis, as in this module.
+    """
     # models expect the components on the last axis
     positions = np.moveaxis(position, 0, -1)
     velocities = np.moveaxis(velocity, 0, -1)
@@ -533,7 +576,11 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 
 
 def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
-    """Returns True for each estimate that rests at a limit of its box, shape (P,)."""
+    """Finds estimates that rest exactly at a limit, and of which the law holds none.
+
+    The derivative of the law is one-sided there. The result is True for each such estimate,
+    shape (P,).
+    """
     layout = lay_out_arguments(site)
     gains = site.gains
     estimate = x[layout.estimate]
@@ -543,9 +590,10 @@ def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
     is_near_high = np.abs(high - estimate) < SWITCHING_TOLERANCE
     rate = evaluate_site_rates(site, x).estimate
     is_still = np.abs(rate) <= SWITCHING_TOLERANCE
-    # an estimate that would leave an open box is held by its bound
-    open_box = gains._replace(low=-np.inf, high=np.inf)
-    free_rate = evaluate_site_rates(site._replace(gains=open_box), x).estimate
+    # an estimate that would leave its range without limits is held by its limit
+    unlimited_gains = gains._replace(low=-np.inf, high=np.inf)
+    unlimited_site = site._replace(gains=unlimited_gains)
+    free_rate = evaluate_site_rates(unlimited_site, x).estimate
     is_held = _is_at_bound(site, estimate, free_rate)
     adapts = np.asarray(gains.Gamma) > 0
     switching: NDArray[np.bool_] = (is_near_low | is_near_high) & is_still & ~is_held & adapts

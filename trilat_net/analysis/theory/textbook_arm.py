@@ -134,7 +134,7 @@ def _repeat_columns(vector: Numbers, columns: tuple[int, ...]) -> Numbers:
 
 
 def _add_axes(values: Numbers, shape: tuple[int, ...], count: int) -> Numbers:
-    """Returns values in a shape with `count` axes of length 1 behind it, to fit any columns."""
+    """Reshapes values to `shape` and adds `count` axes of length 1, to fit any columns."""
     trailing = (1,) * count
     return values.reshape(*shape, *trailing)
 
@@ -206,7 +206,7 @@ class PlacedChain:
             self._links.append(link)
 
     def _get_per_joint(self, name: str) -> Numbers:
-        """Returns an attribute of every joint, shape (n, 1, ...)."""
+        """Returns one attribute of every joint, such as "viscous", shape (n, 1, ...)."""
         joints = self._chain.joints
         column_axes = len(self._columns)
         values = np.array([getattr(joint, name) for joint in joints])
@@ -236,6 +236,7 @@ class PlacedChain:
             W = multiply_columns(link.J, v)
             V_cross = _cross_motion(V)
             W_cross = _cross_motion(W)
+            # acceleration A_i of the link: A_i = X A_p + S a_i + V_i x (S v_i)
             S_a = np.multiply.outer(link.S, a[i])
             S_v = np.multiply.outer(link.S, v[i])
             A_before = multiply_columns(link.X, A)
@@ -243,6 +244,7 @@ class PlacedChain:
             A = A_before + S_a
             A = A + velocity_product
 
+            # F_i, of which each column is the force f_i of a unit parameter
             I_A = _multiply_inertia_units(A)
             I_V = _multiply_inertia_units(V)
             I_W = _multiply_inertia_units(W)
@@ -352,16 +354,20 @@ class PlacedChain:
         return solve_columns(M, net_torque)
 
     def _compute_stop_torque(self, qd: Numbers) -> Numbers:
-        """Returns the torque of the joints' end stops, springs with dampers, shape (n, ...)."""
+        """Returns the torque of the joints' mechanical stops, shape (n, ...), in N m.
+
+        A stop at the end of a joint's range is a spring with a damper.
+        """
         q = self._q
         stiffness = self._get_per_joint("stop_stiffness")
         damping = self._get_per_joint("stop_damping")
         total: Numbers = np.zeros_like(q)
         for name, sign in (("lower", 1.0), ("upper", -1.0)):
             limit = self._get_per_joint(name)
-            depth = sign * (limit - q.real)
-            is_beyond = depth > 0.0
+            penetration = sign * (limit - q.real)
+            is_beyond = penetration > 0.0
             stop_position = np.where(is_beyond, limit, 0.0)
+
             spring = stiffness * (stop_position - q)
             damper = damping * qd
             push = spring - damper
@@ -432,9 +438,11 @@ class PlacedChain:
             rate = _multiply(link.X, rate)
             V = multiply_columns(link.J, qd)
             V_cross = _cross_motion(V)
+            # in the frame of the link, the axis of its joint changes at the rate V x S
             S = _repeat_columns(link.S, columns)
             axis_rate = multiply_columns(V_cross, S)
             rate[:, k] += axis_rate
+        # rates so far are relative to the base; the Jacobian is in the moving frame of the tip
         V_last_cross = _cross_motion(V_last)
         frame_motion = _multiply(V_last_cross, last.J)
         rate = rate - frame_motion
@@ -450,7 +458,11 @@ class PlacedChain:
         return rate + frame_rate
 
     def _move_to_tip(self, columns: Numbers) -> Numbers:
-        """Returns spatial velocities of the last link at the tip and along base axes."""
+        """Converts spatial velocities of the last link to the point of the end effector.
+
+        The arguments are along the axes of the link, and the results along those of the base.
+        Both have the shape (6, n, ...).
+        """
         R = self._links[-1].R_base
         tip_m = np.array(self._chain.tip_m)
         tip_cross = _build_cross_matrix(tip_m)
@@ -463,7 +475,11 @@ class PlacedChain:
 
 
 def _multiply_inertia_units(motion: Numbers) -> Numbers:
-    """Returns the momentum of each unit parameter for a spatial motion, shape (6, 10, ...)."""
+    """Returns the momentum that a spatial motion gives each of the ten inertial parameters.
+
+    Column p of the result, shape (6, 10, ...), is the momentum of a link whose parameter p is 1
+    and all others 0.
+    """
     momentum: Numbers = np.einsum("pab,b...->ap...", _INERTIA_UNITS, motion)
     return momentum
 
@@ -511,14 +527,18 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
     """
     R_0 = np.array(joint.rotation)
     axis = np.array(joint.axis)
+
     columns = np.shape(q)
     origin_m = np.array(joint.origin_m)
     R = _repeat_columns(R_0, columns)
     p = _repeat_columns(origin_m, columns)
+
     if joint.prismatic:
         direction = R_0 @ axis
         shift = np.multiply.outer(direction, q)
         return R, p + shift
+
+    # Rodrigues' formula: R_0 (1 + sin q K + (1 - cos q) K^2).
     K = _build_cross_matrix(axis)
     R_0_K = R_0 @ K
     sine_term = np.multiply.outer(R_0_K, np.sin(q))
@@ -550,13 +570,17 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     cosine_inner = 1.0 - square / 30.0 * (1.0 - square / 56.0)
     sine_series = 1.0 - square / 6.0 * sine_inner
     cosine_series = 0.5 - square / 24.0 * cosine_inner
+
     sine_quotient = np.sin(angle) / angle
     versine = 1.0 - np.cos(angle)
     cosine_quotient = versine / angle**2
+
     sine_factor = np.where(is_small, sine_series, sine_quotient)
     cosine_factor = np.where(is_small, cosine_series, cosine_quotient)
+
     K = _build_cross_matrix(vector)
     K_squared = _multiply(K, K)
+
     column_axes = vector.ndim - 1
     identity = _add_axes(np.eye(3), (3, 3), column_axes)
     sine_term = sine_factor * K
@@ -618,24 +642,24 @@ def _find_quaternion(R: Numbers) -> Numbers:
     xx = R[0, 0]
     yy = R[1, 1]
     zz = R[2, 2]
-    x = R[2, 1] - R[1, 2]
-    y = R[0, 2] - R[2, 0]
-    z = R[1, 0] - R[0, 1]
-    xy = R[0, 1] + R[1, 0]
-    xz = R[0, 2] + R[2, 0]
-    yz = R[1, 2] + R[2, 1]
+    w_x = R[2, 1] - R[1, 2]
+    w_y = R[0, 2] - R[2, 0]
+    w_z = R[1, 0] - R[0, 1]
+    x_y = R[0, 1] + R[1, 0]
+    x_z = R[0, 2] + R[2, 0]
+    y_z = R[1, 2] + R[2, 1]
 
-    # four times the squares of w, x, y and z
+    # w_x is four times the product of w and x, and so on; squares likewise
     square_w = 1.0 + xx + yy + zz
     square_x = 1.0 + xx - yy - zz
     square_y = 1.0 - xx + yy - zz
     square_z = 1.0 - xx - yy + zz
     products = np.array(
         [
-            [square_w, x, y, z],
-            [x, square_x, xy, xz],
-            [y, xy, square_y, yz],
-            [z, xz, yz, square_z],
+            [square_w, w_x, w_y, w_z],
+            [w_x, square_x, x_y, x_z],
+            [w_y, x_y, square_y, y_z],
+            [w_z, x_z, y_z, square_z],
         ]
     )
 
@@ -695,13 +719,14 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
 
     site_rotation = site_pose[POSITION:]
     R = rotation_from_vector(site_rotation)
-    weighted = []
+    weighted_rotations = []
     for share, pose in followed:
         peer_rotation = pose[POSITION:]
         R_peer = rotation_from_vector(peer_rotation)
         rotation = _relative_rotation_vector(R_peer, R)
-        weighted.append(share * rotation)
-    difference = np.asarray(sum(weighted))
+        weighted_rotations.append(share * rotation)
+
+    difference = np.asarray(sum(weighted_rotations))
     turn_back = rotation_from_vector(-difference)
     reference = _multiply(turn_back, R)
     # zero times the site's pose gives the position the same number of columns
@@ -903,7 +928,10 @@ def follow_in_task(
 
 
 def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
-    """Returns x - x_des, shape (m, ...). Orientations differ by Log(R R_des')."""
+    """Returns the difference x - x_des of two poses, shape (m, ...).
+
+    Orientations R and R_des differ by the rotation vector Log(R R_des').
+    """
     e = x - x_des
     if len(x) == POSITION:
         return e
@@ -913,19 +941,19 @@ def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
     desired_rotation = columns_of_x_des[POSITION:]
     R = rotation_from_vector(rotation)
     R_des = rotation_from_vector(desired_rotation)
-    turn = _relative_rotation_vector(R_des, R)
-    return np.concatenate([e[:POSITION], turn])
+    rotation_error = _relative_rotation_vector(R_des, R)
+    return np.concatenate([e[:POSITION], rotation_error])
 
 
 def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
-    """Returns J J', damped if the pose is nearly singular, and the bound that decides.
+    """Returns J J', damped near singular poses, and the bound that decides about damping.
 
-    The bound 1 / trace((J J')^-1) is at most the square of the least singular value. Below the
-    limit sigma^2 it is raised to the limit by adding the difference to the diagonal (damped
-    least squares).
+    The bound 1 / trace((J J')^-1) is at most the square of the least singular value of J. Below
+    the limit sigma^2, it is raised to the limit by adding the difference to the diagonal
+    (damped least squares).
 
     Args:
-        task: The task.
+        task: The task, with the followed axes and the limit sigma.
         J: Jacobian of the followed axes, shape (m, n, ...), with zero rows for the others.
     """
     m = len(task.axes)
@@ -940,8 +968,8 @@ def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
     # NumPy expects matrices on the last two axes
     matrices = np.moveaxis(A_followed, (0, 1), (-2, -1))
     singular_values = np.linalg.svd(matrices.real, compute_uv=False)
-    least = singular_values[..., -1]
-    if not least.min() > SINGULAR:
+    least_singular_value = singular_values[..., -1]
+    if not least_singular_value.min() > SINGULAR:
         return A + np.nan, 0.0
 
     inverses = np.linalg.inv(matrices)

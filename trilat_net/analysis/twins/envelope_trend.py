@@ -34,7 +34,7 @@ import numpy as np
 from ...core import Array
 
 FLOOR_RAD = 1e-12
-"""An envelope below this is the rounding of the numbers, rad; of speeds, rad/s."""
+"""Envelopes below this value are rounding errors, in rad, or in rad/s for speeds."""
 
 _T_QUANTILES = {16: 2.977, 8: 3.707}
 """99.5 % quantiles of Student's t with n - 2 degrees of freedom, by the number n of windows.
@@ -141,10 +141,12 @@ def fit_envelopes(
             continue
         half_s = 0.5 * (t_s[-1] - t_s[0])
         window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
-        for n, fit in zip(undecided, window_fits, strict=True):
-            fits[n] = fit
-        undecided = [n for n in undecided if fits[n].trend is EnvelopeTrend.UNDECIDED]
-    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
+        for index, fit in zip(undecided, window_fits, strict=True):
+            fits[index] = fit
+        undecided = [
+            index for index in undecided if fits[index].trend is EnvelopeTrend.UNDECIDED
+        ]
+    growing = [index for index, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
     if falls_first or not growing:
         return fits
 
@@ -156,9 +158,9 @@ def fit_envelopes(
         return fits
     steps = np.diff(np.log(first_half), axis=0)
     least_steps = steps.min(axis=0)
-    for n, least_step in zip(growing, least_steps, strict=True):
+    for index, least_step in zip(growing, least_steps, strict=True):
         if least_step >= _LEAST_STEP:
-            fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED)
+            fits[index] = fits[index]._replace(trend=EnvelopeTrend.UNDECIDED)
     return fits
 
 
@@ -168,16 +170,16 @@ def _find_window_maxima(
     windows: int,
     floor: float,
 ) -> Array | None:
-    """Returns the maxima of equal windows of the second half, shape (windows, C).
+    """Returns the maximum of each envelope in equal windows of the second half of the run.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
-        values: The envelopes, shape (K, C).
+        values: The C envelopes, shape (K, C).
         windows: Number of windows.
-        floor: Least maximum.
+        floor: Smaller maxima are replaced by this value.
 
     Returns:
-        The maxima. None if some window has fewer than two points.
+        The maxima, shape (windows, C). None if some window has fewer than two points.
     """
     if not len(t_s):
         return None
@@ -193,36 +195,37 @@ def _find_window_maxima(
 
 
 def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[EnvelopeFit]:
-    """Determines the trends of envelopes by least-squares lines through their log maxima.
+    """Fits a line through the logarithms of each envelope's maxima, and classifies its trend.
 
     Args:
-        maxima: Maxima of n equal windows, shape (n, C).
+        maxima: Maxima of n equal windows of C envelopes, shape (n, C).
         window_s: Length of a window, in s.
         log_floor: Logarithm of the floor. An envelope below it is at rest.
     """
-    n = len(maxima)
+    windows = len(maxima)
     log_maxima = np.log(maxima)
-    x = np.arange(n) - 0.5 * (n - 1)
-    x_squares = float(x @ x)
-    column_x = x[:, np.newaxis]
-    # a sum, because the last bits of a matrix product may vary between machines
-    products = (column_x * log_maxima).sum(axis=0)
+    centred_index = np.arange(windows) - 0.5 * (windows - 1)
+    x_squares = float(centred_index @ centred_index)
+    index_column = centred_index[:, np.newaxis]
+    # least squares; a sum, because the last bits of a matrix product may vary between machines
+    products = (index_column * log_maxima).sum(axis=0)
     slopes = products / x_squares
-    residual = log_maxima - log_maxima.mean(axis=0) - column_x * slopes
+    residual = log_maxima - log_maxima.mean(axis=0) - index_column * slopes
     residual_squares = (residual**2).sum(axis=0)
-    slope_variance = residual_squares / (n - 2) / x_squares
-    bounds = _T_QUANTILES[n] * np.sqrt(slope_variance)
-    windows_by_quarter = maxima.reshape(4, n // 4, -1)
+    slope_variance = residual_squares / (windows - 2) / x_squares
+    slope_bounds = _T_QUANTILES[windows] * np.sqrt(slope_variance)
+
+    windows_by_quarter = maxima.reshape(4, windows // 4, -1)
     log_quarters = np.log(windows_by_quarter.max(axis=1))
 
     fits = []
-    lines = zip(slopes.tolist(), bounds.tolist(), log_quarters.T, strict=True)
-    for slope, bound, log_quarter in lines:
+    lines = zip(slopes.tolist(), slope_bounds.tolist(), log_quarters.T, strict=True)
+    for slope, slope_bound, log_quarter in lines:
         steps = np.diff(log_quarter)
         is_dead = float(log_quarter[-1]) <= log_floor
-        trend = _classify_trend(slope * n, bound * n, steps, dead=is_dead)
+        trend = _classify_trend(slope * windows, slope_bound * windows, steps, dead=is_dead)
         falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
-        largest_rise = (slope + bound) * n
+        largest_rise = (slope + slope_bound) * windows
         may_stay = falls or largest_rise <= _LARGEST_CALM_RISE
         last_step = float(steps[-1])
         calm = may_stay and last_step <= _LARGEST_CALM_STEP

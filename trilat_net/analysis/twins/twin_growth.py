@@ -98,7 +98,8 @@ class PushGrowth(NamedTuple):
         ended_s: Time at which the twin ended before the run, in s, because the difference died
             down to the rounding errors or the twin diverged. None if the twin did not end
             early.
-        leads: True if the difference is largest at this joint at the end.
+        leads: True if the difference is largest at this joint at the end, or grows also when
+            all joints are taken together.
     """
 
     push: Push
@@ -122,9 +123,10 @@ def estimate_miss_probability(directions: int) -> float:
     Args:
         directions: Number of independent random directions.
     """
-    share = 1.0 / CLEAR_GROWTH
-    single = 2.0 * share / math.sqrt(2.0 * math.pi)
-    return math.pow(single, directions)
+    largest_missed_share = 1.0 / CLEAR_GROWTH
+    # probability that a standard normal number lies between - and + this share
+    miss_by_one_push = 2.0 * largest_missed_share / math.sqrt(2.0 * math.pi)
+    return math.pow(miss_by_one_push, directions)
 
 
 class RestDeparture(NamedTuple):
@@ -230,7 +232,11 @@ class TwinGrowth(NamedTuple):
 
     @property
     def _miss_text(self) -> str:
-        """A clause on the probability of missing a growth, if joints were not pushed singly."""
+        """A clause on how likely random pushes of all joints miss a growth, for the user.
+
+        Empty if each joint was pushed by itself.
+        """
+        # pushes of a single joint have no random direction
         directions = {push.push.direction for push in self.pushes if push.push.direction}
         if not directions:
             return ""
@@ -492,14 +498,11 @@ def judge_twins(
 
 
 def _find_varying_period_s(scenario: Scenario) -> float | None:
-    """Returns the period of delays that vary, in s, as it is at the end of a scenario.
+    """Returns the time after which varying delays repeat at the end of a scenario, in s.
 
-    Args:
-        scenario: The description of the experiment.
-
-    Returns:
-        The period, of all links and of the ticks of all sites. None if all delays are constant,
-        and if some delay never repeats.
+    Pushes are judged over whole periods, because they may grow in one part of a period and die
+    away in another. The period is that of all links and of the ticks of all sites. The result
+    is None if all delays are constant, or if some delay never repeats.
     """
     links = [find_final_link(scenario, name) for name in scenario.links]
     if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
@@ -508,12 +511,17 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
 
 
 def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
-    """Returns a later start of the part that counts, whose second half has whole periods.
+    """Moves the start of the part that counts so that its second half has whole periods.
+
+    Otherwise the judgement would depend on the part of the period in which the run ends.
 
     Args:
         counts_from_s: Start of the part that counts, in s.
         end_s: End of the part, in s.
         period_s: Period of the delays, in s. None if they are constant or never repeat.
+
+    Returns:
+        The later start, in s. It is unchanged if the second half is shorter than a period.
     """
     half_s = 0.5 * (end_s - counts_from_s)
     if period_s is None or period_s > half_s:
@@ -539,24 +547,28 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
         less than the logarithm of the largest velocity difference of a joint.
     """
     amplitude: Array = path.largest[:, group].max(axis=1)
-    leg_ends = [*path.pushed[1:], len(amplitude)]
-    for leg in map(slice, path.pushed, leg_ends):
-        if leg.stop - leg.start > 2:  # too short for a derivative otherwise
-            largest = amplitude[leg]
-            whole = _measure_leg(path.last[leg][:, group], path.scale[leg], largest)
-            larger = np.maximum(whole, largest)
-            amplitude[leg] = np.where(np.isfinite(whole), larger, largest)
+    interval_ends = [*path.pushed[1:], len(amplitude)]
+    for start, end in zip(path.pushed, interval_ends, strict=True):
+        if end - start <= 2:
+            continue  # too short for a time derivative
+        rows = slice(start, end)
+        largest = amplitude[rows]
+        differences = path.last[rows][:, group]
+        log_A = _measure_interval(differences, path.scale[rows], largest)
+        larger = np.maximum(log_A, largest)
+        amplitude[rows] = np.where(np.isfinite(log_A), larger, largest)
     return amplitude
 
 
-def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
-    """Returns log A of the differences between two pushes, as the module's docstring defines A.
+def _measure_interval(differences: Array, scale: Array, largest: Array) -> Array:
+    """Returns log A between two pushes, where A is the size of the effect of a push.
 
-    Twins store their differences scaled, because these may become too small or too large for
-    floating-point numbers. Therefore the differences are first scaled by their largest value.
+    The module's docstring defines A. Twins store their differences from the run scaled, because
+    these may become too small or too large for floating-point numbers. Therefore the
+    differences are first scaled by their largest value.
 
     Args:
-        last: Scaled differences of the joints, shape (K, n).
+        differences: Scaled velocity differences of the joints, shape (K, n).
         scale: Logarithm of the scale of each row, shape (K,).
         largest: Logarithm of the largest difference of a joint, shape (K,).
 
@@ -571,15 +583,19 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
     ):
         is_finite = np.isfinite(largest)
         peak = np.max(largest, where=is_finite, initial=-np.inf)
-        d = last * np.exp(scale - peak)[:, np.newaxis]
+        rescaling = np.exp(scale - peak)
+        d = differences * rescaling[:, np.newaxis]
         d_rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
 
-        # w is the ratio of d' to d over the whole leg. Each row is divided by the local size
-        # of the difference, so that the rows where the difference is large do not dominate.
-        size = np.exp(2.0 * (_running_maximum(largest) - peak))
-        is_weighted = np.isfinite(largest) & (size > 0.0)
-        weights = np.where(is_weighted, 1.0 / size, 0.0)[:, np.newaxis]
-        w_squared = float((weights * d_rate**2).sum() / (weights * d**2).sum())
+        # w is the ratio of d' to d over the whole interval. Each row is divided by the local
+        # size of the difference, so that rows with a large difference do not dominate.
+        log_local_size = _running_maximum(largest) - peak
+        local_size_squared = np.exp(2.0 * log_local_size)
+        is_weighted = np.isfinite(largest) & (local_size_squared > 0.0)
+        weights = np.where(is_weighted, 1.0 / local_size_squared, 0.0)[:, np.newaxis]
+        rate_sum = (weights * d_rate**2).sum()
+        difference_sum = (weights * d**2).sum()
+        w_squared = float(rate_sum / difference_sum)
 
         squares = (d**2 + d_rate**2 / w_squared).sum(axis=1)
         log_amplitude: Array = np.log(squares) / 2.0 + peak
@@ -587,7 +603,10 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
 
 
 def _running_maximum(values: Array) -> Array:
-    """Returns the maximum over half a second before and after each value, shape (K,)."""
+    """Returns the maximum over half a second before and after each value, shape (K,).
+
+    It removes the zero crossings of an oscillation.
+    """
     padded = np.pad(values, BUCKETS_PER_S // 2, constant_values=-np.inf)
     windows = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1)
     maximum: Array = windows.max(axis=1)
@@ -595,7 +614,7 @@ def _running_maximum(values: Array) -> Array:
 
 
 def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
-    """Returns the trend of an amplitude.
+    """Returns whether an amplitude grows, decays or stays, from its logarithm over time.
 
     Args:
         t_s: Times, shape (K,), in s.
@@ -605,11 +624,15 @@ def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
     Returns:
         The trend. Undecided with fewer than two finite values.
     """
-    known = np.isfinite(amplitude)
-    if known.sum() < 2:
+    is_finite = np.isfinite(amplitude)
+    if is_finite.sum() < 2:
         return EnvelopeFit(EnvelopeTrend.UNDECIDED, float("nan"))
-    scaled = np.exp(np.where(known, amplitude, -np.inf) - amplitude[known].max())
-    return fit_envelopes(t_s, scaled[:, np.newaxis], _AMPLITUDE_FLOOR, falls_first=True)[0]
+    # divided by the largest amplitude, so that the exponential cannot overflow
+    finite_log = np.where(is_finite, amplitude, -np.inf)
+    scaled_amplitude = np.exp(finite_log - amplitude[is_finite].max())
+    one_column = scaled_amplitude[:, np.newaxis]
+    (fit,) = fit_envelopes(t_s, one_column, _AMPLITUDE_FLOOR, falls_first=True)
+    return fit
 
 
 def _judge_push(
@@ -619,35 +642,37 @@ def _judge_push(
     part: slice,
     joint_names: Sequence[str],
 ) -> PushGrowth:
-    """Returns how a push developed. The group is set by the caller.
+    """Returns how the effect of a push developed over the judged part of a run.
 
-    A push that died down to the rounding errors was repeated. It is judged from its last
-    repetition on, if that is long enough ago.
+    A push whose effect died down to the rounding errors was repeated. It is judged from its
+    last repetition on, if that is long enough ago. The caller sets the group of the result.
 
     Args:
-        path: The twin's difference from its run.
+        path: The difference of the pushed repetition (twin) from the run.
         amplitude: Logarithm of the amplitude of the difference, shape (K,).
         joints: Indices of the joints that count.
-        part: Rows of the judged part, and of the part before it.
+        part: Rows whose second half is judged.
         joint_names: Names of all joints.
     """
     t_s = path.t_s
     first = part.start
     end = part.stop
     if not path.push.again:  # a push that is not repeated may have died, or left its limits
-        end = min(end, int(np.flatnonzero(np.isfinite(amplitude))[-1]) + 1)
-    leg_edges = [row for row in path.pushed if row < end]
-    last_push = leg_edges[-1]
+        finite_rows = np.flatnonzero(np.isfinite(amplitude))
+        end = min(end, int(finite_rows[-1]) + 1)
+    push_rows = [row for row in path.pushed if row < end]
+    last_push = push_rows[-1]
     last_second = slice(max(first, end - BUCKETS_PER_S), end)
     largest = path.largest[last_second, joints].max(axis=0)
     start = max(first, last_push)
     fit = _fit_trend(t_s[start:end], amplitude[start:end])
+    leading_joint = joints[int(largest.argmax())]
     growth = PushGrowth(
         push=path.push,
         trend=fit.trend,
         rate_per_s=fit.rate_per_s,
         factor=0.0,
-        joint=joint_names[joints[int(largest.argmax())]],
+        joint=joint_names[leading_joint],
         group=0,
         becomes_rad_s=_exp(float(largest.max())),
     )
@@ -657,13 +682,13 @@ def _judge_push(
         trend = EnvelopeTrend.GROWS if path.died is None else EnvelopeTrend.DECAYS
         return growth._replace(trend=trend, ended_s=float(t_s[end - 1]))
 
-    died_in_judged_part = len(leg_edges) > 1 and last_push > (first + end) // 2
+    died_in_judged_part = len(push_rows) > 1 and last_push > (first + end) // 2
     is_too_recent = end - last_push < (end - first) // 4
     if died_in_judged_part and (fit.trend is not EnvelopeTrend.GROWS or is_too_recent):
-        # The leg since the last repetition is too short to show the rate. Therefore the rate is
-        # that of the leg before, at the end of which the push had died.
-        before = slice(leg_edges[-2], last_push)
-        rate_per_s = _fit_trend(t_s[before], amplitude[before]).rate_per_s
+        # The time since the last repetition is too short to show the rate. Therefore the rate
+        # is that of the time before, at the end of which the effect of the push had died.
+        previous_interval = slice(push_rows[-2], last_push)
+        rate_per_s = _fit_trend(t_s[previous_interval], amplitude[previous_interval]).rate_per_s
         return growth._replace(trend=EnvelopeTrend.DECAYS, rate_per_s=rate_per_s)
 
     half_s = 0.5 * float(t_s[end - 1] - t_s[start])
@@ -691,26 +716,29 @@ def _judge_worst_joint(
     """
     worst = _judge_push(path, amplitude, joints, part, joint_names)
     leading_joint = worst.joint
+    grows_together = worst.trend is EnvelopeTrend.GROWS
     if len(joints) == 1 or worst.ended_s is not None:
         return worst
     for joint in joints:
         joint_amplitude = measure_amplitude(path, [joint])
-        actual = joint_amplitude - path.scale
-        joint_amplitude[actual < math.log(SMALLEST)] = -np.inf
-        last_second = joint_amplitude[max(part.start, part.stop - BUCKETS_PER_S) : part.stop]
+        unscaled_amplitude = joint_amplitude - path.scale
+        # a difference of the size of the rounding errors says nothing about the push
+        joint_amplitude[unscaled_amplitude < math.log(SMALLEST)] = -np.inf
+        last_start = max(part.start, part.stop - BUCKETS_PER_S)
+        last_second = joint_amplitude[last_start : part.stop]
         has_died = not np.isfinite(last_second).any()
         if has_died:
             continue
         growth = _judge_push(path, joint_amplitude, [joint], part, joint_names)
         stays = growth.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.GROWS)
         if stays and _rank_badness(growth) > _rank_badness(worst):
-            leads = growth.joint == leading_joint
+            leads = grows_together or growth.joint == leading_joint
             worst = growth._replace(leads=leads)
     return worst
 
 
 def _rank_badness(growth: PushGrowth) -> tuple[int, float]:
-    """Returns a key that orders pushes from the fastest decay to the fastest growth."""
+    """Returns a sort key that orders pushes from the fastest decay to the fastest growth."""
     return _TRENDS_FROM_BEST.index(growth.trend), growth.rate_per_s
 
 
@@ -725,11 +753,12 @@ def _find_departures(
     joints: Sequence[int],
     quiet: slice,
 ) -> Iterator[RestDeparture]:
-    """Yields the stretches of time in which a run departs from a rest by itself.
+    """Yields the spans of time in which a run moves away from a position of rest by itself.
 
-    The speed of the run and the differences from at least half of its twins must grow. Windows
-    of several lengths are tried, from the whole quiet part to a quarter of it. The second half
-    of each window is judged.
+    Such a motion shows that the position of rest is unstable. The speed of the run and the
+    differences from at least half of its pushed repetitions (twins) must grow. Windows of
+    several lengths are tried, from the whole undisturbed part to a quarter of it. The second
+    half of each window is judged.
 
     Args:
         twins: The run and its twins.
@@ -946,13 +975,14 @@ def _parse_push(text: str) -> tuple[str, float]:
     Raises:
         UsageError: The size is not a number.
     """
-    target, has_size, size = text.partition("=")
+    target, separator, size = text.partition("=")
     try:
-        return target.strip(), float(size) if has_size else PUSH_RAD
+        size_value = float(size) if separator else PUSH_RAD
     except ValueError:
         raise UsageError(
             f"--push {text}: its size is a number, as in m1.q1=1e-6, not {size!r}"
         ) from None
+    return target.strip(), size_value
 
 
 def _parse_sizes(text: str) -> list[float]:
@@ -967,7 +997,7 @@ def _parse_sizes(text: str) -> list[float]:
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
-        low = high = math.nan
+        low = high = math.nan  # refused by the comparison below
     if not LEAST_PUSH <= low < high / 9.99 <= MOST_PUSH / 9.99:
         allowed = f"from {LEAST_PUSH:g} to {MOST_PUSH:g}, a decade apart or more"
         raise UsageError(f"--delta is two sizes {allowed}, as in 1e-9:1e-3, not {text!r}")

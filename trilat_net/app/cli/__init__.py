@@ -116,16 +116,19 @@ class _Group(TyperGroup):
         is_known = name.startswith("-") or self.get_command(ctx, name) is not None
         if not name or is_known or ctx.resilient_parsing:
             return super().resolve_command(ctx, args)
-        word = "trilat" if ctx.parent is None else str(ctx.info_name)
-        group = word if ctx.parent is None else f"trilat {word}"
+
+        group_name = "trilat" if ctx.parent is None else str(ctx.info_name)
+        group_command = group_name if ctx.parent is None else f"trilat {group_name}"
         commands = self.list_commands(ctx)
-        suggested = _SYNONYMS.get(word, {}).get(name.casefold())
-        suggested = suggested or find_nearest(name, commands)
-        hint = f"did you mean {group} {suggested}?"
+        # A word that other programs use for the command is better than a similar name.
+        suggestion = _SYNONYMS.get(group_name, {}).get(name.casefold())
+        suggestion = suggestion or find_nearest(name, commands)
+
+        hint = f"did you mean {group_command} {suggestion}?"
         if ctx.parent is None and name.casefold() in _SUBJECTS:
             hint = _SUBJECTS[name.casefold()]
-        elif not suggested:
-            hint = f"{group} has the commands {', '.join(commands)}"
+        elif not suggestion:
+            hint = f"{group_command} has the commands {', '.join(commands)}"
         return ctx.fail(f"There is no command {name!r}; {hint}")
 
 
@@ -249,14 +252,18 @@ class _PackageCommand(TyperCommand):
         Raises:
             UsageError: The package of the command is not installed or cannot be imported.
         """
-        run = load_entry(COMMANDS, self._entry_name, f"trilat {self._command_line}")
-        if not hasattr(run, "examples"):
+        command_function = load_entry(
+            COMMANDS, self._entry_name, f"trilat {self._command_line}"
+        )
+        if not hasattr(command_function, "examples"):
             raise UsageError(
                 f"trilat {self._command_line} is no command: its function lacks the decorator "
                 "trilat_net.extension.command"
             )
+
+        # A group of its own makes Typer build the command, from which it is taken.
         group = typer.Typer(rich_markup_mode="rich", pretty_exceptions_enable=False)
-        _add_command(group, self._command_line, run)
+        _add_command(group, self._command_line, command_function)
         return typer.main.get_group(group).commands[str(self.name)]
 
     @_deferred
@@ -377,7 +384,7 @@ _GROUP_OPTIONS = {"set": "--session paper "}
 
 
 def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
-    """Adds a command to a group of commands.
+    """Adds a command to a group of commands, with its help and its examples.
 
     Args:
         group: The group.
@@ -387,14 +394,18 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
     examples = [
         f"Example: trilat {command_line} {example}".rstrip() for example in run.examples
     ]
-    text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
+    help_text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
     # One line per paragraph, because the help keeps line breaks.
-    paragraphs = inspect.cleandoc(text).split("\n\n")
-    text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    paragraphs = inspect.cleandoc(help_text).split("\n\n")
+    help_text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
     name = command_line.split()[-1]
     epilog = "\n\n".join([*examples, f"Docs: {run.page}"])
     panel = _find_panel(command_line) if group is app else None
-    declare = group.command(name, cls=_Command, help=text, epilog=epilog, rich_help_panel=panel)
+
+    declare = group.command(
+        name, cls=_Command, help=help_text, epilog=epilog, rich_help_panel=panel
+    )
     declare(options.expand_option_tuples(run))
 
 
@@ -410,22 +421,27 @@ def _add_commands() -> None:
     is that of a group, the command belongs to that group: `log_info_command` is `trilat log
     info`.
     """
-    groups = {
-        name: typer.Typer(cls=_Group, no_args_is_help=True, **settings)
-        for name, settings in _GROUPS.items()
-    }
+    groups = {}
+    for name, settings in _GROUPS.items():
+        groups[name] = typer.Typer(cls=_Group, no_args_is_help=True, **settings)
+
     for file in pkgutil.iter_modules(__path__):
         module = import_module(f"{__name__}.{file.name}")
         for function_name, run in vars(module).items():
-            if not hasattr(run, "examples"):
+            is_command = hasattr(run, "examples")  # an attribute that `options.command` sets
+            if not is_command:
                 continue
+
             command = function_name.removesuffix("_command").replace("_", "-")
-            first, _, rest = command.partition("-")
-            if first in groups:
-                group_options = _GROUP_OPTIONS.get(first, "")
-                _add_command(groups[first], f"{first} {group_options}{rest}", run)
+            first_word, _, other_words = command.partition("-")
+            if first_word in groups:
+                group_options = _GROUP_OPTIONS.get(first_word, "")
+                _add_command(
+                    groups[first_word], f"{first_word} {group_options}{other_words}", run
+                )
             else:
                 _add_command(app, command, run)
+
     for name, group in groups.items():
         app.add_typer(group, name=name, rich_help_panel=_find_panel(name))
 
@@ -446,17 +462,17 @@ _MEMORY_ERRORS = (
 
 
 def _run() -> None:
-    """Runs `trilat`.
+    """Runs `trilat`, and names the remedy if a library is missing.
 
-    If a library is missing that an installation may lack, the error names the remedy.
+    An installation may lack libraries that only some commands need.
     """
     try:
         app()
     except ModuleNotFoundError as error:
-        library = (error.name or "").partition(".")[0]
-        if library in STUDY_LIBRARIES:
-            require_libraries(library)  # raises the error that names the remedy
-        if library in EXTRAS:
+        missing_library = (error.name or "").partition(".")[0]
+        if missing_library in STUDY_LIBRARIES:
+            require_libraries(missing_library)  # raises the error that names the remedy
+        if missing_library in EXTRAS:
             problem = describe_missing_library("this command", error)
             raise UsageError(problem) from None
         raise
@@ -484,14 +500,14 @@ def main() -> None:
 
 
 def _report_system_error(error: Exception) -> int:
-    """Prints an error of the operating system.
+    """Prints an error of the operating system, such as a full disk, as a sentence for the user.
 
     Args:
         error: The error that ended the command.
 
     Returns:
-        The exit code. It is 0 if the program that reads the output has ended, as in
-        `trilat ... | head`.
+        The exit code. It is 0 if the program that reads the output has ended, as in `trilat ...
+        | head`.
 
     Raises:
         Exception: The error itself, if it is a bug of this program.

@@ -30,21 +30,21 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
 
     scenarios = {name: load_scenario(name) for name in list_shipped()}
     if as_json:
-        entries = [
-            {
+        entries = []
+        for name, scenario in scenarios.items():
+            entry = {
                 "name": name,
                 "sites": scenario.names,
                 "duration_s": scenario.duration_s,
                 "title": scenario.title,
             }
-            for name, scenario in scenarios.items()
-        ]
+            entries.append(entry)
         return terminal.print_json(entries)
 
-    rows = [
-        (name, str(len(scenario.names)), f"{scenario.duration_s:g} s", scenario.title)
-        for name, scenario in scenarios.items()
-    ]
+    rows = []
+    for name, scenario in scenarios.items():
+        site_count = str(len(scenario.names))
+        rows.append((name, site_count, f"{scenario.duration_s:g} s", scenario.title))
     columns = ("name", "sites", "time", "what it is")
     return terminal.print_table(TextTable(columns, rows, align="lrrl"))
 
@@ -120,6 +120,9 @@ def scenario_new_command(
 def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[str]) -> None:
     """Prints which files were written for a new law, hand or plant, and how to run it.
 
+    A skeleton is a working example that a user changes: a control law, a program that acts as
+    an operator (hand), or a model of an arm (plant).
+
     Args:
         kind: "law", "hand" or "plant".
         written: Path of the file, and path of its test.
@@ -129,17 +132,20 @@ def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[s
     """
     from ...scenario import name_skeleton_class
 
-    file, test = written
-    code = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
+    file, test_file = written
+    class_path = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
     change_folder = "" if file.parent == Path() else f"cd {file.parent}, and "
     terminal.print_text(
-        f"{file}: a {kind} that works; {test.name}: its test. "
+        f"{file}: a {kind} that works; {test_file.name}: its test. "
         f"Change the {kind}, {change_folder}run"
     )
-    terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
-    for check in checks:
-        terminal.print_text(f"  trilat {check.format(log=f'{file.stem}.mcap', file=file.name)}")
-    terminal.print_text(f"  python -m pytest {test.name}   (python -m pip install pytest)")
+
+    log_name = f"{file.stem}.mcap"
+    terminal.print_text(f"  trilat sim paper --set {key.format(class_path)} -o {log_name}")
+    for command in checks:
+        command_line = command.format(log=log_name, file=file.name)
+        terminal.print_text(f"  trilat {command_line}")
+    terminal.print_text(f"  python -m pytest {test_file.name}   (python -m pip install pytest)")
 
 
 @options.command("mylaw.py", page="docs/extend/own-controller.md")
@@ -215,8 +221,8 @@ def trace_import_command(
     """
     from ...scenario import import_trace
 
-    name = file.name.split(".")[0]
-    path = out if out is not None else Path(f"{name}-trace.csv")
+    stem = file.name.split(".")[0]
+    path = out if out is not None else Path(f"{stem}-trace.csv")
     refuse_existing(path, force=force)
     trace = import_trace(file, form, way=way, column=column, every_s=every_s)
     write_whole(path, trace.write_rows())
@@ -299,11 +305,12 @@ def keys_add_command(
     """
     from ...net import MEMBERS, add_keys
 
-    added = add_keys(folder, members, hosts or (), days)
-    for member_folder in added:
+    new_folders = add_keys(folder, members, hosts or (), days)
+    for member_folder in new_folders:
         terminal.print_line(f"{member_folder}: for {member_folder.name}; copy the folder")
+    # The other members need the new list of all members.
     for path in sorted(folder.glob(f"*/{MEMBERS}")):
-        if path.parent not in added:
+        if path.parent not in new_folders:
             terminal.print_line(f"{path}: for {path.parent.name}; copy this file")
     terminal.print_line(f"the new keys are valid for {count_nouns(days, 'day')}")
 
@@ -366,6 +373,7 @@ def keys_info_command(
 
     if rules and as_json:
         raise UsageError("--rules and --json cannot be combined: --json contains the rules")
+
     keys = read_member_keys(folder)
     if as_json:
         description = {
@@ -376,15 +384,19 @@ def keys_info_command(
             "zenoh": keys.settings,
         }
         return terminal.print_json(description)
+
     if rules:
         return terminal.print_json(keys.settings)
-    kind = "" if keys.member in {*ROLES, ROUTER} else "site "
-    others = [member for member in keys.members if member != keys.member]
-    days = (keys.ends - datetime.now(UTC)).days
+
+    kind_prefix = "" if keys.member in {*ROLES, ROUTER} else "site "
+    other_members = [member for member in keys.members if member != keys.member]
+    others_text = ", ".join(other_members)
+    days_left = (keys.ends - datetime.now(UTC)).days
+    days_text = count_nouns(days_left, "day")
     terminal.print_texts(
         [
-            f"{folder}: keys of {kind}{keys.member}, for a session with {', '.join(others)}",
-            f"valid until {keys.ends:%Y-%m-%d %H:%M} UTC, {count_nouns(days, 'day')} from now",
+            f"{folder}: keys of {kind_prefix}{keys.member}, for a session with {others_text}",
+            f"valid until {keys.ends:%Y-%m-%d %H:%M} UTC, {days_text} from now",
             f"others may reach it at: {', '.join(keys.hosts)}",
             *describe_role(keys.member),
             f"all rules: trilat keys info {shlex.quote(str(folder))} --rules",

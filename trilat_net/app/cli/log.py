@@ -174,9 +174,12 @@ def log_export_command(
     with terminal.progress_bar(f"writing {exporter.path}") as progress:
         summary = exporter.export(*logs, progress=progress)
 
-    records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
+    records = {}
+    for site in logs[0].sites:
+        records[site] = sum(len(log[site]) for log in logs)
     if not summary:
-        summary = f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
+        total_text = count_nouns(sum(records.values()), "record")
+        summary = f"{total_text} of {', '.join(records)}"
     if as_json:
         terminal.print_json(
             {"file": exporter.path.as_posix(), "format": form, "records": records}
@@ -244,11 +247,11 @@ def log_view_command(
     needs_rerun = full or web or save
     if not needs_rerun and find_spec("rerun") is None:
         return _open_page(files)
-    with stage_output(save, force=force) if save is not None else nullcontext() as staged:
+    with stage_output(save, force=force) if save is not None else nullcontext() as output_path:
         open_rerun(
             files,
             lambda: terminal.open_with_progress(*files),
-            ViewerOptions(full=full, web=web, save=staged),
+            ViewerOptions(full=full, web=web, save=output_path),
             terminal.print_text,
         )
     if save is not None:
@@ -300,6 +303,7 @@ def _open_page(files: list[Path]) -> None:
     terminal.print_note(
         f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"
     )
+
     folder = choose_report_folder(files[0])
     refuse_link(folder)
     page = folder / "report.html"

@@ -106,15 +106,15 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Checks the sites without which a session may begin.
+    """Returns the sites without which a session may begin, after checking them.
+
+    Sites that join later are permitted only if the arms glide back to each other after a break.
+    Only the first site decides about the start of a session.
 
     Args:
         scenario: The scenario of the session.
         name: Name of this site.
         without: Names of the sites that may join later, from --without.
-
-    Returns:
-        The names in `without`.
 
     Raises:
         UsageError: This site is not the first one, or the scenario does not let sites join
@@ -248,7 +248,7 @@ def record_command(
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Chooses the path of the log of a session, and makes the folder of its report.
+    """Returns the path of a session's log, and creates the folder for the log and its report.
 
     Args:
         output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
@@ -261,17 +261,18 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
     if not concluded:
         return output if output is not None else Path(f"{session}.mcap")
     require_libraries()
+
     if output is None:
         return make_results_folder(None, session, force=False) / "run.mcap"
     make_folder(output.parent)
     return output
 
 
-def _conclude(parts: list[Path], *, png: bool) -> None:
-    """Verifies a finished log, and writes its report into the folder of the log.
+def _conclude(files: list[Path], *, png: bool) -> None:
+    """Checks a finished log, and writes its report into the folder of the log.
 
     Args:
-        parts: Paths of all parts of the log.
+        files: Paths of all files into which the log was split.
         png: True to write every figure as a PNG file too.
 
     Raises:
@@ -281,18 +282,20 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
     """
     from ...presentation import conclude_files
 
-    log, conclusion = conclude_files(parts, parts[0].parent, png=png)
+    log, conclusion = conclude_files(files, files[0].parent, png=png)
+
     if conclusion.exit_code == CodeWithheld.exit_code:
         raise CodeWithheld(
-            f"{parts[0]}: parts of this log were not checked, because code that the log names "
+            f"{files[0]}: parts of this log were not checked, because code that the log names "
             "may not run; check them with: trilat verify --law FILE"
         )
 
     if not conclusion.passed:
-        raise RunFailed(f"{parts[0]}: failed a check")
+        raise RunFailed(f"{files[0]}: failed a check")
+
     for event in log.events:
         if event.kind in ("diverged", "failed"):
-            raise RunFailed(f"{parts[0]}: {event.text}")
+            raise RunFailed(f"{files[0]}: {event.text}")
 
 
 @options.command("run.mcap --rate 2 --start 5", page="docs/logs/replay.md")
@@ -421,7 +424,9 @@ def replay_command(
 def _announce_playback(
     header: "SessionHeader", name: str, rate: float, print_line: Callable[[str], None]
 ) -> None:
-    """Prints which session a replay opens, how fast it plays, and if its messages are of today.
+    """Prints which sites of a log are replayed, as which session, and how fast.
+
+    A note warns if the messages have another version than those of this program.
 
     Args:
         header: Description of the recorded session.
@@ -431,9 +436,9 @@ def _announce_playback(
     """
     from ...net import VERSION
 
-    speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
+    speed_text = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
     sites = ", ".join(header.boots)
-    print_line(f"playing {sites} as session {name}, {speed}; Ctrl-C ends it")
+    print_line(f"playing {sites} as session {name}, {speed_text}; Ctrl-C ends it")
     if header.version != VERSION:
         print_line(
             f"note: these messages are of schema version {header.version}: recorders and sites "
@@ -454,8 +459,8 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
     """
     if not terminal.err.is_interactive:
         return lambda _: None
-    last_now_ns: int | None = None
-    last_position_ns = 0
+    shown_at_ns: int | None = None
+    shown_position_ns = 0
 
     def show(progress: "PlayProgress") -> None:
         """Overwrites the line of the terminal with the present progress of playing a log.
@@ -463,16 +468,17 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
         The line shows the position in the log, the speed since the last line ("x1.00" is real
         time), the number of published messages, and their largest lateness.
         """
-        nonlocal last_now_ns, last_position_ns
+        nonlocal shown_at_ns, shown_position_ns
         now_ns = clock.monotonic_ns()
         position_ns = progress.position_ns
-        rate = 0.0
-        if last_now_ns is not None and now_ns > last_now_ns:
-            rate = (position_ns - last_position_ns) / (now_ns - last_now_ns)
-        last_now_ns = now_ns
-        last_position_ns = position_ns
+        speed = 0.0
+        if shown_at_ns is not None and now_ns > shown_at_ns:
+            speed = (position_ns - shown_position_ns) / (now_ns - shown_at_ns)
+        shown_at_ns = now_ns
+        shown_position_ns = position_ns
+
         text = (
-            f"{position_ns / 1e9:8.1f} s   x{rate:.2f}   "
+            f"{position_ns / 1e9:8.1f} s   x{speed:.2f}   "
             f"{count_nouns(progress.published, 'message')}   "
             f"latest {progress.late_max_us / 1e3:.2f} ms late"
         )
@@ -540,27 +546,30 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
     terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
 
     messages = count_nouns(sum(outcome.counts.values()), "message")
-    text = f"{messages} in {outcome.took_s:.2f} s"
+    summary = f"{messages} in {outcome.took_s:.2f} s"
     if outcome.rounds > 1:
-        text += f", {count_nouns(outcome.rounds, 'round')}"
-    late = outcome.lateness
-    if late:
-        text += f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us"
+        summary += f", {count_nouns(outcome.rounds, 'round')}"
+    lateness = outcome.lateness
+    if lateness:
+        summary += (
+            f"; late by p50 {lateness.p50_us} us, p99 {lateness.p99_us} us, "
+            f"max {lateness.max_us} us"
+        )
     if outcome.held_s > 0.1:
-        text += f"; waited {outcome.held_s:.2f} s for slow subscribers"
+        summary += f"; waited {outcome.held_s:.2f} s for slow subscribers"
     if not outcome.cut:
-        text += "; none dropped"
-    terminal.print_text(text)
+        summary += "; none dropped"
+    terminal.print_text(summary)
 
     if outcome.recorders:
-        stored = "has not confirmed that it has everything"
+        stored_text = "has not confirmed that it has everything"
         if outcome.stored:
-            stored = "has everything"
-        resent = ""
+            stored_text = "has everything"
+        resent_text = ""
         if outcome.refilled:
-            missed = count_nouns(outcome.refilled, "message")
-            resent = f"; {missed} that it had missed were sent again"
-        terminal.print_text(f"the recorder {stored}{resent}")
+            missed_text = count_nouns(outcome.refilled, "message")
+            resent_text = f"; {missed_text} that it had missed were sent again"
+        terminal.print_text(f"the recorder {stored_text}{resent_text}")
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
@@ -577,15 +586,17 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 
 
 def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
-    """Warns of everything in a replay that was not as recorded.
+    """Warns the user of everything in a replay that differed from the recording.
 
-    This may be torn files, subscribers that were cut off, or messages that were played late.
+    There may be damaged files, receivers that were disconnected because they were too slow, and
+    messages that were played late.
 
     Args:
         outcome: Outcome of the replay.
-        reported: Torn files of which the user has been warned already.
+        reported: Damaged files of which the user has been warned already.
     """
-    _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
+    new_problems = {path: text for path, text in outcome.torn.items() if path not in reported}
+    _warn_torn(new_problems)
     if outcome.cut:
         terminal.print_error(
             "a subscriber received nothing for 5 s and was cut off, "
@@ -684,7 +695,7 @@ def _print_router_line(text: str) -> None:
 
 
 def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Parses an option of a command that limits the parts of a log.
+    """Returns the limit at which a log is split into parts, from an option like --split-size.
 
     Args:
         option: Name of the option, for the error message.

@@ -106,9 +106,8 @@ _OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
 def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], Runs]:
     """Returns a decorator that declares a function as a command of the program.
 
-    The docstring of the function is the help of the command. The help of options that is too
-    long for their declaration is in the section `Options` of the docstring, with an entry for
-    each parameter.
+    The docstring of the function is the help of the command. Its section `Options` has the help
+    of those options for which the declaration has no room.
 
     Args:
         examples: Arguments of the examples that the help shows.
@@ -130,10 +129,12 @@ def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], 
         """
         run.examples = examples  # type: ignore[attr-defined]
         run.page = page  # type: ignore[attr-defined]
+
         docstring = inspect.getdoc(run) or ""
         command_help, _, option_entries = docstring.partition("\n\nOptions:\n")
         run.__doc__ = command_help or None
         for parameter, text in _OPTION_ENTRY.findall(option_entries):
+            # The declaration of an option is the first argument of `Annotated` behind the type.
             option = run.__annotations__[parameter].__metadata__[0]
             option.help = " ".join(text.split())
         return run
@@ -155,7 +156,7 @@ def list_laws() -> list[str]:
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Lists the scenarios with which a shell may complete a word.
+    """Returns the scenarios with which a shell may complete the word that a user types.
 
     They are the shipped scenarios, and the TOML files of a folder.
 
@@ -163,11 +164,17 @@ def complete_scenarios(incomplete: str) -> list[str]:
         incomplete: The word so far. If it has a slash, files of its folder are listed,
             otherwise files of the current folder.
     """
-    shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
-    names = [name for name in shipped if "." not in name and not name.startswith("_")]
+    candidates = []
+    for entry in _SCENARIOS.iterdir():
+        name = entry.name.removesuffix(".toml")
+        is_scenario = "." not in name and not name.startswith("_")
+        if is_scenario:
+            candidates.append(name)
+
     folder = Path(incomplete).parent if "/" in incomplete else Path()
-    files = [str(path) for path in folder.glob("*.toml")] if folder.is_dir() else []
-    return sorted(name for name in [*names, *files] if name.startswith(incomplete))
+    if folder.is_dir():
+        candidates += [str(path) for path in folder.glob("*.toml")]
+    return sorted(name for name in candidates if name.startswith(incomplete))
 
 
 def complete_figures(incomplete: str) -> list[str]:
@@ -182,7 +189,7 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Lists the sites with which a shell may complete a word of the command line.
+    """Returns the names of arms (sites) with which a shell may complete the word of a user.
 
     Args:
         context: The command line, whose scenario or log has the sites.
@@ -198,6 +205,7 @@ def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
     # Arguments in front of an option without a value are not parsed yet.
     if "files" in context.params and not files:
         files = [Path(argument) for argument in context.args]
+
     try:
         if files:
             names = open_log(*files).sites
@@ -292,23 +300,27 @@ def find_split_setting(args: Sequence[str]) -> str:
     for index, argument in enumerate(args[:-1]):
         if argument != "--set":
             continue
-        setting, *others = args[index + 1 :]
-        key, _, first = setting.partition("=")
+        setting, *other_arguments = args[index + 1 :]
+
+        key, _, first_value = setting.partition("=")
         prefix = f"{key}="
-        parts = [first]
-        for other in others:
-            if not other.startswith(prefix):
+        values = [first_value]
+        for next_argument in other_arguments:
+            if not next_argument.startswith(prefix):
                 break
-            parts.append(other.removeprefix(prefix))
-        if len(parts) > 1:
-            is_table = all("=" in part for part in parts)
+            values.append(next_argument.removeprefix(prefix))
+
+        if len(values) > 1:  # the shell has expanded braces
+            is_table = all("=" in entry for entry in values)
             opening = "{" if is_table else "["
-            return f"{prefix}{opening}{','.join(parts)}{_BRACKETS[opening]}"
-        closing = _BRACKETS.get(first[:1], "")
-        if closing and closing not in first:
-            for count, other in enumerate(others, 1):
-                if closing in other:
-                    return " ".join([setting, *others[:count]])
+            return f"{prefix}{opening}{','.join(values)}{_BRACKETS[opening]}"
+
+        # The value begins with a bracket that is closed in a later argument.
+        closing = _BRACKETS.get(first_value[:1], "")
+        if closing and closing not in first_value:
+            for count, next_argument in enumerate(other_arguments, 1):
+                if closing in next_argument:
+                    return " ".join([setting, *other_arguments[:count]])
     return ""
 
 
@@ -324,12 +336,15 @@ def check_session_name(name: str) -> str:
     Raises:
         UsageError: The name is too long or has other characters.
     """
-    if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
+    has_valid_characters = re.fullmatch("[A-Za-z0-9_.-]+", name)
+    if len(name) > MOST_LETTERS or not has_valid_characters:
         # Letters of other alphabets may look like those of ASCII.
-        letters = "" if name.isascii() else "; only the letters a to z and A to Z are allowed"
+        alphabet_note = (
+            "" if name.isascii() else "; only the letters a to z and A to Z are allowed"
+        )
         raise UsageError(
             f"a session's name must have 1 to {MOST_LETTERS} characters (letters, digits, _, - "
-            f"and .), not {ascii(name)[:80]}{letters}"
+            f"and .), not {ascii(name)[:80]}{alphabet_note}"
         )
     return name
 
@@ -476,6 +491,7 @@ def print_and_draw(
         module = import_module(f"trilat_net.presentation.figures.{module_name}")
         draw = getattr(module, function_name)
         write_figure(draw(drawn), picture, REPORT_DPI)
+
     terminal.print_result(result, as_json=as_json)
     if picture is not None and not as_json:
         terminal.print_paths([picture])
@@ -502,7 +518,9 @@ def load_chosen_scenario(
 def _refuse_double_setting(
     overrides: list[str] | None, key: str, option: str, given: float | None
 ) -> None:
-    """Checks that the user does not set a key of the scenario in two ways.
+    """Refuses a setting of the scenario that the user has given in two ways.
+
+    For example, --duration 5 and --set duration_s=10 contradict each other.
 
     Args:
         overrides: Texts of --set. None if the option is absent.
@@ -529,6 +547,8 @@ def _find_key(override: str) -> str:
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
     """Returns the changes of the scenario that --set and --duration ask for, in this order.
+
+    An experiment is changed in this way without editing its file.
 
     Args:
         overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
@@ -561,12 +581,12 @@ def list_used_options(context: typer.Context) -> list[str]:
     Returns:
         The first name of each, for example "--seed", in the order of declaration.
     """
-    used = []
+    used_options = []
     for param in context.command.params:
         source = context.get_parameter_source(param.name or "")
         if source and source.name == "COMMANDLINE":
-            used.append(param.opts[0])
-    return used
+            used_options.append(param.opts[0])
+    return used_options
 
 
 class MemberOptions(NamedTuple):
@@ -587,6 +607,9 @@ class MemberOptions(NamedTuple):
         self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
     ) -> "Connection":
         """Returns the network addresses that the options state, without encryption keys.
+
+        The network library Zenoh connects processes by such addresses, for example
+        "tcp/192.168.0.5:7447".
 
         Args:
             listen_else: Addresses at which to listen if the options state none.
@@ -697,7 +720,7 @@ class LawFiles(NamedTuple):
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
         """Opens a log, and warns the user if code from another person will be executed.
 
-        A log may name files with control laws. They are executed if the run is repeated.
+        A log may name files with control laws, which are executed if the run is repeated.
 
         Args:
             *files: The log, or the files into which it is divided.
@@ -729,7 +752,7 @@ class RunOptions(NamedTuple):
     as_json: JsonOption = False
 
     def load(self, source: str, longest_s: float | None = None) -> "Scenario":
-        """Returns the scenario of the run.
+        """Returns the scenario of the run, with the changes that the options ask for.
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
@@ -737,8 +760,10 @@ class RunOptions(NamedTuple):
                 scenario.
         """
         duration_s = self.duration
-        is_set = any(_find_key(text) == "duration_s" for text in self.overrides or ())
-        if duration_s is None and not is_set:
+        is_duration_overridden = any(
+            _find_key(text) == "duration_s" for text in self.overrides or ()
+        )
+        if duration_s is None and not is_duration_overridden:
             duration_s = longest_s
         return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
 
@@ -759,11 +784,11 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
         The function with one parameter per option.
     """
     declared = inspect.signature(run).parameters
-    tuples = {
-        name: parameter.annotation
-        for name, parameter in declared.items()
-        if hasattr(parameter.annotation, "_fields")
-    }
+    tuples = {}
+    for name, parameter in declared.items():
+        is_tuple = hasattr(parameter.annotation, "_fields")
+        if is_tuple:
+            tuples[name] = parameter.annotation
 
     parameters = []
     for name, parameter in declared.items():

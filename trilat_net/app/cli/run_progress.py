@@ -77,7 +77,7 @@ def show_progress(
 
 
 def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, with its results in a new folder.
+    """Runs a scenario live, with its results in a new folder, for commands with several runs.
 
     Args:
         scenario: The scenario.

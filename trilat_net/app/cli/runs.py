@@ -88,8 +88,8 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {_describe_length(chosen, path)}")
-        files = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
-        report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(files))}"
+        permissions = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
+        report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(permissions))}"
         terminal.print_text(f"next: {report}")
 
     for failure in open_log(path).failed_hands:
@@ -106,7 +106,9 @@ def sim_command(
 
 
 def _describe_length(scenario: "Scenario", path: Path) -> str:
-    """Returns how long a simulated run is and which sites it has, as a phrase.
+    """Returns how long a simulated run is and which arms (sites) it has, as a phrase.
+
+    A run that diverged is shorter than planned, and the phrase says so.
 
     Args:
         scenario: Scenario of the run.
@@ -389,7 +391,7 @@ def figure_command(
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints all figures, and for each that the log cannot have the reason.
+    """Prints the names of all figures. Figures that a log cannot have follow with the reason.
 
     Args:
         log: The log.
@@ -400,10 +402,10 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
     # The reason is empty if the log has what the figure needs.
     reasons = {name: figure.absent(log) for name, figure in FIGURES.items()}
     if as_json:
-        rows = [
-            {"name": name, "about": FIGURES[name].about, "absent": reason or None}
-            for name, reason in reasons.items()
-        ]
+        rows = []
+        for name, reason in reasons.items():
+            row = {"name": name, "about": FIGURES[name].about, "absent": reason or None}
+            rows.append(row)
         terminal.print_json(rows)
         return
 

@@ -61,6 +61,9 @@ class _SessionPage(Protocol):
 def _describe_log(path: Path) -> str:
     """Returns what the log of an interrupted session contains, as the end of a sentence.
 
+    For example ": 1200 records, 0 missing". The text tells the user whether the log is worth
+    keeping.
+
     Args:
         path: The log.
 
@@ -109,10 +112,10 @@ def run_and_report(
     # With a page, an interruption is the normal end of a session, and its log is verified.
     ends_without_report = outcome.interrupted and not (page and has_log)
     if ends_without_report:
-        contents = ""
+        log_note = ""
         if has_log:
-            contents = f"; {outcome.log} holds the records so far{_describe_log(outcome.log)}"
-        terminal.err.print(f"interrupted{contents}", markup=False, soft_wrap=True)
+            log_note = f"; {outcome.log} holds the records so far{_describe_log(outcome.log)}"
+        terminal.err.print(f"interrupted{log_note}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
     if not has_log:
         raise typer.Exit(outcome.exit_code)
@@ -265,6 +268,9 @@ _OPTIONS_WITH_MODE = {
 def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
     """Refuses options that do not belong to the selected mode of `trilat ping`.
 
+    The command has modes for sessions, for ROS 2 topics and for benchmarks. An option of
+    another mode would have no effect.
+
     Args:
         context: The command line.
         mode: The option that selects the mode, as in "--benchmark". Empty for the normal mode,
@@ -273,12 +279,12 @@ def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
     Raises:
         UsageError: An option belongs to another mode.
     """
-    used = set(options.list_used_options(context))
+    used_options = set(options.list_used_options(context))
     if mode:
-        refused = sorted(used - _MODE_OPTIONS[mode])
+        refused = sorted(used_options - _MODE_OPTIONS[mode])
         reason = f"cannot be used with {mode}"
     else:
-        refused = sorted(used & _OPTIONS_WITH_MODE)
+        refused = sorted(used_options & _OPTIONS_WITH_MODE)
         reason = "can be used only with --benchmark, --answer or --ros2"
     if refused:
         raise UsageError(f"{refused[0]}: {reason}")
@@ -311,8 +317,8 @@ def _benchmark(
     options.check_picture(picture, force=force)
     from trilat_net.app.network_benchmark import DEFAULT_S, ping_benchmark
 
-    measured = "the network" if reach.connect else "this machine alone, without --connect"
-    with terminal.progress_lines(f"measuring {measured}, for {seconds or DEFAULT_S:g} s"):
+    subject = "the network" if reach.connect else "this machine alone, without --connect"
+    with terminal.progress_lines(f"measuring {subject}, for {seconds or DEFAULT_S:g} s"):
         result = ping_benchmark(
             scenario,
             overrides or [],
@@ -320,6 +326,7 @@ def _benchmark(
             connect=reach.connect,
             keys=reach.keys,
         )
+
     figure = "linear_figures:draw_network_delays"
     options.print_and_draw(result, picture, figure, result.to_dict(), as_json=as_json)
     if not result.good:
@@ -355,6 +362,7 @@ def _ping_topic(
         )
     except RouterSilent as silent:
         raise RouterSilent(f"{silent}; {ROUTER_ADVICE}") from None
+
     with graph, Interrupt() as interrupt:
         measurement = ping_topic(
             graph=graph,
@@ -363,6 +371,7 @@ def _ping_topic(
             lasts_s=lasts_s,
             stopped=interrupt.is_requested,
         )
+
     terminal.print_result(measurement, as_json=as_json)
 
 
@@ -370,6 +379,8 @@ def _run_far_end(
     endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
 ) -> None:
     """Replies to benchmarks from other machines, for a time or until Ctrl-C.
+
+    This is the counterpart of `trilat ping --benchmark`: it sends every message back at once.
 
     Args:
         endpoints: Endpoints at which to listen.
@@ -403,6 +414,8 @@ SitesArgument = Annotated[
 
 def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
     """Prepares the connection to a running session.
+
+    The commands `trilat stop`, `set` and others send their requests over it.
 
     Args:
         session: Name of the session.
@@ -482,11 +495,12 @@ def _parse_milliseconds(text: str) -> float:
     Raises:
         UsageError: The text is not a number with a unit.
     """
-    match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())
+    match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())  # number and unit
     try:
         if match:
             return float(match[1]) * _UNITS[match[2]]
     except ValueError:
+        # The pattern also matches texts such as "..5", which are no numbers.
         pass
     raise UsageError(f"a time must be a number with a unit, as in 350ms or 0.35s, not {text!r}")
 
@@ -503,7 +517,8 @@ def _parse_share(text: str) -> float:
     number = text.strip().removesuffix("%")
     is_percentage = number != text.strip()
     try:
-        return float(number) / (100.0 if is_percentage else 1.0)
+        divisor = 100.0 if is_percentage else 1.0
+        return float(number) / divisor
     except ValueError:
         raise UsageError(
             f"a share must be a number or a percentage, as in 0.05 or 5%, not {text!r}"
@@ -511,7 +526,9 @@ def _parse_share(text: str) -> float:
 
 
 def _parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
-    """Parses texts KEY=VALUE, in which a value is TOML or a bare word.
+    """Parses the changes of settings that a user has written as KEY=VALUE.
+
+    A value is TOML or a bare word, as in model=gamma.
 
     Args:
         texts: The texts.
@@ -638,6 +655,7 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     check_finite(change, "")  # messages cannot hold infinite numbers
     if session is None:
         raise UsageError("the session is not named: use trilat set --session ID ...")
+
     reply = RunningSession(session, connection).change(site, ChangeRequest(**change))
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")

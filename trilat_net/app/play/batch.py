@@ -69,13 +69,15 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
     due_ns = times_ns.copy()
     positions = indices.copy()
     for channel in np.unique(channels):
-        members = np.flatnonzero(channels == channel)
-        by_number = np.argsort(numbers[members], kind="stable")
-        members = members[by_number]
+        of_channel = np.flatnonzero(channels == channel)
+        by_number = np.argsort(numbers[of_channel], kind="stable")
+        of_channel = of_channel[by_number]
+
         # No message is played after the next message of its channel: neither at a later time,
         # nor at a later position among messages with the same time.
-        due_ns[members] = _limit_by_later(times_ns[members])
-        positions[members] = _limit_by_later(indices[members])
+        due_ns[of_channel] = _limit_by_later(times_ns[of_channel])
+        positions[of_channel] = _limit_by_later(indices[of_channel])
+
     # The last key of np.lexsort is the most important one.
     order = np.lexsort((numbers, positions, due_ns)).astype(np.int64)
     return order, due_ns[order]
@@ -189,6 +191,7 @@ class MessageBatch:
         payload_ends = np.cumsum(self._sizes)
         piece_numbers = payload_ends // size
         first_rows = np.flatnonzero(np.diff(piece_numbers)) + 1
+        # Row indices at which pieces begin and end.
         edges = [0, *first_rows.tolist(), len(self)]
         for start, end in pairwise(edges):
             if end > start:
@@ -200,9 +203,10 @@ class MessageBatch:
         A batch may be a small part of a large buffer, which stays in memory as long as the
         batch. The copy frees the large buffer.
         """
-        view = memoryview(self.data)
-        spans = self.rows[:, _START:].tolist()
-        payloads = [view[start:end] for start, end in spans]
+        buffer = memoryview(self.data)
+        payload_spans = self.rows[:, _START:].tolist()
+        payloads = [buffer[start:end] for start, end in payload_spans]
+
         sizes = self._sizes
         ends = np.cumsum(sizes)
         rows = self.rows.copy()
@@ -251,9 +255,9 @@ class BatchBuilder:
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Sorts the messages that were added into the order in which they are played.
+        """Returns the added messages in the order in which they are played.
 
-        If two files contain the same message, it is included only once.
+        Two files of a session may contain the same message, which is included only once.
 
         Returns:
             The sorted messages. The time of each message is its deadline: the time at which it
@@ -263,6 +267,7 @@ class BatchBuilder:
         repeats = self._find_repeats(rows)
         if repeats:
             rows = np.delete(rows, repeats, axis=0)
+
         order, due_ns = order_for_play(
             times_ns=rows[:, _TIME],
             channels=rows[:, _CHANNEL],
@@ -273,22 +278,21 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Finds messages that are repeated, as they are in two parts of a session.
+        """Returns the indices of messages that repeat an earlier one, and need not be played.
+
+        Two files of a session may contain the same message.
 
         Args:
             rows: The messages in the order of the file, see `MessageBatch.rows`.
-
-        Returns:
-            The indices of all repetitions except the first occurrence.
         """
-        seen: set[tuple[int, int, bytes]] = set()
+        earlier_messages: set[tuple[int, int, bytes]] = set()
         repeats = []
         for index in _find_equal_numbers(rows).tolist():
             _, channel, number, start, end = rows[index].tolist()
             message = (channel, number, bytes(self._payloads[start:end]))
-            if message in seen:
+            if message in earlier_messages:
                 repeats.append(index)
-            seen.add(message)
+            earlier_messages.add(message)
         return repeats
 
 

@@ -116,6 +116,9 @@ class MessageSource:
     ) -> None:
         """Starts the process that reads a long log from the disk while the log is played.
 
+        The player must publish each message at its time, and therefore cannot wait for the
+        disk.
+
         Args:
             paths: The files of the log.
             selection: Which messages are played, by channel and time.
@@ -252,14 +255,14 @@ def sort_messages(
         late in the file to be put in order.
     """
     sorter = _MessageSorter()
-    before_all_ns = -(2**62)
-    after_all_ns = 1 << 62
-    newest_ns = before_all_ns
+    before_all_messages_ns = -(2**62)
+    after_all_messages_ns = 1 << 62
+    newest_ns = before_all_messages_ns
     next_release_ns = None
     for message in messages:
         sorter.add(message)
-        t_ns = message[0]
-        newest_ns = max(newest_ns, t_ns)
+        message_ns = message[0]
+        newest_ns = max(newest_ns, message_ns)
         if next_release_ns is None:
             next_release_ns = newest_ns + horizon_ns + step_ns
         if newest_ns >= next_release_ns:
@@ -268,7 +271,7 @@ def sort_messages(
             next_release_ns = newest_ns + step_ns
         elif sorter.memory > limit_bytes:
             yield sorter.release_half()
-    yield sorter.release_until(after_all_ns)
+    yield sorter.release_until(after_all_messages_ns)
 
 
 class _MessageSorter:
@@ -300,6 +303,9 @@ class _MessageSorter:
     def release_until(self, until_ns: int) -> tuple[MessageBatch, int]:
         """Removes the messages that are due up to a time, so that they can be played.
 
+        They are put in the order in which they are played, which may differ from that of the
+        file.
+
         Args:
             until_ns: The time, in ns after the start of the session.
 
@@ -307,9 +313,10 @@ class _MessageSorter:
             The messages in play order, and the number of strays: messages that came too late,
             after one with a higher number in the same channel had been released.
         """
-        ordered = self._waiting.ordered()
-        count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
-        return self._release(ordered, count)
+        sorted_messages = self._waiting.ordered()
+        times_ns = sorted_messages.times_ns
+        due_count = int(np.searchsorted(times_ns, until_ns, side="right"))
+        return self._release(sorted_messages, due_count)
 
     def release_half(self) -> tuple[MessageBatch, int]:
         """Removes the earlier half of the messages, because they need too much memory.
@@ -337,9 +344,12 @@ class _MessageSorter:
 def feed_player(
     pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool
 ) -> None:
-    """Sends messages to the player until all files are read or the player has ended.
+    """Sends the messages of a log to the player, until all are read or the player has ended.
 
-    This is the main function of the reader process.
+    This is the main function of the reader process. It reads a log that is too long for the
+    memory, while another process, the player, publishes its messages. Each pass through the log
+    is followed by a report of the damaged files and of the strays. These are messages so late
+    in the file that they could not be put in order.
 
     Args:
         pipe: Pipe to the player.
@@ -374,7 +384,8 @@ def feed_player(
                     for piece in batch.pieces():
                         assert reader.header is not None  # there was a message
                         send(_ReadPiece(reader.header.topics, piece.compact()))
-                send(_RoundEnd(strays, reader.header.torn if reader.header else {}))
+                torn_files = reader.header.torn if reader.header else {}
+                send(_RoundEnd(strays, torn_files))
                 if not loop:
                     return
         except LogError as error:

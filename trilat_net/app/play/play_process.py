@@ -170,18 +170,24 @@ class Playback:
         """
         clock = self.clock
         options = self.options
-        first_ns = self._player.prepare()
+        first_ns = self._player.prepare()  # None if the log has no messages to play
         self._wait_for_recorders()
+
         origin_ns = clock.monotonic_ns() + AHEAD_NS
         if first_ns is not None:
-            pace = Pace(origin_ns, first_ns if start_ns is None else start_ns, options.rate)
+            if start_ns is None:
+                start_ns = first_ns
+            pace = Pace(origin_ns, start_ns, options.rate)
             self._stand_ins.start_session(pace.due_ns(0))
             self._player.play(pace, loop=options.loop)
         duration_ns = max(0, clock.monotonic_ns() - origin_ns)
 
         self._stand_ins.serve_queries()
+
+        # Recorders that leave from now on still belong to the result.
         recorders = set(self._stand_ins.recorders)
         self._linger()
+
         has_deadlines = math.isfinite(options.rate)
         return PlaybackSummary(
             counts=dict(zip(self.header.topics, self._player.counts, strict=False)),
@@ -198,9 +204,11 @@ class Playback:
         )
 
     def _wait_for_recorders(self) -> None:
-        """Waits until every recorder that is present has replied, at most `LISTEN_NS`.
+        """Waits until every recorder on the network is ready to receive, at most `LISTEN_NS`.
 
-        If the options require a recorder, this time begins when the first one is present.
+        Otherwise the first messages could be missing in their logs. A recorder is ready when it
+        has replied to a query. If the options require a recorder, the waiting time begins when
+        one is present.
         """
         clock = self.clock
         stand_ins = self._stand_ins
@@ -209,11 +217,11 @@ class Playback:
         give_up_ns = clock.monotonic_ns() + LISTEN_NS
         while not self.stopped():
             stand_ins.serve_queries()
-            missing = self.options.needs_recorder and not stand_ins.recorders
-            listening = stand_ins.are_recorders_listening()
-            if missing:
+            is_recorder_missing = self.options.needs_recorder and not stand_ins.recorders
+            are_ready = stand_ins.are_recorders_listening()
+            if is_recorder_missing:
                 give_up_ns = clock.monotonic_ns() + LISTEN_NS
-            elif listening or clock.monotonic_ns() > give_up_ns:
+            elif are_ready or clock.monotonic_ns() > give_up_ns:
                 return
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
@@ -253,7 +261,9 @@ def play_log(
     say: Callable[[str], None],
     show: Callable[[PlayProgress], None],
 ) -> PlaybackSummary | None:
-    """Plays a log over the network.
+    """Plays a log over the network, so that it looks like a running session to other programs.
+
+    To play a log means to publish its messages again, at the times of the original session.
 
     Args:
         loaded: Description of the recorded session, and its messages if they are in memory.
@@ -279,6 +289,7 @@ def play_log(
     # clock would then starve the threads of Zenoh.
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
+
     with ExitStack() as stack:
         stack.enter_context(process.pause_gc())
         bus = open_playback_bus(
@@ -292,9 +303,11 @@ def play_log(
             return None
         stack.enter_context(closing(bus))
         refuse_running_session(bus, clock, options.session, stopped)
+
         source = stack.enter_context(closing(MessageSource(header, batch)))
         if batch is None:
             source.start_reader(paths, selection, loop=options.loop)
+
         playback = Playback(
             bus=bus,
             clock=clock,
@@ -320,7 +333,7 @@ def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
         recorded_session: Name of the recorded session.
         session: Name of the playback's session.
     """
-    chunks = topic.strip("/").split("/")
-    if chunks[:2] == [topics.ROOT, recorded_session]:
-        chunks = chunks[2:]
-    return "/".join([topics.ROOT, session, *chunks])
+    name_parts = topic.strip("/").split("/")
+    if name_parts[:2] == [topics.ROOT, recorded_session]:
+        name_parts = name_parts[2:]
+    return "/".join([topics.ROOT, session, *name_parts])

@@ -81,7 +81,10 @@ class Pace:
 
 
 def parse_rate(text: str) -> float:
-    """Parses the option `--rate`. The texts "max" and "0" mean as fast as possible.
+    """Parses the option `--rate`, the speed of a playback relative to the recorded run.
+
+    For example, "2" plays a log twice as fast. The texts "max" and "0" mean as fast as
+    possible.
 
     Returns:
         Seconds of the log per second, `math.inf` for as fast as possible.
@@ -91,10 +94,12 @@ def parse_rate(text: str) -> float:
     """
     if text.strip().lower() == "max":
         return math.inf
+
     try:
         rate = float(text)
     except ValueError:
         rate = math.nan
+
     if rate == 0:
         return math.inf
     if not SLOWEST <= rate <= FASTEST:
@@ -185,12 +190,14 @@ class LatenessHistogram:
         total = counts_up_to[-1]
         if not total:
             return None
+
         percents = np.array([50, 99])
-        bins_us = np.searchsorted(100 * counts_up_to, total * percents).tolist()
+        percentiles_us = np.searchsorted(100 * counts_up_to, total * percents).tolist()
         # The overflow bin has no lateness of its own. The maximum stands for it.
-        p50_us, p99_us = (
-            bin_us if bin_us < LATENESS_LIMIT_US else self.max_us for bin_us in bins_us
-        )
+        p50_us, p99_us = [
+            percentile_us if percentile_us < LATENESS_LIMIT_US else self.max_us
+            for percentile_us in percentiles_us
+        ]
         return LatenessSummary(p50_us, p99_us, self.max_us)
 
 
@@ -283,6 +290,8 @@ class Player:
 
     def prepare(self) -> int | None:
         """Waits for the first messages, so that playing can begin without delay.
+
+        Messages that are read from the disk or decoded only when they are due would be late.
 
         Returns:
             The time of the first message, in ns after the start of the recorded session. None
@@ -400,6 +409,9 @@ class Player:
 
     def _use_slack(self, due_ns: int, now_ns: int) -> bool:
         """Does other work until shortly before a deadline.
+
+        Such work includes replies to other programs and reading in advance. Shortly before the
+        deadline, nothing may delay the player.
 
         Args:
             due_ns: The deadline, in ns.

@@ -67,10 +67,12 @@ class PlaySelection:
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
         """Finds out whether the messages of a channel are played.
 
+        By default, these are the channels of the sites, the processes that each control one
+        arm. If the user includes channels explicitly, only the user's filter counts.
+
         Args:
             topic: Topic of the channel, such as "/trilat/paper/m1/state".
-            sites: Names of the sites of the scenario. If the user selects no channel, theirs
-                are played.
+            sites: Names of the sites of the scenario.
         """
         key = topic.strip("/")
         parts = topics.parse_key(key)
@@ -99,7 +101,10 @@ def parse_selection(
     duration_s: float | None,
     time: str,
 ) -> PlaySelection:
-    """Parses the options of a command that select messages.
+    """Parses the options of a command that select which messages of a log are played.
+
+    The user limits the part of the session by `--start`, and by either `--stop` or
+    `--duration`.
 
     Args:
         include: Key expressions of `--include`.
@@ -117,17 +122,24 @@ def parse_selection(
             "--time must be publish (the time at which a message was sent) or log (the time at "
             f"which it arrived), not {time!r}"
         )
+
     for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
-        if seconds is not None and not (math.isfinite(seconds) and abs(seconds) <= 1e9):
+        if seconds is None:
+            continue
+        is_reasonable = math.isfinite(seconds) and abs(seconds) <= 1e9
+        if not is_reasonable:
             raise UsageError(f"{name} must be a number of seconds, not {seconds:g}")
+
     if duration_s is not None:
         if duration_s <= 0:
             raise UsageError(f"--duration must be more than 0 s, not {duration_s:g}")
         if stop_s is not None:
             raise UsageError("--stop and --duration set the same limit; give only one of them")
         stop_s = (start_s or 0.0) + duration_s
+
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
+
     return PlaySelection(
         channels=ChannelFilter.parse(include, exclude),
         start_ns=None if start_s is None else round(start_s * NS_PER_S),
@@ -222,11 +234,14 @@ class _PlayedChannel:
         self.site = ""
         self.kind = ""
         self.rate_hz = 0
+
         is_of_session = parts is not None and parts.session == header.session
         if parts is not None and is_of_session and parts.member in sites:
             self.site = parts.member
             self.kind = parts.channel
             self.rate_hz = sites[self.site].rate_hz
+
+        # A channel that is played gets the next number.
         self.channel_number = -1
         if selection.accepts(topic, sites):
             if topic not in header.topics:
@@ -312,7 +327,10 @@ class SessionReader:
                 yield from self._read_file(path, reader)
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
-        """Yields the selected messages of one file, and completes the header.
+        """Yields the messages of a file that are played, and completes the session's header.
+
+        Each message is yielded with its time, the number of its channel, and the number that
+        orders it within the channel.
 
         Args:
             path: The file.
@@ -328,8 +346,11 @@ class SessionReader:
             if epoch_ns is None:
                 # The reader has read the metadata when it yields the first message.
                 epoch_ns, header = self._read_session(path, reader)
+
             t_ns = self._find_time_ns(item, epoch_ns)
-            if stop_ns is not None and item.log_time_ns - epoch_ns > stop_ns + HORIZON_NS:
+            arrival_ns = item.log_time_ns - epoch_ns
+            # A message arrives later than it was sent, but by less than the horizon.
+            if stop_ns is not None and arrival_ns > stop_ns + HORIZON_NS:
                 return  # all further messages arrived even later
 
             channel = channels.get(item.topic)
@@ -338,10 +359,13 @@ class SessionReader:
                 channels[item.topic] = channel
             header.first_ns = min(header.first_ns, t_ns)
             header.last_ns = max(header.last_ns, t_ns)
+
+            # The first message of a site tells the boot, the random number of the site's start.
             if channel.site and channel.site not in header.boots:
                 boot = _decode_header(item.payload).boot
                 if boot >= 0:
                     header.boots[channel.site] = boot
+
             number = channel.find_number(item, t_ns)
             if channel.channel_number >= 0 and self._selection.contains(t_ns):
                 yield t_ns, channel.channel_number, number, item.payload
@@ -370,6 +394,8 @@ class SessionReader:
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
         """Reads the metadata of a file's session, and creates the header for the first file.
 
+        All files must belong to the same session, because they are played as one.
+
         Returns:
             The start of the session in Unix time, in ns, and the header.
 
@@ -394,7 +420,11 @@ class SessionReader:
                 )
         except (ScenarioError, ValueError) as error:
             raise LogError(f"{path}: the session of the log cannot be read: {error}") from None
-        if (self.header.session, self.header.scenario_text) != (metadata["session"], text):
+
+        is_same_session = (
+            self.header.session == metadata["session"] and self.header.scenario_text == text
+        )
+        if not is_same_session:
             raise LogError(
                 f"{path}: belongs to a different session from {self._paths[0]}; the files of "
                 "one replay must be parts of the same log"
@@ -414,6 +444,9 @@ def preload_messages(
     progress: Progress | None = None,
 ) -> tuple[SessionHeader, MessageBatch | None]:
     """Reads the description of a session, and its selected messages if they fit into memory.
+
+    A short log is played from memory. If the messages need more memory, a reader process is
+    started later, and here the file is searched only for the first messages of all sites.
 
     Args:
         paths: The files.
@@ -438,12 +471,14 @@ def preload_messages(
             waiting.add(*message)
             if waiting.memory > limit_bytes:
                 break
-        else:
+        else:  # the end of the files was reached
             if reader.header is None:
                 raise LogError(f"{paths[0]}: contains nothing")
             if not waiting.memory:
                 raise UsageError(_describe_empty_selection(paths[0], selection, reader.header))
             return reader.header, waiting.ordered()
+
+        # The messages do not fit. Read on until the first message of each site.
         assert reader.header is not None  # there was a message
         for _ in islice(messages, SEARCH_LIMIT):
             if reader.header.boots.keys() >= reader.header.scenario.sites.keys():
@@ -454,16 +489,21 @@ def preload_messages(
 def _describe_empty_selection(
     path: Path, selection: PlaySelection, header: SessionHeader
 ) -> str:
-    """Explains to the user why no message is selected."""
+    """Explains to the user why no message is selected, and what the log contains.
+
+    A wrong start or end is named. Otherwise the filter of the channels is the reason.
+    """
     if header.last_ns < header.first_ns:
         return f"{path}: contains no message"
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"
+
     if selection.start_ns is not None and selection.start_ns > header.last_ns:
         option = f"--start {selection.start_ns / NS_PER_S:g} s"
         return f"{option}: is after the end; the log lasts {span}"
     if selection.stop_ns is not None and selection.stop_ns < header.first_ns:
         option = f"--stop {selection.stop_ns / NS_PER_S:g} s"
         return f"{option}: is before the beginning; the log lasts {span}"
+
     return (
         f"{path}: has no message for this selection; the topics of the log have the form "
         f"trilat/{header.session}/{header.scenario.names[0]}/state, and the log lasts {span}"

@@ -111,12 +111,13 @@ class PlayedHistory:
         for channel in np.unique(batch.channels).tolist():
             indices = np.flatnonzero(batch.channels == channel)
             numbers = batch.numbers[indices]
-            parts = self._messages.setdefault(channel, deque())
-            parts.append(_ChannelMessages(numbers, indices, batch))
+            stored_batches = self._messages.setdefault(channel, deque())
+            stored_batches.append(_ChannelMessages(numbers, indices, batch))
+
             if self._kept_ns is not None:
                 oldest_ns = batch.end_ns - self._kept_ns
-                while parts[0].batch.end_ns < oldest_ns:
-                    parts.popleft()
+                while stored_batches[0].batch.end_ns < oldest_ns:
+                    stored_batches.popleft()
 
     def clear(self) -> None:
         """Removes all stored messages, before a log is played again from its beginning.
@@ -141,21 +142,22 @@ class PlayedHistory:
         Returns:
             The number of the first message in the reply, and the payloads.
         """
-        played = self.next_numbers.get(channel, 0)
-        last_available = min(last, played - 1)
+        next_to_play = self.next_numbers.get(channel, 0)
+        last_available = min(last, next_to_play - 1)
         payloads: list[bytes] = []
         size = 0
         reply_first = first
         next_number = first
-        for part in self._list_parts(channel, first):
-            for number, index in part.list_from(next_number):
+        for stored_batch in self._list_parts(channel, first):
+            for number, index in stored_batch.list_from(next_number):
+                # The reply begins with the first message that is stored.
                 if not payloads:
-                    reply_first = max(first, min(number, played))
+                    reply_first = max(first, min(number, next_to_play))
                     next_number = reply_first
                 if number < next_number:
                     continue  # a repeated number
 
-                payload = part.batch.payload(index)
+                payload = stored_batch.batch.payload(index)
                 size += len(payload)
                 is_beyond = number > last_available
                 has_gap = number > next_number
@@ -166,9 +168,9 @@ class PlayedHistory:
                 payloads.append(payload)
                 next_number = number + 1
 
-        if not payloads and first < played:
+        if not payloads and first < next_to_play:
             # No requested message is kept. The empty reply states that they are not available.
-            reply_first = played
+            reply_first = next_to_play
         return reply_first, payloads
 
     def _list_parts(self, channel: int, first: int) -> list[_ChannelMessages]:
@@ -233,11 +235,14 @@ class SiteStandIns:
         self._boots: dict[str, tuple[int, int]] = {}
         # Time at which the identity of each site was encoded, and the encoded identity.
         self._encoded: dict[str, tuple[int, bytes]] = {}
+
+        # The identities of the sites, and what makes them appear as members of the session.
         self._infos = {}
         for site, boot in header.boots.items():
             self._infos[site] = describe_member(
                 site, boot, clock, header.fingerprint, header.scenario_text
             )
+
         self._identity_queries = {}
         self._backfill_queries = {}
         for site, info in self._infos.items():
@@ -323,13 +328,16 @@ class SiteStandIns:
     def have_stored(self, recorders: Collection[str]) -> bool:
         """Returns True if recorders have reported that they stored all messages of every site.
 
+        The player may then leave, because no recorder will request a message again.
+
         Args:
             recorders: The recorders. Each is identified by the random number of its start, as
                 text.
         """
-        for boot in recorders:
-            stored_sites = self._stored.get(boot, set())
-            if not stored_sites >= self._infos.keys():
+        all_sites = self._infos.keys()
+        for recorder in recorders:
+            stored_sites = self._stored.get(recorder, set())
+            if not stored_sites >= all_sites:
                 return False
         return True
 

@@ -67,7 +67,9 @@ Spatial = tuple[Three, Three]
 
 
 class ChainJoint(NamedTuple):
-    """One joint of a chain; theta contains the parameters of the link that it moves.
+    """Geometry, drive, friction and stops of one joint of an arm.
+
+    Mass and inertia of the link that it moves are not here, but in the parameters theta.
 
     Attributes:
         prismatic: True: the joint slides (m, N); false: it turns (rad, N m).
@@ -112,10 +114,10 @@ _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 @cache
 def chain_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the row that stores a joint of a chain.
+    """Returns the NumPy data type that stores one joint of a chain of joints.
 
-    A row contains the constants of the joint and the work space of the algorithms. A link is
-    the body that the joint moves, and its frame moves with it. Names with lin and ang are the
+    It contains the constants of the joint and the work space of the algorithms. A link is the
+    body that the joint moves, and its frame moves with it. Names with lin and ang are the
     linear and the angular part of a spatial vector at the origin of this frame. Positions are
     in m.
 
@@ -126,7 +128,8 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
     - Placement: R and p, the orientation and the origin of the link's frame in that of the
       previous link. `R_base` is the orientation, `p_base` the origin and `axis_base` the axis
       in the frame of the base.
-    - Motion: V, W, A and f of the recursion at the top of this module.
+    - Motion, as spatial vectors: the velocity V of the link, its velocity W and acceleration A
+      in the reference motion of a control law, and the force f on the link.
     - Dynamics: `bias`, the torque C qd + G with friction, less the torque of the stops;
       `composite`, the ten inertial parameters of the link and all links after it as one rigid
       body; and M, the row of the inertia matrix.
@@ -149,16 +152,21 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
 
 
 def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
-    """Returns the rows of the joints of a chain, shape (n,), see `chain_dtype`.
+    """Creates the array with the data of all joints of an arm, on which compiled code works.
 
-    The rotation of a joint by the angle q about its axis a (Rodrigues) uses three constant
-    matrices, where F is the rotation at q = 0 and [a] the matrix of the cross product with a:
+    The constants of each joint are filled in. Among them are three matrices, with which the
+    rotation R of a joint by the angle q about its axis a needs no matrix product (Rodrigues):
 
         R = F + sin(q) F [a] + (1 - cos(q)) F [a]^2
+
+    Here F is the rotation at q = 0, and [a] is the matrix of the cross product with a.
 
     Args:
         joints: The joints.
         width: Number of joints for which the rows have room; by default that of the chain.
+
+    Returns:
+        One row per joint, shape (n,), see `chain_dtype`.
     """
     rows = np.zeros(len(joints), chain_dtype(width or len(joints)))
     row: Row
@@ -324,7 +332,7 @@ def place_joints(chain: RowArray, q: Vector) -> None:
     results, so this function must be called first after each change of the positions.
 
     Args:
-        chain: Rows of the joints; written.
+        chain: Data of the joints, one row per joint; written.
         q: Positions of the joints, shape (n,), rad or m.
     """
     for i in range(chain.shape[0]):
@@ -346,13 +354,19 @@ def place_joints(chain: RowArray, q: Vector) -> None:
 
 @leaf
 def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
-    """Returns X V_p + S rate: the spatial velocity of a link from that of the previous link.
+    """Returns the spatial velocity of a link: that of the previous link plus that of the joint.
+
+    In the notation of spatial vectors this is X V_p + S rate. Accelerations are transformed in
+    the same way.
 
     Args:
-        row: Row of the joint.
-        linear: Linear part of V_p, in the previous link's frame.
+        row: Data of the joint between the two links.
+        linear: Linear part of the previous link's velocity V_p, in the previous link's frame.
         angular: Angular part of V_p, in the previous link's frame.
-        rate: Velocity of the joint.
+        rate: Velocity of the joint, rad/s or m/s.
+
+    Returns:
+        The linear and the angular part, in the link's own frame.
     """
     p = three(row.p)
     turning_velocity = cross(angular, p)
@@ -370,13 +384,14 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
 
 @leaf
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
-    """Returns the spatial momentum I(pi) V of a link.
+    """Returns the linear and angular momentum I(pi) V of a link about the origin of its frame.
 
     Args:
-        pi: Inertial parameters of the links.
-        first: Index of the link's first parameter.
-        linear: Linear part of V.
-        angular: Angular part of V.
+        pi: Inertial parameters of the links: per link its mass m, m times its centre of mass,
+            and its moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+        first: Index of the link's first parameter in `pi`.
+        linear: Linear velocity of the link's origin, m/s.
+        angular: Angular velocity of the link, rad/s.
     """
     m = pi[first]
     mc_x = pi[first + 1]
@@ -409,7 +424,7 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
     It is the torque of a revolute joint or the force of a prismatic joint.
 
     Args:
-        row: Row of the joint.
+        row: Data of the joint.
         linear: Linear part of f, the force.
         angular: Angular part of f, the torque.
     """
@@ -427,7 +442,7 @@ def friction_torque(row: Row, speed: float) -> float:
     It increases with the velocity v. The second term is a smooth form of dry friction.
 
     Args:
-        row: Row of the joint, with the coefficients `viscous` and `coulomb`.
+        row: Data of the joint, with the coefficients `viscous` and `coulomb`.
         speed: Velocity v of the joint, rad/s or m/s.
     """
     x = speed / COULOMB_SPEED
@@ -439,11 +454,13 @@ def friction_torque(row: Row, speed: float) -> float:
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
-    """Adds a link's spatial force to that of the previous link, in the previous link's frame.
+    """Adds the force on a link to the force on the previous link, which has to transmit it.
+
+    The force and its torque are transformed to the frame of the previous link.
 
     Args:
-        row: Row of the link's joint.
-        before: Row of the previous joint, which is changed.
+        row: Data of the joint that moves the link.
+        before: Data of the previous joint; changed.
     """
     R = row.R
     p = three(row.p)
@@ -469,7 +486,7 @@ def propagate_motion(
     them. `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Rows of the joints; written.
+        chain: Data of the joints, one row per joint; written.
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
         qd: Velocities of the joints, shape (n,), rad/s or m/s.
         v: Reference velocities, by which the Coriolis matrix C is multiplied, shape (n,).
@@ -552,13 +569,14 @@ def inverse_dynamics(
     the same motion.
 
     Args:
-        chain: Rows of the joints.
+        chain: Data of the joints, one row per joint.
         theta: Inertial parameters, ten per link, shape (10 n,).
         v: Reference velocities, shape (n,), rad/s or m/s.
         a: Reference accelerations, shape (n,), rad/s^2 or m/s^2.
-        torque: Written: the torque, shape (n,), N m or N.
+        torque: Receives the torque, shape (n,), N m or N.
     """
     n = chain.shape[0]
+    # The force on each link.
     for i in range(n):
         row: Row = chain[i]
         first = LINK_PARAMETERS * i
@@ -586,6 +604,8 @@ def inverse_dynamics(
         half_torque = scale(0.5, turning_torque)
         put_three(row.f_lin, add(I_A[0], half_force))
         put_three(row.f_ang, add(I_A[1], half_torque))
+
+    # Torque of each joint, from the tip to the base: a joint carries all links after it.
     for i in range(n - 1, -1, -1):
         row = chain[i]
         force = three(row.f_lin)
@@ -710,8 +730,8 @@ def _add_composite(row: Row, before: Row) -> None:
     connected. The parallel-axis theorem is written out for the ten parameters of a body.
 
     Args:
-        row: Row of the joint of the body.
-        before: Row of the previous joint, whose composite body is changed.
+        row: Data of the joint that moves the body.
+        before: Data of the previous joint, whose composite body is changed.
     """
     pi = row.composite
     total = before.composite
@@ -782,7 +802,7 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
     have been called for the same positions.
 
     Args:
-        chain: Rows of the joints; written.
+        chain: Data of the joints, one row per joint; written.
         theta: Inertial parameters, ten per link, shape (10 n,).
     """
     n = chain.shape[0]
@@ -791,10 +811,12 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
         first = LINK_PARAMETERS * i
         for p in range(LINK_PARAMETERS):
             row.composite[p] = theta[first + p]
+
     still = (0.0, 0.0, 0.0)
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        # The force that accelerates the composite body at the joint's unit acceleration.
+        # The force that accelerates the composite body (the link and all links after it) at the
+        # joint's unit acceleration.
         axis = three(row.axis)
         if row.prismatic == 0:
             linear, angular = _momentum(row.composite, 0, still, axis)
@@ -802,6 +824,7 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
             linear, angular = _momentum(row.composite, 0, axis, still)
         rigid = _along_axis(row, linear, angular)
         row.M[i] = rigid + row.armature_kg_m2
+        # The torque of this force at each earlier joint is an element of M off the diagonal.
         for j in range(i - 1, -1, -1):
             link: Row = chain[j + 1]
             linear = rotate(link.R, linear)
@@ -815,10 +838,12 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 
 @leaf
 def _stop_torque(row: Row, q: float, qd: float) -> float:
-    """Returns the torque of a joint's stops, a spring and a damper that never pull.
+    """Returns the torque of the mechanical stops at the ends of a joint's range, N m or N.
+
+    A stop is a spring and a damper, which only push the joint back into its range.
 
     Args:
-        row: Row of the joint.
+        row: Data of the joint.
         q: Position of the joint, rad or m.
         qd: Velocity of the joint, rad/s or m/s.
     """
@@ -827,18 +852,22 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
     upper_spring = row.stop_stiffness * (row.upper - q)
     lower_push: float = max(lower_spring - damper, 0.0)
     upper_push: float = min(upper_spring - damper, 0.0)
-    push_at_most = choose(q > row.upper, upper_push, 0.0)
-    return choose(q < row.lower, lower_push, push_at_most)
+    # Selections in place of branches: this code is also compiled for several runs at once.
+    upper_or_none = choose(q > row.upper, upper_push, 0.0)
+    return choose(q < row.lower, lower_push, upper_or_none)
 
 
 @leaf
 def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector) -> None:
-    """Writes C qd + G + friction - stops into the field `bias` of the rows.
+    """Computes the joint torques that act besides those of the accelerations: the bias torque.
 
-    `place_joints` must have been called for the same positions.
+        bias = C qd + G + friction - stops
+
+    The terms are the Coriolis torque, the gravity torque, the joint friction, and the torque of
+    the joint stops. `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Rows of the joints.
+        chain: Data of the joints, one row per joint. The result is written into `bias`.
         theta: Inertial parameters, shape (10 n,).
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,).
@@ -848,8 +877,11 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
     still = (0.0, 0.0, 0.0)
     V_lin = still
     V_ang = still
+    # A base that accelerates upwards has the same effect as gravity.
     A_lin = (-gravity[0], -gravity[1], -gravity[2])
     A_ang = still
+
+    # Velocity V, acceleration A and force of each link, from the base to the tip.
     for i in range(n):
         row: Row = chain[i]
         V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
@@ -873,6 +905,8 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
         turning_force, turning_torque = _force_cross(V, momentum)
         put_three(row.f_lin, add(force, turning_force))
         put_three(row.f_ang, add(torque, turning_torque))
+
+    # Torque of each joint, from the tip to the base: a joint carries all links after it.
     for i in range(n - 1, -1, -1):
         row = chain[i]
         force = three(row.f_lin)
@@ -902,13 +936,13 @@ def put_model(
     positions.
 
     Args:
-        chain: Rows of the joints.
+        chain: Data of the joints, one row per joint.
         theta: Inertial parameters, ten per link, shape (10 n,).
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
-        M: Written: the inertia matrix, shape (n, n).
-        bias: Written: the bias torque, shape (n,), N m or N.
+        M: Receives the inertia matrix, shape (n, n).
+        bias: Receives the bias torque, shape (n,), N m or N.
     """
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
     mass_matrix(chain, theta)
@@ -938,13 +972,13 @@ def find_acceleration(
     `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Rows of the joints.
+        chain: Data of the joints, one row per joint.
         theta: Inertial parameters, ten per link, shape (10 n,).
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         torque: The whole torque on the joints, shape (n,), N m or N.
-        qdd: Written: the accelerations, shape (n,), rad/s^2 or m/s^2.
+        qdd: Receives the accelerations, shape (n,), rad/s^2 or m/s^2.
     """
     n = chain.shape[0]
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)

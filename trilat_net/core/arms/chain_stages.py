@@ -73,15 +73,15 @@ def update_errors(s: Row, chain: RowArray) -> None:
 
 @leaf
 def _update_joint_errors(s: Row, joints: int) -> None:
-    """Writes the errors of a site that compares joint angles with its peers, Eqs. (9) and (10).
+    """Computes the tracking errors of an arm that follows other arms joint by joint.
 
     For each joint, e = q - q_des is the position error, ed its derivative, v = -Lambda e the
     reference velocity, a its derivative, and r = qd - v the filtered error on which the control
     law acts.
 
     Args:
-        s: Row of the site. It holds q, qd, the reference q_des with qd_des, and the rate
-            Lambda, 1/s.
+        s: State of the site (the process that runs the arm), with the angles q, velocities qd,
+            the reference q_des with its rate qd_des, and the gain Lambda, 1/s; written.
         joints: Number of joints.
     """
     for i in range(joints):
@@ -165,10 +165,10 @@ def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
     called for the present positions.
 
     Args:
-        s: Row of the site, with its settings and its state.
-        chain: Rows of the joints.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint.
         theta: Inertial parameters, shape (10 n,).
-        torque: Written: the torque, shape (n,), N m.
+        torque: Receives the torque, shape (n,), N m.
     """
     zeros = s.zeros
     propagate_motion(chain=chain, gravity=s.gravity, qd=zeros, v=zeros, a=zeros)
@@ -302,13 +302,16 @@ def update_external_torque(
 def put_stage_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments at a stage of the integrator.
+    """Computes the torque of operators and environments for a stage of the integrator.
+
+    A stage is one of the four evaluations of the Runge-Kutta method in a control period.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
-        s: Row of the site, with `stage_q` and `stage_qd`; `stage_torque` is written.
-        chain: Rows of the joints, placed at `stage_q`.
-        actors: Rows of operators and environments.
+        s: State of the site (the process that runs the arm), with the positions `stage_q` and
+            velocities `stage_qd` of the stage; `stage_torque` is written.
+        chain: Data of the joints, one row per joint, placed at the angles `stage_q`.
+        actors: Operators and environments, one row for each.
         table: Their numbers, for example recorded torques.
     """
     put_torque_on_chain(
@@ -326,13 +329,17 @@ def put_stage_torque(
 
 @leaf
 def put_stage_acceleration(s: Row, chain: RowArray) -> None:
-    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
+    """Computes the joint accelerations for a stage of the integrator.
 
-    The torque is the held u plus the torque of the actors at the time and state of the stage.
+    A stage is one of the four evaluations of the Runge-Kutta method in a control period. The
+    torque is the sum of the motor torque u, which is constant during the period, and the torque
+    of operators and environments in the stage.
 
     Args:
-        s: Row of the site, with `stage_q`, `stage_qd` and `stage_torque`.
-        chain: Rows of the joints, placed at `stage_q`.
+        s: State of the site (the process that runs the arm), with the positions `stage_q`,
+            velocities `stage_qd` and external torques `stage_torque` of the stage. The
+            accelerations are written into `stage_qdd`.
+        chain: Data of the joints, one row per joint, placed at the angles `stage_q`.
     """
     for i in range(chain.shape[0]):
         s.stage_torque[i] += s.u[i]
@@ -351,15 +358,19 @@ def put_stage_acceleration(s: Row, chain: RowArray) -> None:
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
+    """Computes the joint accelerations for a stage of the integrator, with all torques.
+
+    A stage is one of the four evaluations of the Runge-Kutta method in a control period.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
-        s: Row of the site, with `stage_q` and `stage_qd`.
-        chain: Rows of the joints.
-        actors: Rows of operators and environments.
+        s: State of the site (the process that runs the arm), with the positions `stage_q` and
+            velocities `stage_qd` of the stage. The accelerations are written into `stage_qdd`.
+        chain: Data of the joints, one row per joint.
+        actors: Operators and environments, one row for each.
         table: Their numbers, for example recorded torques.
     """
+    # The torques and the dynamics depend on where the links are.
     place_joints(chain, s.stage_q)
     put_stage_torque(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     put_stage_acceleration(s, chain)
@@ -397,10 +408,10 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
 
 @leaf
 def begin_stages(s: Row, joints: int) -> None:
-    """Prepares the first stage of the integrator, at the beginning of the period.
+    """Prepares the first of the four stages of the Runge-Kutta method in a control period.
 
     Args:
-        s: Row of the site.
+        s: State of the site (the process that runs the arm).
         joints: Number of joints.
     """
     for i in range(joints):
@@ -412,11 +423,15 @@ def begin_stages(s: Row, joints: int) -> None:
 
 @leaf
 def end_stages(h_s: float, s: Row, joints: int) -> bool:
-    """Writes the positions and velocities at the end of the period, if they are finite.
+    """Completes the Runge-Kutta method: computes the motion at the end of the control period.
+
+        q(t + h) = q(t) + h/6 sum_qd,    qd(t + h) = qd(t) + h/6 sum_qdd
 
     Args:
-        h_s: The period, s.
-        s: Row of the site, after all stages.
+        h_s: The period h, s.
+        s: State of the site (the process that runs the arm), with the weighted sums of the
+            velocities and accelerations of all stages. Positions q and velocities qd are
+            written.
         joints: Number of joints.
 
     Returns:
@@ -469,6 +484,8 @@ def advance_arm(
     n = chain.shape[0]
     begin_stages(s, n)
     half = 0.5 * h_s
+    # Four evaluations: at the beginning, twice in the middle, and at the end of the period. The
+    # evaluations in the middle count twice.
     _put_acceleration(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     use_stage(s, n, 1.0, half)
     _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)

@@ -36,8 +36,8 @@ def sincos(x: float) -> tuple[float, float]:
     itself causes an error of similar size. Both results are NaN if the angle is not finite or
     is beyond `LARGEST_RAD`.
     """
-    # `round_down` returns a float: the angle y need not wait for conversions to an integer and
-    # back.
+    # The nearest quarter turn, and the angle y from there. `round_down` returns a float: the
+    # angle y need not wait for conversions to an integer and back.
     quarter = round_down(x * _QUARTERS_PER_RAD + 0.5)
     y = ((x - quarter * _PART_1) - quarter * _PART_2) - quarter * _PART_3
     z = y * y

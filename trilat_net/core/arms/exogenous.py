@@ -74,7 +74,9 @@ OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
 
 
 class TorqueSource(NamedTuple):
-    """One operator or environment; the meaning of its vectors depends on its kind.
+    """Settings of one operator or environment, which exerts a torque on an arm.
+
+    Which settings are used, and the meaning of the vectors, depend on the kind.
 
     Attributes:
         kind: The kind of operator or environment.
@@ -172,7 +174,7 @@ def torque_source_rows(
     """Converts operators and environments to arrays, which compiled code can read.
 
     Args:
-        actors: Operators and environments.
+        actors: Operators and environments of the arm, one row for each.
         joints: Number of joints of the arm.
         axes: Number of Cartesian axes: 2 for the planar arm, 3 for a chain of joints.
 
@@ -192,6 +194,7 @@ def torque_source_rows(
         for name in _NUMBERS:
             numbers = getattr(actor, name)
             row[name][: len(numbers)] = numbers
+
         row.kind = int(actor.kind)
         row.sampled = int(actor.sampled)
         row.coordinates = axes if actor.kind is TorqueKind.OWN_TIP else joints
@@ -204,6 +207,8 @@ def torque_source_rows(
             content = np.resize(numbers, (row_count, width))
         if content is None:
             continue
+
+        # All tables have the same number of columns, filled up with zeros.
         columns = np.shape(content)[1]
         table = np.zeros((len(content), width))
         table[:, :columns] = content
@@ -216,7 +221,7 @@ def torque_source_rows(
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns the progress of a minimum-jerk motion, a smooth motion as of a human arm.
+    """Returns the progress of a minimum-jerk motion, as smooth as the motion of a human arm.
 
         10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
 
@@ -236,10 +241,10 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
         return 1.0, 0.0
     duration_s = end_s - start_s
     x = (t_s - start_s) / duration_s
-    rest = 1.0 - x
+    remaining = 1.0 - x
     polynomial = 10.0 + x * (6.0 * x - 15.0)
     progress = x * x * x * polynomial
-    rate = 30.0 * x * x * rest * rest / duration_s
+    rate = 30.0 * x * x * remaining * remaining / duration_s
     return progress, rate
 
 
@@ -247,17 +252,20 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
 def _spring_along(
     actor: Row, i: int, progress: float, rate: float, at: float, speed: float
 ) -> float:
-    """Returns the force of a hand's spring and damper along coordinate `i`, N or N m.
+    """Returns the force of the spring and damper by which an operator pulls the arm.
 
-        K (target - at) + B (target' - speed),    target = a + progress (b - a)
+    It is the force or torque along one coordinate, N or N m:
+
+        K (target - at) + B (target_speed - speed),    target = a + progress (b - a)
 
     Args:
-        actor: The actor's row.
-        i: The coordinate.
-        progress: Progress of the target from `a` to `b`.
-        rate: Its derivative, 1/s.
+        actor: Data of the operator, with the stiffness K, the damping B and the path of the
+            target from a to b.
+        i: Index of the coordinate.
+        progress: Progress of the target from a to b, 0 to 1.
+        rate: Derivative of `progress`, 1/s.
         at: Position of the arm along the coordinate, rad or m.
-        speed: Its derivative.
+        speed: Derivative of `at`.
     """
     start: float = actor.a[i]
     distance: float = actor.b[i] - start
@@ -270,14 +278,15 @@ def _spring_along(
 
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
-    """Returns the progress of a target on its path from `a` to `b`, and its rate, 1/s.
+    """Returns how far the target of an operator is on its path from `a` to `b`, and its rate.
 
-    A spring of an operator pulls the arm to this target. The target of a script moves along a
-    minimum-jerk path. The target of a live hand is at `a` and moves by b - a per second.
+    The spring of the operator pulls the arm to this target. A scripted operator moves the
+    target along a minimum-jerk path. If a person or program moves the arm (live hand), the
+    target is at `a`, and moves by b - a per second.
 
     Args:
-        actor: Row of the operator, see `torque_source_dtype`.
-        t_s: Time since the epoch, the common start of the session, s.
+        actor: Data of the operator, see `torque_source_dtype`.
+        t_s: Time since the start of the session, s.
 
     Returns:
         The progress, 0 to 1, for the position a + progress (b - a) of the target, and its
@@ -292,31 +301,31 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the factor that reduces the force of a live hand to its grip and its limit.
+    """Returns the factor that reduces the force of a person who moves the arm (live hand).
 
-    A live hand is a person or program that moves the arm during the run. The part `grip` of its
-    force acts, and the norm of the force before this reduction is at most `limit`.
+    The norm of the force is first limited, as a human hand is. Then it is multiplied by the
+    grip: 1 for a firm grip, 0 after the hand has let go.
 
     Args:
-        actor: Row of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
-        square: Square of the norm of the whole force, N^2 or N^2 m^2.
+        actor: Data of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
+        square: Square of the norm of the force, N^2 or N^2 m^2.
     """
-    share: float = actor.grip
+    factor: float = actor.grip
     if square > actor.limit * actor.limit:
-        share *= actor.limit / math.sqrt(square)
-    return share
+        factor *= actor.limit / math.sqrt(square)
+    return factor
 
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
     """Returns the force of an operator, who pulls the arm to a target, N or N m.
 
-    A spring and a damper act between the arm and the target along two coordinates. A live hand,
-    an operator who moves the arm during the run, is limited and acts only as far as it grips.
-    The kind LIVE_FORCE has no spring: its force is given.
+    A spring and a damper act between the arm and the target along two coordinates. The force of
+    a person who moves the arm during the run (live hand) is limited, and smaller while the grip
+    is not firm. The kind LIVE_FORCE has no spring: its force is given.
 
     Args:
-        actor: Row of the operator, see `torque_source_dtype`.
+        actor: Data of the operator, see `torque_source_dtype`.
         t_s: Time since the start of the session, s.
         at: Position of the arm along the coordinates, rad or m.
         speed: Derivative of the position, rad/s or m/s.
@@ -335,21 +344,22 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
         x = actor.a[0]
         y = actor.a[1]
     square = x * x + y * y
-    share = _live_share(actor, square)
-    return share * x, share * y
+    factor = _live_share(actor, square)
+    return factor * x, factor * y
 
 
 @leaf
 def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
-    """Returns the two rows of a table around a time, and the fraction between them.
+    """Finds the two rows of recorded torques between which to interpolate at a time.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator, with the place of its rows in the common table.
         t_s: Time since the start of the session, s.
-        table: Tables of all actors.
+        table: Tables of all operators and environments. Column 0 is the time of a row, s.
 
     Returns:
-        The indices of the rows, which are -1 outside of the table, and the fraction, 0 to 1.
+        The indices of the rows before and after the time, and where the time lies between
+        them, from 0 to 1. The indices are -1 if the time is outside of the recording.
     """
     first = actor.table_first
     count = actor.table_count
@@ -357,6 +367,7 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
     if count < 1 or t_s < table[first, 0] or t_s > table[last, 0]:
         return -1, -1, 0.0
     before = count_started(table, first, count, t_s) - 1
+    # At the time of the last row, interpolate between the last two rows.
     offset = max(min(before, count - 2), 0)
     low = first + offset
     high = min(low + 1, last)
@@ -368,12 +379,14 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
 
 @leaf
 def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Returns the torque of a table by linear interpolation; zero outside of the table.
+    """Returns the torque of an operator whose torques were recorded, by linear interpolation.
+
+    The torque is zero before and after the recording.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator.
         t_s: Time since the start of the session, s.
-        table: Tables of all actors.
+        table: Tables of all operators and environments, for example of recorded torques.
     """
     low, high, x = _find_table_rows(actor, t_s, table)
     if low < 0:
@@ -398,15 +411,16 @@ def _sine_of_turns(turns: float) -> float:
 
 @leaf
 def _chirp_size(actor: Row, t_s: float) -> float:
-    """Returns the sine of a chirp, a sine whose frequency changes linearly within a sweep.
+    """Returns the present value of a chirp, a sine whose frequency rises or falls with time.
 
-    With the frequencies f0 and f1 at the start and the end of a sweep, and the time x within
-    the present sweep, this is
+    Such a torque excites the arm at all frequencies of a range, one after another, in repeated
+    sweeps. With the frequencies f0 and f1 at the start and the end of a sweep, the duration
+    span of a sweep, and the time x since the present sweep began, the value is
 
         sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator, with the frequencies in `b`, Hz.
         t_s: Time since the start of the session, s.
     """
     first_hz = actor.b[0]
@@ -423,12 +437,14 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
 @leaf
 def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the sum of the sines of a multisine, each with amplitude 1.
+    """Returns the present value of a multisine, a sum of sines that each have the amplitude 1.
+
+    Such a torque excites the arm at several frequencies at once.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator.
         t_s: Time since the start of the session, s.
-        table: Tables of all actors, here rows of frequency, Hz, and phase, turns.
+        table: Tables of all actors, here with rows of frequency, Hz, and phase, turns.
     """
     total = 0.0
     first = actor.table_first
@@ -443,15 +459,19 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
 @leaf
 def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the torque of a pulse, chirp or multisine as a multiple of `a`.
+    """Returns the present value of a scripted torque, as a multiple of its amplitude `a`.
 
-    A pulse is sin^2(pi (t - start) / (end - start)), which is smooth at both ends as in Fig. 3
-    of the paper. The paper does not print the numbers of its pulses.
+    The torque is a pulse, a chirp or a multisine. A pulse is
+
+        sin^2(pi (t - start) / (end - start))
+
+    which is smooth at both ends as in Fig. 3 of the paper. The paper does not print the numbers
+    of its pulses.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator.
         t_s: Time since the start of the session, s.
-        table: Tables of all actors.
+        table: Tables of all operators and environments, for example of recorded torques.
     """
     if actor.kind == _PULSE:
         elapsed_s = t_s - actor.start_s
@@ -465,25 +485,26 @@ def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
 @leaf
 def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
-    """Returns the force of a wall on the end effector, N.
+    """Returns the force of a wall on the end effector of the planar arm, N.
 
-    The force acts along the wall's normal and never pulls.
+    The wall is a spring and a damper. The force acts along the wall's normal and never pulls.
 
     Args:
-        actor: Row of the wall.
+        actor: Data of the wall: a point of it in `a`, m, and its outward normal in `b`.
         at: Position of the end effector, m.
-        speed: Its velocity, m/s.
+        speed: Velocity of the end effector, m/s.
     """
     normal_x = actor.b[0]
     normal_y = actor.b[1]
     x = actor.a[0] - at[0]
     y = actor.a[1] - at[1]
     depth = x * normal_x + y * normal_y
-    if not depth > 0.0:
+    is_touched = depth > 0.0  # False for NaN
+    if not is_touched:
         return 0.0, 0.0
-    outward = speed[0] * normal_x + speed[1] * normal_y
+    outward_speed = speed[0] * normal_x + speed[1] * normal_y
     spring = actor.K[0] * depth
-    damper = actor.B[0] * outward
+    damper = actor.B[0] * outward_speed
     push = max(spring - damper, 0.0)
     return push * normal_x, push * normal_y
 
@@ -508,7 +529,7 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
     (`effort`), which is zero until then.
 
     Args:
-        actor: Row of the actor. `call` is the address of the function.
+        actor: Data of the operator or environment. `call` is the address of the function.
         t_s: Time since the epoch (the common start of the session), s.
         table: Tables of all actors. The rows `table_first` to `table_first + table_count` hold
             the numbers of the user's model.
@@ -524,14 +545,16 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
 
 @leaf
 def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
-    """Returns the effort of a user's function along two joints or axes, N m or N.
+    """Returns the torque or force of an operator or environment that a user programmed.
+
+    It acts along the two joints of the planar arm, N m, or along two axes, N.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator or environment.
         t_s: Time since the start of the session, s.
         at: Position along the joints or axes, rad or m.
-        speed: Its derivative.
-        table: Tables of all actors.
+        speed: Derivative of the position, rad/s or m/s.
+        table: Tables of all operators and environments, for example of recorded torques.
     """
     for i in range(2):
         actor.at[i] = at[i]
@@ -544,15 +567,18 @@ def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: Torqu
 def _end_effector_torque(
     actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the joint torque J' F of an actor at the end effector, and |F| of a wall, N.
+    """Returns the joint torque of an operator or environment that acts at the end effector.
+
+    Its force F has the effect of the joint torque J' F, where J is the Jacobian of the end
+    effector. The third number is the norm of F for a wall, N, and 0 otherwise.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator or environment.
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
-        table: Tables of all actors.
+        table: Tables of all operators and environments, for example of recorded torques.
     """
     _, at = forward_kinematics(lengths, q)
     J_x, J_y = end_effector_jacobian(lengths, q)
@@ -590,7 +616,8 @@ def source_torque(
         The torques on the two joints, N m, and the force of the wall, N. The force is 0 if the
         environment is not a wall.
     """
-    if not actor.start_s <= t_s < actor.end_s:
+    is_active = actor.start_s <= t_s < actor.end_s
+    if not is_active:
         return 0.0, 0.0, 0.0
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         torque = _spring_force(actor, t_s, q, qd)
@@ -635,7 +662,8 @@ def add_source_torque(
         lengths: Lengths of the two links, m.
         actor: Parameters of the operator or environment.
         table: Recorded torques and other numbers of all operators and environments.
-        sampled: 1 to add only a sampled actor, 0 to add only others.
+        sampled: 1 to add the torque only if it is constant during a control period (sampled). 0
+            to add it only if it acts continuously.
 
     Returns:
         The new total. It is `total` if the actor is not of the requested sort.
@@ -693,14 +721,17 @@ def torque_on_arm(
 def _force_in_space(
     actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable
 ) -> Three:
-    """Returns the force of an actor on an end effector in three dimensions, N.
+    """Returns the force of an operator or environment on the end effector of a chain, N.
+
+    The force is that of a user's function, of an operator, who pulls the end effector by a
+    spring, or of a wall, which pushes it.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator or environment.
         t_s: Time since the start of the session, s.
         at: Position of the end effector, m.
-        speed: Its velocity, m/s.
-        table: Tables of all actors.
+        speed: Velocity of the end effector, m/s.
+        table: Tables of all operators and environments, for example of recorded torques.
     """
     if actor.kind == _OWN_TIP:
         for i in range(3):
@@ -724,19 +755,20 @@ def _force_in_space(
         if actor.kind == _LIVE_FORCE:
             x, y, z = three(actor.a)
         square = x * x + y * y + z * z
-        share = _live_share(actor, square)
+        factor = _live_share(actor, square)
         force = (x, y, z)
-        return scale(share, force)
+        return scale(factor, force)
 
     # A wall.
     normal = three(actor.b)
     point = three(actor.a)
     depth = dot(point, normal) - dot(at, normal)
-    if not depth > 0.0:
+    is_touched = depth > 0.0  # False for NaN
+    if not is_touched:
         return 0.0, 0.0, 0.0
-    outward = dot(speed, normal)
+    outward_speed = dot(speed, normal)
     spring = actor.K[0] * depth
-    damper = actor.B[0] * outward
+    damper = actor.B[0] * outward_speed
     push = max(spring - damper, 0.0)
     return scale(push, normal)
 
@@ -751,43 +783,46 @@ def _add_joint_torque(
     table: TorqueTable,
     torque: Array,
 ) -> None:
-    """Adds the torque of an actor that acts on the joints of a chain.
+    """Adds the torque of an operator or environment that acts on the joints of a chain.
 
     Args:
-        actor: Row of the actor.
+        actor: Data of the operator or environment.
         t_s: Time since the start of the session, s.
-        q: Joint positions, shape (n,).
-        qd: Joint velocities, shape (n,).
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
         joints: Number n of joints.
-        table: Tables of all actors.
-        torque: Changed, shape (n,), N m.
+        table: Tables of all operators and environments, for example of recorded torques.
+        torque: The torque is added to it, shape (n,), N m.
     """
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
+        # An operator, who pulls each joint to a target by a spring.
         progress, rate = _target_progress(actor, t_s)
-        share = 1.0
+        factor = 1.0
         square = 0.0
         if actor.kind == _LIVE_JOINT:
+            # The limit applies to the norm over all joints, which must be known first.
             for i in range(joints):
                 pull = _spring_along(
                     actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
                 )
                 square += pull * pull
-            share = _live_share(actor, square)
+            factor = _live_share(actor, square)
         for i in range(joints):
             pull = _spring_along(
                 actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
             )
-            torque[i] += share * pull
+            torque[i] += factor * pull
     elif actor.kind == _VISCOUS:
         for i in range(joints):
             torque[i] -= actor.B[i] * qd[i]
     elif actor.kind == _RECORDED:
-        low, high, x = _find_table_rows(actor, t_s, table)
-        if low >= 0:
+        low, high, fraction = _find_table_rows(actor, t_s, table)
+        is_recorded = low >= 0
+        if is_recorded:
             for i in range(joints):
-                recorded = table[low, 1 + i]
-                step = table[high, 1 + i] - recorded
-                torque[i] += recorded + x * step
+                before = table[low, 1 + i]
+                step = table[high, 1 + i] - before
+                torque[i] += before + fraction * step
     elif actor.kind == _OWN_JOINTS:
         for i in range(joints):
             actor.at[i] = q[i]
@@ -803,14 +838,13 @@ def _add_joint_torque(
 
 @leaf
 def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]:
-    """Returns position and velocity of a chain's end effector, m and m/s.
-
-    Its Jacobian remains in the chain's rows.
+    """Returns the position and the velocity of the end effector of a chain, m and m/s.
 
     Args:
-        qd: Joint velocities, shape (n,).
-        tip: End effector in the last link's frame, m.
-        chain: Rows of the joints, after `place_joints`.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        tip: Position of the end effector in the last link's frame, m.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called
+            before. The Jacobian of the end effector is written into it.
     """
     position = place_end_effector(chain, tip)
     velocity = (0.0, 0.0, 0.0)
@@ -856,6 +890,7 @@ def put_torque_on_chain(
     n = chain.shape[0]
     for i in range(n):
         torque[i] = 0.0
+    # The motion of the end effector is computed only if an operator or environment needs it.
     at = (0.0, 0.0, 0.0)
     speed = (0.0, 0.0, 0.0)
     has_motion = False
@@ -865,6 +900,7 @@ def put_torque_on_chain(
         is_active = actor.start_s <= t_s < actor.end_s
         if actor.sampled != sampled or not is_active:
             continue
+
         if not _is_at_end_effector(actor):
             _add_joint_torque(
                 actor=actor, t_s=t_s, q=q, qd=qd, joints=n, table=table, torque=torque
@@ -874,6 +910,7 @@ def put_torque_on_chain(
             at, speed = _tip_motion(qd, tip, chain)
             has_motion = True
         force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
+        # The torque J' F, where J is the Jacobian.
         for i in range(n):
             column = three(chain[i].J_lin)
             torque[i] += dot(column, force)

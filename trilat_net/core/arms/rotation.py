@@ -84,7 +84,7 @@ def rotation_matrix(vector: Three) -> Matrix:
 
 @leaf
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
-    """Returns the quaternion (w, v) of a rotation, with w >= 0.
+    """Converts a rotation matrix to a quaternion (w, v), with the scalar part w >= 0.
 
     The method starts from the largest component (Shepperd, 1978), and so never divides by a
     small number.
@@ -121,16 +121,17 @@ def rotation_vector(R: Array | Matrix) -> Three:
     Args:
         R: The rotation matrix, three rows.
     """
+    # w is the cosine of half the angle. v is the axis times the sine of half the angle.
     w, v = _quaternion(R)
     x, y, z = v
     square = x * x + y * y + z * z
-    n = math.sqrt(square)
-    if n < _SMALL:
+    sine = math.sqrt(square)
+    if sine < _SMALL:
         return scale(2.0 / w, v)
     # `arctan` takes arguments up to 1.
-    half_angle = arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n)
+    half_angle = arctan(sine / w) if sine <= w else 0.5 * math.pi - arctan(w / sine)
     angle = 2.0 * half_angle
-    return scale(angle / n, v)
+    return scale(angle / sine, v)
 
 
 @leaf
@@ -138,8 +139,8 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
     """Returns the rotation from the orientation `other` to the orientation R, in base axes.
 
     Args:
-        R: Rotation matrix of the one orientation, three rows.
-        other: Rotation matrix of the other orientation, three rows.
+        R: Rotation matrix of the first orientation, three rows.
+        other: Rotation matrix of the second orientation, three rows.
 
     Returns:
         The rotation vector of R other', whose direction is the axis and whose length is the
@@ -156,9 +157,10 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 
 @leaf
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
-    """Returns a row of a matrix times the transpose of a matrix with the rows a, b and c.
+    """Returns the scalar products of a vector with the vectors a, b and c.
 
-    Its three numbers are the scalar products of `row` with a, b and c.
+    This is a row of the product of a matrix with the transpose of the matrix with the rows a, b
+    and c.
     """
     x = row[0]
     y = row[1]
@@ -175,7 +177,7 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
 
     All three are rotation vectors: the direction is the axis, the length the angle in rad. With
     the rotation matrices T of `turn` and R of `vector`, the result is the rotation vector of
-    T R. `relative_rotation` returns that of T X' for a matrix X. Therefore X is the inverse R'.
+    T R.
 
     Args:
         turn: Rotation vector of the second rotation.
@@ -184,6 +186,7 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
     second_matrix = rotation_matrix(turn)
     inverse_vector = scale(-1.0, vector)
     first_matrix_inverse = rotation_matrix(inverse_vector)
+    # `relative_rotation` transposes its second matrix, and the transpose of R' is R.
     return relative_rotation(second_matrix, first_matrix_inverse)
 
 
@@ -207,18 +210,22 @@ def length(vector: Three) -> float:
 
 @leaf
 def angular_velocity(turn: Three, rate: Three) -> Three:
-    """Returns the angular velocity of a body whose rotation vector changes, rad/s.
+    """Returns the angular velocity of a body with a changing rotation vector, rad/s.
 
     The angular velocity differs from the derivative of the rotation vector as soon as the axis
-    changes too.
+    changes too. With the rotation vector u, its length a (the angle) and its derivative u', the
+    angular velocity is the left Jacobian times u':
+
+        w = u' + (1 - cos a) / a^2  u x u' + (a - sin a) / a^3  u x (u x u')
 
     Args:
-        turn: The rotation vector, rad.
+        turn: The rotation vector u, rad.
         rate: The derivative of the rotation vector, rad/s.
     """
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
+        # Series, because the differences would lose digits.
         a4 = a2 * a2
         once_gain = 0.5 - a2 / 24.0 + a4 / 720.0
         twice_gain = 1.0 / 6.0 - a2 / 120.0 + a4 / 5040.0
@@ -226,10 +233,10 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
         s, c = sincos(angle)
         once_gain = (1.0 - c) / a2
         twice_gain = (angle - s) / (a2 * angle)
-    once = cross(turn, rate)
-    twice = cross(turn, once)
-    once_part = scale(once_gain, once)
-    twice_part = scale(twice_gain, twice)
+    crossed_once = cross(turn, rate)
+    crossed_twice = cross(turn, crossed_once)
+    once_part = scale(once_gain, crossed_once)
+    twice_part = scale(twice_gain, crossed_twice)
     correction = add(once_part, twice_part)
     return add(rate, correction)
 

@@ -57,9 +57,10 @@ def has_orientation(s: Row) -> bool:
 
 @leaf
 def count_linear_coordinates(s: Row) -> int:
-    """Returns the number of shared coordinates for which a difference is a plain subtraction.
+    """Returns the number of shared coordinates that are not part of an orientation.
 
-    They come first, and are all coordinates except those of an orientation.
+    They come first. The difference of two such coordinates is a plain subtraction, but that of
+    two orientations is a rotation.
     """
     return POSITION if has_orientation(s) else s.q_des.shape[0]
 
@@ -68,16 +69,17 @@ def count_linear_coordinates(s: Row) -> int:
 def update_pose(s: Row, chain: RowArray) -> None:
     """Computes the motion of the end effector from that of the joints.
 
-    The pose x, its velocity xd, the Jacobian J and the derivative of J are written into the row
-    of the site. The coordinates are a position, or a position and a rotation vector. They refer
-    to the frame that all arms share.
+    The results are the pose x, its velocity xd, the Jacobian J and the derivative of J. The
+    coordinates are a position, or a position and a rotation vector. They refer to the frame
+    that all arms share.
 
     Args:
-        s: Row of the site, with the joint positions q and velocities qd; written. `tip` is the
-            end effector's position in the frame of the last link, m, `tip_back` the inverse of
-            its orientation in this frame, and `scale` the size of the shared coordinates in
-            relation to this arm.
-        chain: Rows of the chain, after `place_joints`.
+        s: State of the site (the process that runs the arm), with the joint positions q and
+            velocities qd; written. `tip` is the end effector's position in the frame of the
+            last link, m, `tip_back` the inverse of its orientation in this frame, and `scale`
+            the size of the shared coordinates in relation to this arm.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called
+            before.
     """
     # This also writes the frames of the links and the columns of J in base axes.
     position = place_end_effector(chain, s.tip)
@@ -111,13 +113,16 @@ def update_pose(s: Row, chain: RowArray) -> None:
 
 @leaf
 def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
-    """Writes the derivative of J along qd.
+    """Computes the time derivative of the end effector's Jacobian J, for joint velocities qd.
 
-    The axes turn with their links, and the joints' origins move.
+    J has a column for each joint. It changes because the axes of the joints turn with their
+    links, and because their origins and the end effector move.
 
     Args:
-        s: The site's row.
-        chain: The chain's rows, after `place_end_effector`.
+        s: State of the site (the process that runs the arm), with qd; the derivative is written
+            into `Jd`.
+        chain: Data of the joints, one row per joint. `place_end_effector` must have been called
+            before.
         tip: Position of the end effector in base axes, m.
     """
     zeros = (0.0, 0.0, 0.0)
@@ -129,6 +134,7 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
         column = three(chain[i].J_lin)
         joint_part = scale(s.qd[i], column)
         tip_velocity = add(tip_velocity, joint_part)
+
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         axis = three(row.axis_base)
@@ -171,8 +177,11 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 
     where R_j is the orientation of arm j, alpha_ij the weight with which this arm follows it,
     and Log converts a rotation matrix to a rotation vector. The angular velocity is the
-    weighted sum of the other arms' angular velocities. It is exact only if the orientations
-    agree.
+    weighted sum of the other arms' angular velocities w_j, plus the effect of changing weights:
+
+        sum_j (alpha_ij w_j - alpha_ij' Log(R_i R_j'))
+
+    It is exact only if the orientations agree.
 
     Args:
         s: State of the site (the process that runs this arm); the reference is written into it.
@@ -201,11 +210,11 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 
 @leaf
 def _factor(s: Row, damping: float) -> None:
-    """Writes the factors L D L' of J J' + damping I into the lower part of `s.A`.
+    """Factors the matrix J J' + damping I as L D L', so that `_solve` can divide by it.
 
-    L is a lower triangular matrix with ones on its diagonal, and D a diagonal matrix. They are
-    stored together: D on the diagonal of A, and L below it. Row by row, with the matrix
-    B = J J' + damping I,
+    J is the Jacobian of the end effector. L is a lower triangular matrix with ones on its
+    diagonal, and D a diagonal matrix. They are stored together in `s.A`: D on the diagonal, and
+    L below it. Row by row, with the matrix B = J J' + damping I,
 
         L_jk D_k = B_jk - sum_{p < k} L_jp L_kp D_p    for k < j
         D_j      = B_jj - sum_{p < j} L_jp^2 D_p
@@ -215,7 +224,8 @@ def _factor(s: Row, damping: float) -> None:
     the axis, and L is zero in its column.
 
     Args:
-        s: Row of the site. `axes` is 1 for each axis that is followed, otherwise 0.
+        s: State of the site (the process that runs the arm). `axes` is 1 for each axis that is
+            followed, otherwise 0.
         damping: The damping, in the unit of J J'. It is zero except near singular poses.
     """
     J = s.J
@@ -239,38 +249,44 @@ def _factor(s: Row, damping: float) -> None:
 
 @leaf
 def _solve(s: Row, b: Array, y: Array) -> None:
-    """Writes the solution y of L D L' y = b, with the factors in `s.A`.
+    """Solves the linear equations L D L' y = b, with the factors that `_factor` has computed.
 
     Args:
-        s: Row of the site.
-        b: Right-hand side, shape (m,).
-        y: Written, shape (m,).
+        s: State of the site (the process that runs the arm). `A` has D on its diagonal, and the
+            lower triangular matrix L below it.
+        b: Right-hand side, shape (m,) for m coordinates of the end effector.
+        y: Receives the solution, shape (m,).
     """
     A = s.A
-    m = s.shared
-    for j in range(m):
+    coordinates = s.shared
+    # Substitute forwards: y becomes the solution of L y = b.
+    for j in range(coordinates):
         y[j] = b[j]
         for k in range(j):
             y[j] -= A[j, k] * y[k]
-    for j in range(m - 1, -1, -1):
+
+    # Divide by D, and substitute backwards.
+    for j in range(coordinates - 1, -1, -1):
         pivot = A[j, j]
         y[j] = y[j] / pivot if pivot > TINY else 0.0
-        for k in range(j + 1, m):
+        for k in range(j + 1, coordinates):
             y[j] -= A[k, j] * y[k]
 
 
 @leaf
 def _factor_damped(s: Row) -> None:
-    """Factors J J' with the damping that it needs near singular poses.
+    """Factors J J', with a damping near singular poses, where the arm can hardly move.
 
-    The number 1 / trace((J J')^-1) is a lower bound of the square of the least singular value
-    of J. The damping is the amount by which it is below the square of `s.singular_value`, and
-    zero otherwise. The trace is that of the axes that are followed. It is computed from the
-    factors without damping, by solving for each column of the inverse.
+    J is the Jacobian of the end effector. The number 1 / trace((J J')^-1) is a lower bound of
+    the square of the least singular value of J. The damping is the amount by which it is below
+    the square of `s.singular_value`, and zero otherwise. The trace is that of the axes that are
+    followed. It is computed from the factors without damping, by solving for each column of the
+    inverse.
 
     Args:
-        s: Row of the site. J and its derivative Jd get rows of zeros for axes that are not
-            followed. The factors are written into A, see `_factor`. `b` and `y` are work space.
+        s: State of the site (the process that runs the arm). J and its derivative Jd get rows
+            of zeros for axes that are not followed. The factors are written into A, see
+            `_factor`. `b` and `y` are work space.
     """
     for j in range(s.shared):
         mask = s.axes[j]
@@ -302,7 +318,7 @@ def _factor_damped(s: Row) -> None:
 
 @leaf
 def _update_axis_errors(s: Row) -> None:
-    """Writes the error e of the end effector and its derivative ed, for each axis of the task.
+    """Computes the error e of the end effector and its derivative ed, for each axis.
 
     For a position, e is the difference from the reference, m. For a pose, the last three
     numbers of e are the rotation vector from the reference orientation to the present one, rad.
@@ -328,11 +344,12 @@ def update_task_errors(s: Row) -> None:
     """Computes the errors of the end effector, and the reference motion of the joints.
 
     The results are the errors e and ed of the coordinates that are followed, the reference
-    velocity v and acceleration a of the joints, and the filtered error r = qd - v. The
-    equations are at the top of this module.
+    velocity v and acceleration a of the joints, and the filtered error r = qd - v. With the
+    Jacobian J and a velocity psi that pulls the joints to a preferred posture,
 
-    The fields `stage_q` and `stage_qd`, which the integrator needs later, are overwritten with
-    intermediate results.
+        v = psi + J' y                J J' y     = -Lambda e - J psi
+        a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
+                                                   - (Jd J' + J Jd') y
 
     Args:
         s: State of the site (the process that runs the arm); the results are written into it.
@@ -345,12 +362,14 @@ def update_task_errors(s: Row) -> None:
     y = s.y
     v = s.v
     a = s.a
+    # Jd' y and J' y are stored in fields that the integrator needs only later.
     Jd_y = s.stage_q
     J_y = s.stage_qd
     _update_axis_errors(s)
     _factor_damped(s)
     k = s.posture_rate
-    # y, from J J' y = -Lambda e - J psi
+
+    # y, from J J' y = -Lambda e - J psi, with psi = -k (q - q_posture)
     for j in range(m):
         b[j] = -s.Lambda[j] * s.e[j]
         for i in range(n):
@@ -368,7 +387,8 @@ def update_task_errors(s: Row) -> None:
         for j in range(m):
             Jd_y[i] += Jd[j, i] * y[j]
             J_y[i] += J[j, i] * y[j]
-    # y', from J J' y' = -Lambda e' - Jd (psi + J' y) - J (psi' + Jd' y)
+
+    # dy/dt, from J J' dy/dt = -Lambda de/dt - Jd (psi + J' y) - J (dpsi/dt + Jd' y)
     for j in range(m):
         b[j] = -s.Lambda[j] * s.ed[j]
         for i in range(n):
@@ -378,7 +398,8 @@ def update_task_errors(s: Row) -> None:
             J_part = J[j, i] * acceleration
             b[j] -= Jd_part + J_part
     _solve(s, b, y)
-    # v = psi + J' y and a = psi' + Jd' y + J' y'
+
+    # v = psi + J' y and a = dpsi/dt + Jd' y + J' dy/dt
     for i in range(n):
         v[i] += J_y[i]
         a[i] += Jd_y[i]
@@ -389,16 +410,17 @@ def update_task_errors(s: Row) -> None:
 
 @leaf
 def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: Array) -> None:
-    """Adds the joint torque that exerts a force at the end effector.
+    """Adds the joint torque by which a control law exerts a force at the end effector.
 
-    The torque is factor J' (gains * values), where J is the Jacobian of the end effector.
+    The force is a gain times a value, for example a stiffness times a position error. The
+    torque is factor J' (gains * values), where J is the Jacobian of the end effector.
 
     Args:
-        s: Row of the site, with J.
-        gains: Gain per coordinate of the task.
-        values: Value per coordinate of the task.
+        s: State of the site (the process that runs the arm), with J.
+        gains: Gain per coordinate of the end effector.
+        values: Value per coordinate of the end effector.
         factor: Factor of the force.
-        torque: Changed: the sum, shape (n,), N m.
+        torque: The torque is added to it, shape (n,), N m.
     """
     for i in range(s.joints):
         for j in range(s.shared):
@@ -419,8 +441,9 @@ def update_wrench(s: Row) -> None:
     been factored before, with its damping near singular poses (`update_task_errors`).
 
     Args:
-        s: Row of the site, with the torque ON each joint in `on_arm`, N m. The wrench is
-            written into it, N and N m, one number per shared coordinate.
+        s: State of the site (the process that runs the arm), with the torque ON each joint in
+            `on_arm`, N m. The wrench is written into it, N and N m, one number per shared
+            coordinate.
     """
     J_tau_x = s.b
     for j in range(s.shared):

@@ -76,9 +76,10 @@ def theta_from_links(links: ArmLinks) -> Array:
 
 @leaf
 def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the inertia matrix M(q) of the arm, two rows, kg m^2.
+    """Returns the inertia matrix M(q) of the planar arm, two rows, kg m^2 (Section IV).
 
-    See Section IV of the paper, and its Property 1.
+        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
+            | theta_3 + theta_2 cos(q2)      theta_3                   |
 
     Args:
         theta: Parameters of the arm, shape (5,).
@@ -95,9 +96,10 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def gravity(theta: Vector, g: float, q: Vector) -> Pair:
-    """Returns the gravity torque G(q) of the planar arm, N m per joint.
+    """Returns the gravity torque G(q) of the planar arm, which holds the arm, N m per joint.
 
-    A torque of this size holds the arm.
+        G = g | theta_4 cos(q1) + theta_5 cos(q1 + q2) |
+              | theta_5 cos(q1 + q2)                   |
 
     Args:
         theta: Parameters of the arm, shape (5,).
@@ -190,14 +192,16 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
     m11 = theta[0] + 2.0 * theta[1] * c2
     m12 = theta[2] + theta[1] * c2
     m22 = theta[2]
-    h = -theta[1] * s2
+    h = -theta[1] * s2  # the factor of all terms of C
     coriolis_1 = h * qd2 * (2.0 * qd1 + qd2)
+    # The gravity torques: both act on the first joint, only `outer` on the second.
     inner = theta[3] * g * c1
     outer = theta[4] * g * c12
     # The torques that accelerate the arm.
     f1 = torque[0] - coriolis_1 - inner - outer
     centrifugal_2 = h * qd1 * qd1
     f2 = torque[1] + centrifugal_2 - outer
+    # Cramer's rule for M qdd = f.
     determinant = m11 * m22 - m12 * m12
     qdd1 = (m22 * f1 - m12 * f2) / determinant
     qdd2 = (m11 * f2 - m12 * f1) / determinant

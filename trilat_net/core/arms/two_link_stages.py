@@ -137,9 +137,9 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
     The last two columns of the regressor, g cos q_1 and g cos(q_1 + q_2), belong to gravity.
 
     Args:
-        s: Row of the site, after `update_errors`.
+        s: State of the site (the process that runs the arm), after `update_errors`.
         theta: Parameters of the arm, shape (5,).
-        torque: Written: the torque, shape (2,), N m.
+        torque: Receives the torque, shape (2,), N m.
     """
     inner = s.Y[0, 3] * theta[3]
     outer = s.Y[1, 4] * theta[4]
@@ -148,7 +148,7 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
 
 @leaf
 def update_model(s: Row) -> None:
-    """Computes the model of the planar arm for a user's law.
+    """Computes the dynamics of the planar arm that a control law written by a user may read.
 
     The model consists of the gravity torque G. If the law asks for them, it also contains the
     inertia matrix M and the bias torque C qd + G, where C is the Coriolis matrix.
@@ -160,6 +160,7 @@ def update_model(s: Row) -> None:
         M = inertia(s.known, q)
         put_pair(s.M[0], M[0])
         put_pair(s.M[1], M[1])
+        # Y theta is M a + C v + G, here with v = qd and a = 0.
         Y = regressor(g=s.g, q=q, qd=qd, v=qd, a=(0.0, 0.0))
         for i in range(2):
             s.bias[i] = 0.0
@@ -267,9 +268,10 @@ def find_stage_acceleration(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> Pair:
-    """Returns qdd at a stage of the integrator, rad/s^2.
+    """Computes the joint accelerations for one of the four stages of the Runge-Kutta method.
 
-    The torque is the held u plus the torque of the actors at the time and state of the stage.
+    The torque is the sum of u, which is constant during the control period, and the torque of
+    the operators and environments at the time and state of the stage.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
@@ -279,7 +281,7 @@ def find_stage_acceleration(
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Rows of operators and environments.
+        actors: Operators and environments, one row for each.
         table: Their numbers, for example recorded torques.
     """
     on_arm = torque_on_arm(
@@ -304,7 +306,7 @@ def advance_stage(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
-    """Evaluates stages 2 to 4 of the Runge-Kutta method, from the results of the stage before.
+    """Evaluates stage 2, 3 or 4 of the Runge-Kutta method, from the previous stage.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
@@ -317,7 +319,7 @@ def advance_stage(
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Rows of operators and environments.
+        actors: Operators and environments, one row for each.
         table: Their numbers, for example recorded torques.
 
     Returns:
@@ -352,10 +354,12 @@ def combine_stages(
     qdd_3: Vector,
     qdd_4: Vector,
 ) -> tuple[Pair, Pair]:
-    """Returns the joint angles and velocities at the end of a period, from all four stages.
+    """Completes the Runge-Kutta method: combines its four stages to the motion after a period.
+
+        q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
 
     Args:
-        h_s: The period, s.
+        h_s: The period h, s.
         q: Joint angles at the beginning, rad.
         qd: Joint velocities at the beginning, which are those of stage 1, rad/s.
         qd_2: Joint velocities at stage 2, rad/s.
@@ -474,10 +478,12 @@ def rk4_step(
 
 @leaf
 def move_arm(s: Row, q: Pair, qd: Pair) -> bool:
-    """Writes joint angles and velocities into the row of a site, if they are finite.
+    """Writes joint angles and velocities into the state of a site, if they are finite.
+
+    A simulation that has become unstable stops with its last finite state.
 
     Returns:
-        False if they are not finite. Then the row is unchanged.
+        False if a number is not finite. Then the state is unchanged.
     """
     is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
     if not is_finite:
@@ -493,14 +499,14 @@ def advance_arm(
 ) -> bool:
     """Simulates the motion of the arm in one period (Runge-Kutta method of fourth order).
 
-    The torque `s.u` is held over the period. The joint angles q and velocities qd at its end
-    are written into the row of the site.
+    The torque `s.u` is constant during the period. The joint angles q and velocities qd at the
+    end of the period are written into the state of the site.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
         h_s: The period, s.
-        s: Row of the site; written.
-        actors: Rows of operators and environments.
+        s: State of the site (the process that runs the arm); written.
+        actors: Operators and environments, one row for each.
         table: Their numbers, for example recorded torques.
 
     Returns:

@@ -83,24 +83,24 @@ class HandReach(NamedTuple):
         """
         nearest = tuple(goal)
         if self.low:
-            nearest = tuple(
-                min(max(x, low), high)
-                for x, low, high in zip(goal, self.low, self.high, strict=True)
-            )
+            ranges = zip(goal, self.low, self.high, strict=True)
+            nearest = tuple(min(max(x, low), high) for x, low, high in ranges)
         if not self.centre:
             return nearest
+
         offset = [x - middle for x, middle in zip(nearest, self.centre, strict=True)]
-        radius = math.sqrt(sum(x * x for x in offset))
-        if self.inner_m <= radius <= self.outer_m:
+        distance_m = math.sqrt(sum(x * x for x in offset))
+        if self.inner_m <= distance_m <= self.outer_m:
             return nearest
-        allowed_m = min(max(radius, self.inner_m), self.outer_m)
-        if radius == 0.0:
+
+        allowed_m = min(max(distance_m, self.inner_m), self.outer_m)
+        if distance_m == 0.0:
             # From the centre all directions are equally near: choose the first axis.
             offset[0] = 1.0
-            radius = 1.0
-        factor = allowed_m / radius
-        pairs = zip(offset, self.centre, strict=True)
-        return tuple(middle + factor * x for x, middle in pairs)
+            distance_m = 1.0
+        factor = allowed_m / distance_m
+        centred_offset = zip(self.centre, offset, strict=True)
+        return tuple(middle + factor * x for middle, x in centred_offset)
 
 
 class HandRules(NamedTuple):
@@ -207,8 +207,8 @@ class HandInForce(NamedTuple):
             vector: Field `hand` of the record. It contains the numbers of all fields of this
                 class, in their order.
         """
-        size = (len(vector) - 3) // 2
         grip, number, source, *numbers = vector
+        size = len(numbers) // 2  # of the target and of its velocity
         return cls(
             grip=grip,
             number=int(number),
@@ -284,27 +284,30 @@ def advance_hand(
     """
     refused: list[str] = []
     changes: list[tuple[int, str]] = []
-    now = _move_target(rules, memory) if memory.target else memory
+    state = _move_target(rules, memory) if memory.target else memory
     for command in commands:
-        now, outcome = _accept_command(
-            rules=rules, memory=now, t_ns=t_ns, command=command, locate=locate
+        state, outcome = _accept_command(
+            rules=rules, memory=state, t_ns=t_ns, command=command, locate=locate
         )
         if outcome in (TAKEN, RELEASED):
             changes.append((command.source, outcome))
         elif outcome:
             refused.append(outcome)
 
-    if now.source and t_ns - now.received_ns > SILENCE_NS:
-        changes.append((now.source, SILENT))
+    silence_ns = t_ns - state.received_ns
+    if state.source and silence_ns > SILENCE_NS:
+        changes.append((state.source, SILENT))
         # One less: the silent holder may repeat its number and so take hold again.
-        now = _release(now, now.number - 1)
+        state = _release(state, state.number - 1)
 
-    if not now.target:
-        return HandStep(now, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
-    rate = _find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
-    now = now._replace(rate=rate)
-    vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
-    return HandStep(now, vector, tuple(refused), tuple(changes))
+    if not state.target:
+        return HandStep(state, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
+
+    is_held = state.source != 0
+    rate = _find_rate(rules, state, t_ns) if is_held else _find_fading_rate(rules, state)
+    state = state._replace(rate=rate)
+    vector = [state.grip, float(state.number), float(state.source), *state.target, *rate]
+    return HandStep(state, vector, tuple(refused), tuple(changes))
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
@@ -325,7 +328,8 @@ def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
     target = tuple([x + v * h_s for x, v in zip(memory.target, memory.rate, strict=True)])
     is_held = memory.source != 0
     if is_held:
-        return memory._replace(target=target, grip=min(memory.grip + grip_step, 1.0))
+        grip = min(memory.grip + grip_step, 1.0)
+        return memory._replace(target=target, grip=grip)
 
     grip = max(memory.grip - grip_step, 0.0)
     if grip > 0.0:
@@ -394,10 +398,11 @@ def glide(
     rate: Array,
     rows: Array,
 ) -> float:
-    """Computes how the target of a held arm moves in a series of ticks without a message.
+    """Computes how a person or program pulls an arm in several ticks without a new message.
 
-    The result equals that of `advance_hand`, bit for bit, but one compiled call computes all of
-    the ticks.
+    A simulated spring pulls the arm to a target, which moves to the goal of the last message.
+    The grip, a factor of the force from 0 to 1, grows at first. The result equals that of
+    `advance_hand`, bit for bit, but one compiled call computes all ticks (control periods).
 
     Args:
         first: The first tick.
@@ -410,17 +415,20 @@ def glide(
         goal: The goal, shape (size,).
         target: The target before; changed, shape (size,).
         rate: Its velocity before; changed, shape (size,).
-        rows: Written: one row per tick as `HandInForce`, except number and source.
+        rows: Receives one row per tick, in the form of `HandInForce`. The number and the
+            source of the message (columns 1 and 2) are left to the caller.
 
     Returns:
         The firmness of the grip afterwards.
     """
     h_s = 1.0 / rate_hz
+    # The period, 1e9 / rate_hz in ns, as a part of GRIP_NS.
     grip_step = 1e9 / (GRIP_NS * rate_hz)
     size = target.shape[0]
     for n in range(rows.shape[0]):
         t_ns = (first + n) * 1_000_000_000 // rate_hz
         grip = min(grip + grip_step, 1.0)
+        # An overdue target arrives within one period.
         left_s = max((arrives_ns - t_ns) * 1e-9, h_s)
         if acceleration < math.inf:
             _glide_tick(
@@ -459,7 +467,10 @@ def _glide_tick(
     target: Array,
     rate: Array,
 ) -> None:
-    """Moves a target by a tick, and changes its velocity as `_find_limited_rate` does.
+    """Moves a target towards its goal in one control period, with limited acceleration.
+
+    A simulated spring pulls the arm to this target. The equations of the velocity are those of
+    `_find_limited_rate`, for compiled code.
 
     Args:
         left_s: Time that remains until the target arrives at the goal, s.
@@ -500,38 +511,47 @@ def _accept_command(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> tuple[HandMemory, str]:
-    """Returns the state after a message, and the outcome of the message.
+    """Processes a message of a person or program that holds an arm, or wants to.
+
+    Only one sender holds an arm at a time. A message may take hold of a free arm, move the goal
+    to which the arm is pulled, or release the arm.
 
     Args:
-        rules: Limits of the hand.
+        rules: Limits of the goals.
         memory: State before the message.
         t_ns: Nominal time of the tick (control period), ns since the start of the session.
         command: The message.
         locate: Function that returns the arm's pose now.
 
     Returns:
-        The state, and the outcome: a reason why the message has no effect, a change of the
-        holder, or "" for an ordinary message.
+        The state after the message, and the outcome: a reason why the message has no effect, a
+        change of the holder, or "" for an ordinary message.
     """
-    if memory.source not in (0, command.source):
+    is_held = memory.source != 0
+    if is_held and memory.source != command.source:
         return memory, ANOTHER_HOLDS
 
     # Messages may arrive out of order or twice.
-    last = memory.number if memory.source else memory.before[1]
-    is_known = memory.source or memory.before[0] == command.source
-    if is_known:
-        is_repeated = command.number == last and not memory.source
-        if command.number < last or is_repeated:
+    if is_held:
+        known_source = memory.source
+        newest_number = memory.number
+    else:
+        known_source, newest_number = memory.before
+    if command.source == known_source:
+        is_repeated = command.number == newest_number and not is_held
+        if command.number < newest_number or is_repeated:
             return memory, OUT_OF_ORDER
 
     if not command.grip:
-        if not memory.source:
+        if not is_held:
             return memory, ""
         return _release(memory, command.number), RELEASED
-    if not memory.source:
+    if not is_held:
         return _take_hold(rules, memory, t_ns, command, locate), TAKEN
+
     memory = memory._replace(received_ns=t_ns)
-    if command.number == memory.number:
+    has_new_goal = command.number != memory.number
+    if not has_new_goal:
         return memory, ""
 
     between_messages_ns = command.sent_ns - memory.sent_ns
@@ -589,7 +609,9 @@ def _take_hold(
 def _aim(
     rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
 ) -> HandMemory:
-    """Returns the state with the goal of a message, moved within reach.
+    """Returns the state of a pulled arm with the goal of a new message.
+
+    A goal that the arm cannot reach is moved to the nearest point that it can reach.
 
     Args:
         rules: Limits of the hand.
@@ -605,9 +627,10 @@ def _aim(
 
 
 def _release(memory: HandMemory, number: int) -> HandMemory:
-    """Returns the state after the holder has released the arm: nobody holds it, the grip fades.
+    """Returns the state after a person or program has let go of the arm.
 
-    The grip, the target and its velocity continue, so that the force fades without a jump.
+    Nobody holds the arm, but the grip, the target and its velocity continue, so that the force
+    fades without a jump.
 
     Args:
         memory: State before the release.
@@ -619,29 +642,32 @@ def _release(memory: HandMemory, number: int) -> HandMemory:
 
 
 def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
-    """Returns the velocity of the target while its grip fades, after the hand let go.
+    """Returns the velocity of the target to which an arm is pulled, after the person let go.
 
-    The speed falls with the largest deceleration that `rules` allow, in the direction of
-    motion, until the target stands still.
+    The force fades meanwhile. The speed of the target falls with the largest deceleration that
+    `rules` allow, until the target stands still.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.
-        memory: State of the hand, with the present velocity of the target.
+        memory: State of the pull, with the present velocity of the target.
 
     Returns:
         The velocity, one number per coordinate, in the unit of the target per second.
     """
     speed = math.sqrt(sum(v * v for v in memory.rate))
-    slower = speed - rules.acceleration_limit / rules.rate_hz
-    if slower <= 0.0:
+    largest_change = rules.acceleration_limit / rules.rate_hz
+    next_speed = speed - largest_change
+    if next_speed <= 0.0:
         return (0.0,) * len(memory.rate)
-    return tuple(slower / speed * v for v in memory.rate)
+    return tuple(next_speed / speed * v for v in memory.rate)
 
 
 def _find_limited_rate(
     rules: HandRules, memory: HandMemory, left_s: float
 ) -> tuple[float, ...]:
-    """Returns the velocity of a target whose speed and acceleration are limited.
+    """Returns the velocity with which a target moves towards its goal and stops there.
+
+    A simulated spring pulls an arm to this target. Speed and acceleration are limited.
 
     The desired velocity points to the goal. Its size is the smallest of three speeds: the speed
     limit, the speed that reaches the goal in the time that is left, and the largest speed from
@@ -685,20 +711,23 @@ def _find_limited_rate(
 
 
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
-    """Returns the velocity of a target towards its goal, within the limits of the hand.
+    """Returns the velocity with which a target moves towards its goal.
 
-    The target moves straight, and arrives when the next message is expected, unless this needs
-    more than the largest speed. With a limit of the acceleration, it also slows down in time.
+    A simulated spring pulls an arm to this target. It moves straight, and arrives when the next
+    message with a new goal is expected, unless this needs more than the largest speed. If the
+    acceleration is limited, it also slows down in time.
 
     Args:
-        rules: Limits of the hand.
+        rules: Limits of the target's motion, and the rate of the control loop.
         memory: State, with the target already moved to this tick.
         t_ns: Nominal time of the tick (control period), ns since the start of the session.
 
     Returns:
         The velocity, one number per coordinate, in the unit of the target per second.
     """
-    left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
+    # An overdue target arrives within one period.
+    period_s = 1.0 / rules.rate_hz
+    left_s = max((memory.arrives_ns - t_ns) * 1e-9, period_s)
     if rules.acceleration_limit < math.inf:
         return _find_limited_rate(rules, memory, left_s)
     rate = [(goal - x) / left_s for goal, x in zip(memory.goal, memory.target, strict=True)]

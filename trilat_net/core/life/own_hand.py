@@ -79,7 +79,7 @@ class HandView(NamedTuple):
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
 
     Attributes:
-        k: The tick.
+        k: Number of the tick (control period).
         t_s: Nominal time of the tick since the start of the session, s.
         q: Joint angles of the arm, rad, shape (n,).
         qd: Joint velocities, rad/s.
@@ -115,10 +115,10 @@ class HandProgram(Protocol):
     """
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Decides what the program does with the arm, from what the site knows at a tick.
+        """Decides where the program pulls the arm, from what its control process knows.
 
         Args:
-            now: State of the arm, its target and its peers.
+            now: State of the arm, of the target to which it is pulled, and of the other arms.
 
         Returns:
             The target of the end effector, m, or of the joints, rad, or a force, N, as the
@@ -168,11 +168,12 @@ class OwnHand:
     def find_next_event(self, k: int) -> int:
         """Returns the first tick after `k` in which the program decides or a decision acts.
 
-        Until that tick there is no new command. Therefore `advance_span` computes the ticks
-        before it in one compiled call.
+        A tick is a control period. Until that tick there is no new command. Therefore
+        `advance_span` computes the ticks before it in one compiled call.
         """
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
-        return min([next_decision, *(due for due, _ in self._due if due > k)])
+        next_actions = [due for due, _ in self._due if due > k]
+        return min([next_decision, *next_actions])
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Collects what the user's program may know when it decides how to pull the arm.
@@ -185,56 +186,66 @@ class OwnHand:
         # NumPy reads fields of plain arrays faster than those of records.
         site = np.asarray(arrays.site)
         links = np.asarray(arrays.links)
-        n = layout.joints
-        m = layout.shared
-        q = site["q"][0, :n].copy()
+        joints = layout.joints
+        shared = layout.shared
+        # Copies, because the program may keep the view while the arrays change.
+        q = site["q"][0, :joints].copy()
+        pose = self._locate(q.tolist())
+        no_target = (0.0,) * self._rules.size
         return HandView(
             k=k,
             t_s=k / self._rules.rate_hz,
             q=q,
-            qd=site["qd"][0, :n].copy(),
-            pose=np.asarray(self._locate(q.tolist()), dtype=np.float64),
-            q_des=site["q_des"][0, :m].copy(),
-            tau_x=0.0 - site["on_arm"][0, :n],
-            target=np.array(self._memory.target or (0.0,) * self._rules.size),
+            qd=site["qd"][0, :joints].copy(),
+            pose=np.asarray(pose, dtype=np.float64),
+            q_des=site["q_des"][0, :shared].copy(),
+            # The program gets the negative of the torque ON the arm, as in the records.
+            tau_x=0.0 - site["on_arm"][0, :joints],
+            target=np.array(self._memory.target or no_target),
             grip=self._memory.grip,
-            peers=self._view_peers(k, links, m),
+            peers=self._view_peers(k, links, shared),
         )
 
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
-        """Returns the peers at tick `k`, by the samples in use at the previous tick.
+        """Returns what the program may know about the peers, the other arms.
+
+        It sees the samples (states of the peers) that this site used at the previous tick.
 
         Args:
-            k: The tick.
-            links: Rows of the site's links.
-            coordinates: Count of numbers in the vectors of a peer.
+            k: Number of the tick (control period) of the decision.
+            links: State of each link, one row per peer.
+            coordinates: Number of coordinates of a sample.
         """
         now_ns = tick_ns(k, self._rules.rate_hz)
-        vectors = {name: links[name][:, :coordinates].copy() for name in ("q", "qd", "tau_x")}
+        q = links["q"][:, :coordinates].copy()
+        qd = links["qd"][:, :coordinates].copy()
+        tau_x = links["tau_x"][:, :coordinates].copy()
+        # Lists are faster to read number by number than arrays.
         alpha = links["alpha"].tolist()
-        used = links["used"].tolist()
+        used_ticks = links["used"].tolist()
         rates_hz = links["rate_hz"].tolist()
         new = links["new"].tolist()
         peers = []
         for j in range(len(links)):
-            stamp_ns = tick_ns(max(used[j], 0), rates_hz[j])
+            # Before the first sample (tick -1), the age counts from the start of the session.
+            sent_ns = tick_ns(max(used_ticks[j], 0), rates_hz[j])
             peers.append(
                 PeerView(
                     alpha=alpha[j],
-                    tick=used[j],
-                    age_s=(now_ns - stamp_ns) * 1e-9,
+                    tick=used_ticks[j],
+                    age_s=(now_ns - sent_ns) * 1e-9,
                     new=new[j],
-                    q=vectors["q"][j],
-                    qd=vectors["qd"][j],
-                    tau_x=vectors["tau_x"][j],
+                    q=q[j],
+                    qd=qd[j],
+                    tau_x=tau_x[j],
                 )
             )
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Schedules a decision of the program, which acts after the delay of the program.
+        """Checks a decision of the program, and schedules it after the program's reaction time.
 
-        A decision is ignored if it is based on an older view than an earlier decision.
+        A decision is ignored if it is based on an older view of the arm than an earlier one.
 
         Args:
             k: Control period whose view of the arm the decision is based on.
@@ -245,10 +256,11 @@ class OwnHand:
             ValueError: The goal has the wrong number of coordinates, is not finite, or is too
                 large.
         """
+        holds_arm = goal is not None
         numbers: tuple[float, ...] = ()
         if goal is not None:
             numbers = tuple(float(number) for number in goal)
-        if goal is not None and len(numbers) != self._rules.size:
+        if holds_arm and len(numbers) != self._rules.size:
             count = count_nouns(len(numbers), "number")
             raise ValueError(f"the action has {count}, not {self._rules.size}")
         if not all(map(math.isfinite, numbers)):
@@ -259,11 +271,12 @@ class OwnHand:
             raise ValueError(
                 f"the action has a norm of {norm:g}, but at most {largest_norm:g} is accepted"
             )
-        if k <= self._newest:
+        is_outdated = k <= self._newest
+        if is_outdated:
             return
 
         self._newest = k
-        self._schedule(k, k + self.delay_ticks, numbers, grip=goal is not None)
+        self._schedule(k, k + self.delay_ticks, numbers, grip=holds_arm)
 
     def release(self, k: int) -> None:
         """Makes the program release the arm in control period k.
@@ -274,7 +287,7 @@ class OwnHand:
         self._schedule(k, k, (), grip=False)
 
     def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
-        """Appends the command of tick `k`, which acts at tick `due`.
+        """Stores a command of the program until the tick (control period) in which it acts.
 
         Args:
             k: Tick of the view on which the command is based.
@@ -301,9 +314,14 @@ class OwnHand:
         Returns:
             The action in this period and the state for the next period, see `advance_hand`.
         """
+        # The commands whose delay has passed, in order.
         commands = []
-        while self._due and self._due[0][0] <= k:
-            commands.append(self._due.popleft()[1])
+        while self._due:
+            due, command = self._due[0]
+            if due > k:
+                break
+            self._due.popleft()
+            commands.append(command)
         step = advance_hand(
             rules=self._rules,
             memory=self._memory,
@@ -333,13 +351,15 @@ class OwnHand:
         """
         size = self._rules.size
         rate_hz = self._rules.rate_hz
-        first = self.advance_to(k, read_angles).vector
-        last = max(min(self.find_next_event(k), end), k + 1)
-        rows = np.zeros((last - k, 3 + 2 * size))
-        rows[0] = first
+        first_row = self.advance_to(k, read_angles).vector
+        span_end = min(self.find_next_event(k), end)
+        span_end = max(span_end, k + 1)
+        rows = np.zeros((span_end - k, 3 + 2 * size))
+        rows[0] = first_row
         memory = self._memory
-        silence_ns = tick_ns(last - 1, rate_hz) - memory.received_ns
-        if not memory.source or silence_ns > SILENCE_NS:
+        is_held = memory.source != 0
+        silence_ns = tick_ns(span_end - 1, rate_hz) - memory.received_ns
+        if not is_held or silence_ns > SILENCE_NS:
             # The program does not hold the arm, or its silence may end its grip.
             for n in range(1, len(rows)):
                 rows[n] = self.advance_to(k + n, read_angles).vector

@@ -68,9 +68,9 @@ _KNOWN = int(Law.KNOWN)
 def rests(site: SiteRow) -> bool:
     """Returns True if the arm comes to rest or is at rest in the present mode.
 
-    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the rule of the
-    site for silent peers is `StaleAction.GLIDE`. Under the other rules, these modes do not stop
-    the arm smoothly.
+    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the rule for
+    other arms that are silent is `StaleAction.GLIDE`. Under the other rules, these modes do not
+    stop the arm smoothly.
     """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
@@ -78,11 +78,11 @@ def rests(site: SiteRow) -> bool:
 
 @leaf
 def _find_brake_ratio(site: SiteRow) -> float:
-    """Returns how far the brake of the arm exceeds what its torque limits permit.
+    """Returns how much of its largest torque an arm needs for braking by damping alone.
 
     This is the largest ratio of B |qd| to the torque limit over the joints, where B is the
-    damping of the arm at rest and qd the joint velocity. Above 1 the damping alone needs more
-    torque than the joint has.
+    damping with which the arm comes to rest, and qd the joint velocity. Above 1 the damping
+    alone needs more torque than a joint has.
     """
     ratio = 0.0
     for i in range(site.joints):
@@ -114,11 +114,12 @@ def rests_by_law(site: SiteRow) -> bool:
     - The law computed a number that is not finite.
     - The arm is too fast, see `_is_fast`.
     """
-    holds = site.law != _USER or site.holds != 0
-    learns_in_task = site.task != 0 and site.law != _KNOWN
-    failed = site.reason == _NOT_FINITE
-    usable = holds and not learns_in_task and not failed
-    return bool(usable and not _is_fast(site))
+    is_declared = site.law != _USER or site.holds != 0
+    is_unsuitable_in_task = site.task != 0 and site.law != _KNOWN
+    has_failed = site.reason == _NOT_FINITE
+    is_usable = is_declared and not is_unsuitable_in_task and not has_failed
+    # The costly condition comes last.
+    return bool(is_usable and not _is_fast(site))
 
 
 @leaf
@@ -132,7 +133,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
         t_ns: Time, ns since the epoch, the common start of the session.
         mode: The mode to enter.
         reason: Reason of the change of mode, a `LifeReason`.
-        site: Row of the site, the state of one arm with its controller; changed.
+        site: State of the site (the process that runs the arm); changed.
     """
     failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
     keeps_reference = rests(site) and not failed
@@ -186,12 +187,13 @@ def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
 def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
     """Returns the time T_left that the arm still takes to come to rest, s.
 
-    It is at least the rest of LEAST_STOP_S, and long enough for each joint to stop with the
-    deceleration that half of its torque limit gives.
+    It is at least the part of LEAST_STOP_S that is left, and long enough for each joint to stop
+    with the deceleration that half of its torque limit gives.
 
     Args:
         elapsed_s: Time since the start of the rest, s.
-        site: Row of the site, with the velocity of the reference.
+        site: State of the site (the process that runs the arm), with the velocity of the
+            reference.
     """
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):
@@ -222,25 +224,28 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
     factor = 0.0
     if remaining_s > step_s + _ROUNDING_S:
         factor = 1.0 - step_s / remaining_s
-    fast = _is_fast(site)
+    is_fast = _is_fast(site)
     for i in range(site.joints):
         qd = site.qd[i]
         q_ref, rate_before = _read_rest_reference(site, i)
+        # The reference stops when the joint reverses, and is never faster than the joint.
         rate = factor * rate_before
-        if rate * qd <= 0.0:
+        has_joint_reversed = rate * qd <= 0.0
+        if has_joint_reversed:
             rate = 0.0
         elif abs(rate) > abs(qd):
             rate = qd
         step = 0.5 * step_s * (rate_before + rate)
         is_limited = abs(site.tau[i]) >= site.tau_limit[i]
-        if fast or is_limited:
+        if is_fast or is_limited:
             # Without the law, or at its limit, the torque does not pay for a growing distance
             # from the reference. The spring would later return that distance as energy of its
             # own, so the reference moves along with the joint.
             q_before = site.q_before[i]
             joint_step = site.q[i] - q_before
             distance = q_before - q_ref
-            if (joint_step - step) * distance >= 0.0:
+            moves_away = (joint_step - step) * distance >= 0.0
+            if moves_away:
                 step = joint_step
         _write_rest_reference(site, i, q_ref + step, rate)
 
@@ -255,8 +260,8 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site. While the arm is at rest, `return_from_ns` is the start of the
-            rest.
+        site: State of the site (the process that runs the arm). While the arm is at rest,
+            `return_from_ns` is the start of the rest.
     """
     elapsed_ns = t_ns - site.return_from_ns
     brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or _is_fast(site)
@@ -318,11 +323,11 @@ def _find_slip(site: SiteRow, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque moved towards zero by `change`, but not past zero.
+    """Returns a torque that is reduced towards zero by `change`, but not past zero.
 
     Args:
         torque: The torque, N m.
-        change: Amount by which it shrinks, N m, with the sign of the torque.
+        change: Amount of the reduction, N m, with the sign of the torque.
     """
     return torque - change if abs(torque) > abs(change) else 0.0
 
@@ -352,17 +357,17 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     """
     starts_to_rest = t_ns == site.return_from_ns
     brakes = _brakes(t_ns, site)
-    # The part of an unexplained torque that is kept, smaller for a faster arm.
-    kept_part = 0.0
+    # The factor of a torque that the law does not explain: smaller for a faster arm.
+    unexplained_factor = 0.0
     if k > site.first:
-        kept_part = max(0.0, 1.0 - _find_brake_ratio(site))
+        unexplained_factor = max(0.0, 1.0 - _find_brake_ratio(site))
     for i in range(site.joints):
         qd = site.qd[i]
         damping = site.damping[i]
         w = site.tau_held[i]
         if starts_to_rest:
             unexplained = site.tau_before[i] - site.tau[i]
-            w = kept_part * unexplained
+            w = unexplained_factor * unexplained
         acts_along_motion = w * qd > 0.0
         if brakes and acts_along_motion:
             w = _shrink(w, damping * qd)
@@ -421,6 +426,7 @@ def limit_torque_rate(site: SiteRow) -> None:
         if rate_limit < inf:
             largest_change = rate_limit / site.rate_hz
             before = site.tau_before[i]
+            # An arm that brakes may change its torque against the motion by more.
             brake = site.damping[i] * site.qd[i] if braking else 0.0
             low = before - largest_change - max(brake, 0.0)
             high = before + largest_change - min(brake, 0.0)

@@ -34,8 +34,8 @@ def limit_reference(k: int, site: SiteRow) -> None:
     it starts from the pose of the arm.
 
     Args:
-        k: The tick.
-        site: Row of the site, whose reference is changed.
+        k: Number of the tick (control period).
+        site: State of the site (the process that runs the arm), whose reference is changed.
     """
     if k == site.first:
         for i in range(site.shared):
@@ -120,7 +120,7 @@ def return_to_law(t_ns: int, site: SiteRow) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, whose torque `tau` is changed.
+        site: State of the site (the process that runs the arm), whose torque `tau` is changed.
     """
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9
     progress = min(elapsed_s / BLEND_S, 1.0)

@@ -102,15 +102,15 @@ _ORDER_HELD = int(LifeOrder.HELD)
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """Returns True if no peer that the site follows is silent.
+    """Returns True if none of the other arms that this arm follows is silent.
 
-    A peer is silent if none of its samples (sent states) came into use within the last
-    `silence_ns`. Peers with a dominance factor of zero are not followed.
+    Another arm, a peer, is silent if none of its samples (sent states) came into use within the
+    last `silence_ns`. Peers with a weight (dominance factor) of zero are not followed.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
         silence_ns: Longest time without a sample, ns.
-        links: Rows of the site's links.
+        links: State of each link from another site, one row per link.
     """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
@@ -124,18 +124,20 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
 def _alignment_s(site: SiteRow) -> float:
     """Returns the duration T of an alignment, s.
 
-    An alignment is the smooth return of an arm to its peers, in the mode RETURN. An offset is
-    added to the reference of the peers, and falls from its start value to zero within T. The
-    largest slope of its polynomial is 1.5 times its mean slope, so with
+    An alignment is the smooth return of an arm to the arms that it follows, its peers, in the
+    mode RETURN. An offset is added to the reference, the position that the peers ask for, and
+    falls from its start value to zero within T. The largest slope of its polynomial is 1.5
+    times its mean slope, so with
 
         T = 1.5 distance / align_speed
 
     the offset is no faster than the limit `align_speed`. T is at least MIN_ALIGN_NS.
 
     Args:
-        site: Row of the site. `q_held` is the start value of the offset, rad or m. For a pose,
-            its last three coordinates are a rotation vector, rad. `align_speed` counts for each
-            linear coordinate, rad/s or m/s, and for the angle of the rotation, rad/s.
+        site: State of the site (the process that runs the arm). `q_held` is the start value of
+            the offset, rad or m. For a pose, its last three coordinates are a rotation vector,
+            rad. `align_speed` counts for each linear coordinate, rad/s or m/s, and for the
+            angle of the rotation, rad/s.
     """
     longest_distance = 0.0
     for i in range(count_linear_coordinates(site)):
@@ -185,11 +187,11 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
         turn_velocity = subtract(three(qd[3:]), peers_velocity)
         turn_rate = rotation_vector_rate(turn, turn_velocity)
 
-    near = length(turn) <= site.align_limit
+    is_near = length(turn) <= site.align_limit
     for i in range(count_linear_coordinates(site)):
         distance = abs(q[i] - site.q_des[i])
-        near = near and distance <= site.align_limit
-    if not near:
+        is_near = is_near and distance <= site.align_limit
+    if not is_near:
         site.reason = _ALIGN_LIMIT
         return
 
@@ -207,14 +209,14 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
 
 @leaf
 def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
-    """Starts an alignment, by which an arm at rest returns to its peers.
+    """Starts the smooth return of an arm at rest to the arms that it follows (an alignment).
 
     The alignment starts from the reference at rest, the motion that the law of the resting arm
     follows. This reference is first written into `q_followed` and `qd_followed`.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, the process that runs the arm; changed.
+        site: State of the site, the process that runs the arm; changed.
         reason: Reason of the change of mode, a `LifeReason`.
     """
     put_rest_reference(site, site.q_followed, site.qd_followed)
@@ -277,7 +279,7 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site; changed.
+        site: State of the site (the process that runs the arm); changed.
         mode: The mode to enter.
         reason: Reason of the change of mode, a `LifeReason`.
     """
@@ -289,7 +291,7 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
 @leaf
 def _find_fault(site: SiteRow) -> int:
-    """Returns the reason for a fault in the arm's motion, or -1 if there is no fault.
+    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is none.
 
     A fault is a number that is not finite, an angle beyond its limits, or a speed above its
     limit.
@@ -308,21 +310,24 @@ def _find_fault(site: SiteRow) -> int:
 
 @leaf
 def _apply_order(t_ns: int, site: SiteRow) -> None:
-    """Applies the waiting order and the consequences of missed ticks, and clears both.
+    """Changes the mode of an arm for an order, or because its control loop missed ticks.
 
-    At most one branch applies. Orders that leave FAULT or STOPPED come first; in these modes
-    all other orders have no effect.
+    An order comes from a person, such as stop, or from the site itself, such as the loss of a
+    real arm. Missed ticks (control periods) stop an arm that moves. At most one branch applies.
+    Orders that leave FAULT or STOPPED come first; in these modes all other orders have no
+    effect.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, with the order and the number of missed ticks.
+        site: State of the site (the process that runs the arm), with the order and the number
+            of missed ticks.
     """
     order = site.order
     skipped = site.skipped
     mode = site.mode
     site.order = 0
     site.skipped = 0
-    moves = mode in (_RUN, _ALIGN)
+    moves = mode in (_RUN, _ALIGN)  # _ALIGN is the mode RETURN
     stops = order in (_ORDER_STOP, _ORDER_RELEASED)
     if order == _ORDER_RESET and mode == _FAULT:
         enter_rest(t_ns, _WAITING, _RESET, site)
@@ -356,10 +361,10 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 
 @leaf
 def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode for a fault of the motion, or for silent or returning peers.
+    """Changes the mode of an arm for a fault of its motion, or for silent or returning peers.
 
-    The first of these changes that applies is made (the modes are explained at the top of this
-    module, and the code calls the mode RETURN `_ALIGN`):
+    A peer is another arm that this arm follows. The first of these changes that applies is made
+    (the code calls the mode RETURN `_ALIGN`):
 
         any mode        a fault of the motion                       -> FAULT
         WAITING         all peers are heard                         -> RETURN
@@ -371,10 +376,10 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, the process that runs the arm. `return_from_ns` is the time of
+        site: State of the site, the process that runs the arm. `return_from_ns` is the time of
             the last change to rest, to an alignment or to RUN. `regrouped` is the reason if a
             peer was dropped or restored in this tick, otherwise 0.
-        links: Rows of the site's links, one per peer.
+        links: State of each link, one row per peer.
     """
     fault = _find_fault(site)
     if fault >= 0 and site.mode != _FAULT:
@@ -382,15 +387,15 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     if site.mode == _FAULT or site.mode == _STOPPED or site.reason == _ARM_SILENT:
         return  # peers do not change these modes
 
-    heard = _all_heard(t_ns, site.stale_ns, links)
+    all_heard = _all_heard(t_ns, site.stale_ns, links)
     moves = site.mode == _RUN or site.mode == _ALIGN
     elapsed_ns = t_ns - site.return_from_ns
-    entered_now = elapsed_ns == 0
-    if heard and site.mode == _WAITING:
+    is_first_tick_of_mode = elapsed_ns == 0
+    if all_heard and site.mode == _WAITING:
         _leave_rest(t_ns, site, _PEERS_HERE)
-    elif heard and site.mode == _HOLD and not entered_now:
+    elif all_heard and site.mode == _HOLD and not is_first_tick_of_mode:
         _leave_rest(t_ns, site, _PEERS_BACK)
-    elif not heard and moves:
+    elif not all_heard and moves:
         enter_rest(t_ns, _HOLD, _PEER_SILENT, site)
     elif site.regrouped and moves:
         # The set of followed peers has changed: align from where the reference would be now.
@@ -406,12 +411,12 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode of a site if needed, and computes its reference for the mode.
+    """Decides whether an arm waits, follows, comes to rest or stops, and computes its goal.
 
-    A site is the process that runs the arm, and the reference is the position that the arm
-    follows. The modes and their changes are explained at the top of this module. The mode
-    changes by an order of a person or of the site itself, by a fault of the arm, or because
-    peers (other arms) fall silent or are heard again.
+    What the arm does is called its mode, for example RUN while it follows the other arms, its
+    peers. The mode changes by an order of a person or of the arm's own control process (site),
+    by a fault of the arm, or because peers fall silent or are heard again. The goal is called
+    the reference, the position that the arm follows.
 
     Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms' positions
     and its derivative. After the call, they contain the reference: this mean in the mode RUN,
@@ -445,11 +450,12 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns the offset of a coordinate from the peers' reference, and its rate.
+    """Returns how far an arm that returns to its peers is still kept away from them.
 
-    While the arm returns smoothly to its peers (an alignment), the offset falls to zero within
-    the time T. It is the cubic Hermite polynomial with the start value D, the start rate D' and
-    zero value and rate at the end:
+    The peers are the arms that it follows. During the smooth return (an alignment), an offset
+    is added to the position that the peers ask for. It falls to zero within the time T, and is
+    the cubic Hermite polynomial with the start value D, the start rate D' and zero value and
+    rate at the end:
 
         offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2
         d offset / dx = T D' (1 - x) (1 - 3 x) - 6 D x (1 - x)
@@ -457,9 +463,9 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
         duration_s: Duration T of the alignment, s.
-        site: Row of the site. The alignment started at `return_from_ns`, with D in `q_held` and
-            D' in `qd_held`.
-        i: The coordinate.
+        site: State of the site (the process that runs the arm). The alignment started at
+            `return_from_ns`, with D in `q_held` and D' in `qd_held`.
+        i: Index of the coordinate.
 
     Returns:
         The offset, rad or m, and its rate, rad/s or m/s.

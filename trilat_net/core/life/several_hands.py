@@ -65,30 +65,36 @@ class HandArrays(NamedTuple):
 
 @leaf
 def _put_nearest_goal(lane: int, goal: Array, hands: HandArrays) -> None:
-    """Moves the goal of a program to the nearest point that its arm can reach.
+    """Stores the goal to which a program pulls its arm, moved to where the arm can reach.
+
+    The goal is moved to the nearest point of a box, and then of a spherical shell, as in
+    `HandReach.find_nearest`.
 
     Args:
-        lane: The lane.
-        goal: The goal, shape (2,).
-        hands: State of the hands; changed.
+        lane: Index of the run among the runs that are computed side by side.
+        goal: The goal, shape (2,), m or rad.
+        hands: State of the programs' pulls in all runs; the goal is written into it.
     """
     for i in range(AXES):
         hands.goal[lane, i] = min(max(goal[i], hands.low[lane, i]), hands.high[lane, i])
     inner_m = hands.radii_m[lane, 0]
     outer_m = hands.radii_m[lane, 1]
-    if inner_m == 0.0 and outer_m == math.inf:
+    has_shell = inner_m != 0.0 or outer_m != math.inf
+    if not has_shell:
         return
+
     offset_x = hands.goal[lane, 0] - hands.centre[lane, 0]
     offset_y = hands.goal[lane, 1] - hands.centre[lane, 1]
-    radius = math.sqrt(offset_x * offset_x + offset_y * offset_y)
-    if inner_m <= radius <= outer_m:
+    distance_m = math.sqrt(offset_x * offset_x + offset_y * offset_y)
+    if inner_m <= distance_m <= outer_m:
         return
-    allowed_m = min(max(radius, inner_m), outer_m)
-    if radius == 0.0:
+
+    allowed_m = min(max(distance_m, inner_m), outer_m)
+    if distance_m == 0.0:
         # From the centre all directions are equally near: choose the first axis.
         offset_x = 1.0
-        radius = 1.0
-    factor = allowed_m / radius
+        distance_m = 1.0
+    factor = allowed_m / distance_m
     hands.goal[lane, 0] = hands.centre[lane, 0] + factor * offset_x
     hands.goal[lane, 1] = hands.centre[lane, 1] + factor * offset_y
 
@@ -118,11 +124,12 @@ def _advance_hands(
         period_ticks: Time from one decision to the next, ticks.
         is_idle: 1 for runs that are not advanced, shape (L,).
         acts: 1 for runs in which a decision begins to act at the first tick, shape (L,).
-        goals: These decisions, shape (L, 2).
+        goals: These decisions: the position to which the arm is pulled, or the force, shape
+            (L, 2).
         poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
-        hands: State of the hands; changed.
+        hands: State of the programs' pulls in all runs; changed.
         rows: Room for the actions of a run, shape (ticks, 3 + 2 * 2).
-        actions: Written: for each tick and lane the grip, the target, and the target one second
+        actions: Receives for each tick and lane the grip, the target, and the target one second
             later, shape (ticks, 5, L).
     """
     grip_step = 1e9 / (GRIP_NS * rate_hz)
@@ -223,8 +230,10 @@ class SeveralHands:
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
         """Returns why the actions of a program cannot be computed for several runs at once.
 
+        The caller then computes each run alone, by `OwnHand`.
+
         Args:
-            rules: Its limits.
+            rules: Limits of the program's actions.
             period_ticks: Time from one decision to the next, ticks.
             largest_action: Largest absolute value of a number of an action.
 
@@ -244,7 +253,7 @@ class SeveralHands:
 
         Args:
             run: Index of the run.
-            rules: Limits of the hand.
+            rules: Limits of the program's actions.
         """
         hands = self.arrays
         reach = rules.reach
@@ -272,7 +281,7 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes how each program pulls its arm in the next ticks, from its decisions.
+        """Computes how each program pulls its arm in the next ticks (control periods).
 
         Args:
             runs: Number of runs that are advanced, the first ones.

@@ -50,7 +50,7 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
     Args:
         stamp_ns: Stamp of the sample, ns since the epoch, the common start of the session.
-        link: Row of the link. It states which rows of `points` are its outages.
+        link: State of the link. It states which rows of `points` are its outages.
         points: Table of points; the row of an outage has its start and its end, ns.
     """
     for n in range(link.outage_first, link.outage_first + link.outage_count):
@@ -69,15 +69,16 @@ def loses_samples(model: Row) -> bool:
 def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -> bool:
     """Decides by random numbers whether the next sample is lost, with losses in bursts.
 
-    The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
-    loss. A fresh chain starts in its stationary distribution, where the bad state has the
-    probability enter / (enter + leave).
+    The link is in a good or a bad state, each with its own probability of loss (model of
+    Gilbert and Elliott). From sample to sample it enters the bad state with the probability
+    `enter`, and leaves it with the probability `leave`. A fresh chain starts in its stationary
+    distribution, where the bad state has the probability enter / (enter + leave).
 
     Args:
         u: Uniform random number, which decides on the state of the chain.
         v: Uniform random number, which decides on the loss.
         fresh: True for the first sample of the model.
-        link: Row of the link, whose state is changed.
+        link: State of the link; changed.
         model: Model in force, which loses samples.
     """
     if fresh:
@@ -93,12 +94,12 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Returns True if a sample is lost, as random numbers decide.
+    """Returns True if the network loses a sample (message), as random numbers decide.
 
     Args:
         sample: Index of the sample.
         fresh: True for the first sample of the model.
-        link: Row of the link, whose state is changed.
+        link: State of the link; changed.
         model: Model in force.
     """
     if not loses_samples(model):
@@ -111,15 +112,19 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 def find_delay_us(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns the delay of a sample, us, or LOST if a trace says that the sample is lost.
+    """Returns the delay of a sample on a link, by the link's delay model, us.
+
+    A sample is the state that another arm sends in one control period. The delay may follow a
+    distribution, a function of time, or a recorded trace, see `DelayKind`. The result is LOST
+    if the trace says that the sample is lost.
 
     Args:
         sample: Index of the sample.
-        stamp_ns: Stamp of the sample, ns since the start of the session.
-        fresh: True for the first sample of the model.
-        link: Row of the link.
-        model: Model in force.
-        points: The site's traces.
+        stamp_ns: Time at which the sample was sent, ns since the start of the session.
+        fresh: True for the first sample of the model, with which the model's state starts.
+        link: State of the link, with the seed of its random numbers.
+        model: Delay model in force, a row of LINK_MODEL_DTYPE.
+        points: Delay traces and outages of all links of the receiver.
     """
     key: DrawKey = link.key
     if model.kind == _MEASURED:
@@ -134,22 +139,24 @@ def find_delay_us(
         )
         return clamp_delay_us(model.location + model.scale * link.memory)
     if model.kind == _CUSTOM:
-        return clamp_delay_us(
-            custom_delay_us(
-                key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
-            )
+        custom_us = custom_delay_us(
+            key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
         )
-    return clamp_delay_us(draw_delay_us(key, sample, DELAY, model))
+        return clamp_delay_us(custom_us)
+    drawn_us = draw_delay_us(key, sample, DELAY, model)
+    return clamp_delay_us(drawn_us)
 
 
 @leaf
 def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int:
-    """Returns the due time of a sample that is not lost, from its delay, ns since the epoch.
+    """Returns when a sample that is not lost is delivered, ns since the start of the session.
+
+    A sample is the state that another arm sends in a control period.
 
     Args:
-        stamp_ns: Time at which the sample was sent, ns since the epoch.
+        stamp_ns: Time at which the sample was sent, ns since the start of the session.
         delay_us: Delay of the sample, or the smaller one of its delay and that of its copy, us.
-        link: State of the link, whose latest due time `due_before` is updated.
+        link: State of the link. `due_before`, the latest delivery so far, is updated.
         model: Model of delay and loss in force.
     """
     # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
@@ -171,9 +178,10 @@ def find_due_ns(
     model: Row,
     points: Points,
 ) -> int:
-    """Computes when a link delivers a sample whose loss and delay have been drawn.
+    """Computes when a link delivers a sample (message), after its loss and delay were drawn.
 
-    This function must be called once for each sample, in the order of the indices.
+    The result also depends on outages, duplicates and the order of samples. This function must
+    be called once for each sample, in the order of the indices.
 
     Args:
         sample: Index of the sample.
@@ -249,18 +257,21 @@ def _due_ns(
 
 @leaf
 def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) -> bool:
-    """Selects the model that is in force when a sample is sent, the model of the link.
+    """Selects the model of a link's delay and loss that is in force when a sample is sent.
+
+    The model may change at planned times. A sample is the state that another arm sends.
 
     Args:
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        link: Row of the link, whose field `model` is the index of the model; changed.
+        link: State of the link; its field `model`, the index of the model, is changed.
         models: Models of the link, in the order in which they come into force.
 
     Returns:
         True if the sample is the first one of the model.
     """
     fresh = sample == 0
+    # Move on while a later model has come into force before the sample was sent.
     while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
         link.model += 1
         fresh = True

@@ -139,7 +139,7 @@ sqrt(-2 log 2^-53) by Box and Muller, and -log 2^-53.
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
-    """Returns an upper bound of the delays of a model, us.
+    """Returns the longest delay that a delay model can produce, us, or a bound of it.
 
     The bound follows from the bounds of the model's random numbers: the largest normal number
     is `_LARGEST_NORMAL`, and the largest exponential number of mean 1 is
@@ -202,7 +202,9 @@ def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -
     bounds_us = []
     for model, trace in zip(models, traces, strict=True):
         longest_us = min(_longest_us(model, trace), MAX_DELAY_US)
-        bounds_us.append(max(math.ceil(longest_us) + 1, model.playout_us))
+        # One more, because delays are rounded to whole microseconds.
+        rounded_us = math.ceil(longest_us) + 1
+        bounds_us.append(max(rounded_us, model.playout_us))
     return min(MAX_DELAY_US, max(bounds_us))
 
 
@@ -232,7 +234,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 
     Args:
         key: Key of the link, from which all its random numbers follow.
-        sample: Index of the sample, the state that a site sends in one tick.
+        sample: Index of the sample, the state that an arm sends in one control period.
         purpose: Selects random numbers that are independent of each other: DELAY for the
             sample, COPY for its duplicate.
         model: Model of the delay, a row of LINK_MODEL_DTYPE.
@@ -269,11 +271,12 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 def next_ar1_value(
     key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
 ) -> float:
-    """Returns the next number of a random sequence whose neighbours are correlated.
+    """Returns the next number of a random sequence in which neighbours are correlated.
 
         x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
 
-    This is an AR(1) sequence. Each of its numbers has the mean 0 and the deviation 1.
+    Delays that vary slowly from message to message follow such an AR(1) sequence. Each of its
+    numbers has the mean 0 and the deviation 1.
 
     Args:
         key: Key of the link, from which all its random numbers follow.
@@ -290,7 +293,7 @@ def next_ar1_value(
 
 @leaf
 def sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Computes the delay of a sample on a link whose delay is a sine function of time.
+    """Computes the delay of a sample (message) on a link with a delay that is a sine of time.
 
         delay(t) = mean + amplitude sin(2 pi t / period + phase)
 
@@ -314,10 +317,13 @@ def sine_delay_us(stamp_ns: int, model: Row) -> float:
 
 @leaf
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
-    """Returns the delay of a sample on a link with a trace, a table of delays by time.
+    """Returns the delay of a sample (message) on a link with a recorded trace of delays.
 
-    The delay is that of the last point at or before the stamp. A trace that loops starts again
-    after its last point, which lasts as long as the point before it.
+    A trace is a table of delays by time.
+
+    The delay is that of the last point at or before the time at which the sample was sent. A
+    trace that loops starts again after its last point, which lasts as long as the point before
+    it.
 
     Args:
         stamp_ns: Stamp of the sample, the time at which it was sent, ns since the start of the
@@ -332,8 +338,10 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     count = model.trace_count
     t_us = stamp_ns // 1000
     if model.at_end == _LOOP and count > 1:
-        end_us = points[first + count - 1, 0]
-        t_us %= 2 * end_us - points[first + count - 2, 0]
+        last_us = points[first + count - 1, 0]
+        before_last_us = points[first + count - 2, 0]
+        loop_us = 2 * last_us - before_last_us  # the last point lasts last_us - before_last_us
+        t_us %= loop_us
     index = count_started(points, first, count, t_us) - 1
     delay_us: int = points[first + max(index, 0), 1]
     return delay_us
@@ -358,7 +366,7 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Computes the delay of a sample by the compiled function of a user's delay model.
+    """Computes the delay of a sample (message) by the compiled function of a user's model.
 
     The delay is limited to the maximum that the user's model declares. The function has two
     arguments: the parameters of the user's model, and the row of the delay model. It reads its

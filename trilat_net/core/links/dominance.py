@@ -36,9 +36,10 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns which sites each site follows, directly or through other sites.
+    """Returns which arms each arm follows, directly or through other arms.
 
-    A site follows another one if its dominance factor, the weight of that site, is above 0.
+    The process that controls an arm is called a site. Site i follows site j if the dominance
+    factor alpha_ij, the weight of site j, is above 0.
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -55,7 +56,7 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """Returns True if every site follows every other site, directly or through others.
+    """Returns True if every arm (site) follows every other one, directly or through others.
 
     The stability theorem needs this property of the dominance matrix.
 
@@ -69,11 +70,12 @@ def is_irreducible(alpha: Array) -> bool:
 def find_balancing_weights(alpha: Array) -> Array | None:
     """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
 
-    This equation is called detailed balance. It has a solution if the products of the dominance
-    factors around each circle of sites are equal in both directions (Kolmogorov), as in
-    alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three sites. Then the eigenvalues of
-    alpha are real. Links out of a group of sites that reach each other belong to no circle and
-    are ignored.
+    With such weights the matrix is similar to a symmetric one, so that its eigenvalues are
+    real. Some stability conditions hold only then. The equation is called detailed balance. It
+    has a solution if the products of the dominance factors around each circle of sites are
+    equal in both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32
+    alpha21 for three sites. Links out of a group of sites that reach each other belong to no
+    circle and are ignored.
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -83,29 +85,30 @@ def find_balancing_weights(alpha: Array) -> Array | None:
         D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
     """
     reach = find_reach(alpha)
-    followed = reach & reach.T & (alpha > 0.0)
-    D = np.zeros(len(alpha))
+    is_on_circle = reach & reach.T & (alpha > 0.0)
+    D = np.zeros(len(alpha))  # 0: not known yet
     for first in range(len(alpha)):
         if D[first]:
             continue
+        # The first site of a group: the balance with its neighbours gives their weights.
         D[first] = 1.0
-        waiting = [first]
-        while waiting:
-            i = waiting.pop()
-            for j in np.flatnonzero(followed[i]).tolist():
+        unvisited = [first]
+        while unvisited:
+            i = unvisited.pop()
+            for j in np.flatnonzero(is_on_circle[i]).tolist():
                 forward = D[i] * alpha[i, j]
-                share_back = alpha[j, i]
-                imbalance = abs(forward - D[j] * share_back)
-                if not D[j] and share_back:
-                    D[j] = forward / share_back
-                    waiting.append(j)
+                alpha_back = alpha[j, i]
+                imbalance = abs(forward - D[j] * alpha_back)
+                if not D[j] and alpha_back:
+                    D[j] = forward / alpha_back
+                    unvisited.append(j)
                 elif imbalance > ROW_SUM_TOLERANCE * forward:
                     return None
     return D
 
 
 def perron_vector(alpha: Array) -> Array:
-    """Returns the weights beta of the sites in the energy function of the stability proof.
+    """Returns the weights beta of the arms (sites) in the energy function of the proof.
 
     They are the positive solution of beta' = beta' alpha with the sum 1, which the paper writes
     as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985).
@@ -131,6 +134,7 @@ def perron_vector(alpha: Array) -> Array:
         a[:last, last] /= row.sum()
         column = a[:last, last]
         a[:last, :last] += np.outer(column, row)
+    # Substitute back, from the weight 1 of the first site.
     beta = np.zeros(size)
     beta[0] = 1.0
     for site in range(1, size):
@@ -151,7 +155,9 @@ end.
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
-    """Returns the factor at time t of a linear change from `before` to `after`.
+    """Returns the dominance factor at a time during a linear change from `before` to `after`.
+
+    The result is `after` once the change has ended.
 
     Args:
         t_ns: Time t, ns since the start of the session.
@@ -179,11 +185,12 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
         count: Number of filled rows of `ramps`.
         ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P); row 0 holds
             the factors at the epoch.
-        links: Rows of the links, shape (P,); written.
+        links: State of each link, one row per peer, shape (P,); written.
     """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
         column = RAMP_COLUMNS + j
+        # Find the current ramp, and the factor `before` at its start.
         before = ramps[0, column]
         current = 0
         for n in range(1, count):
@@ -270,15 +277,15 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if the last sample of some peer that the site follows is too old.
+    """Returns True if nothing recent is known of some peer (other arm) that the site follows.
 
-    A peer from which no sample is in use counts as if its last sample were of the epoch, the
-    common start of the session.
+    That is, the sample (state) of the peer that is in use was sent too long ago. If there is no
+    such sample, the time counts from the epoch, the common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.
         age_ns: Largest age, ns.
-        links: Rows of the site's links.
+        links: State of each link from another site, one row per link.
     """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
@@ -290,13 +297,12 @@ def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Stops the reference of a site while a peer is silent, and resumes it afterwards.
+    """Stops an arm while another arm that it follows is silent, and resumes afterwards.
 
-    A site is the process that runs one arm, and the reference is the position that its arm
-    follows. A peer, a site that it follows, is silent if its last sample is too old. In mode
-    HOLD the reference stays where it was. In BRAKE it is the pose that the arm had when the
-    peer fell silent. In RETURN the reference moves smoothly back to the position q_des that the
-    peers ask for:
+    The reference is the position that the arm follows, and a peer an arm that it follows. A
+    peer is silent if its last sample (sent state) is too old. In mode HOLD the reference stays
+    where it was. In BRAKE it is the pose that the arm had when the peer fell silent. In RETURN
+    the reference moves smoothly back to the position q_des that the peers ask for:
 
         reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
 
@@ -305,22 +311,22 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
     Args:
         t_ns: Time, ns since the start of the session.
-        site: State of the site, whose reference is q_des; changed.
-        links: States of the site's links, one row per peer.
+        site: State of the site (the process that runs the arm), with q_des; changed.
+        links: State of each link from another site, one row per link.
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return
-    stale = _any_peer_stale(t_ns, site.stale_ns, links)
+    is_stale = _any_peer_stale(t_ns, site.stale_ns, links)
     follows = site.mode == _RUN or site.mode == _RETURN
-    stopped = site.mode == _HOLD or site.mode == _BRAKE
-    if stale and follows:
-        braking = site.on_stale == _ACT_BRAKE
+    is_stopped = site.mode == _HOLD or site.mode == _BRAKE
+    if is_stale and follows:
+        brakes = site.on_stale == _ACT_BRAKE
         for i in range(site.q_held.shape[0]):
             pose = site.x[i] if site.task else site.q[i]
-            site.q_held[i] = pose if braking else site.q_followed[i]
-        site.mode = _BRAKE if braking else _HOLD
+            site.q_held[i] = pose if brakes else site.q_followed[i]
+        site.mode = _BRAKE if brakes else _HOLD
         site.return_from_ns = 0
-    elif not stale and stopped:
+    elif not is_stale and is_stopped:
         site.mode = _RETURN
         site.return_from_ns = t_ns
 
@@ -330,19 +336,23 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     if site.mode == _RUN:
         return  # the reference is that of the peers
 
+    # With x = 0, in HOLD and BRAKE, the reference stays at q_held.
     x = elapsed_ns / site.return_ns if site.mode == _RETURN else 0.0
-    share = x * x * (3.0 - 2.0 * x)
-    share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
+    s = x * x * (3.0 - 2.0 * x)
+    s_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
     for i in range(site.q_held.shape[0]):
         held = site.q_held[i]
         distance = site.q_des[i] - held
-        site.q_des[i] = held + share * distance
-        site.qd_des[i] = share * site.qd_des[i] + share_rate * distance
+        site.q_des[i] = held + s * distance
+        site.qd_des[i] = s * site.qd_des[i] + s_rate * distance
 
 
 @leaf
 def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) -> None:
-    """Computes the reference of a site, which the arm follows, from the samples of its peers.
+    """Computes the position that an arm follows, a weighted mean of the other arms' positions.
+
+    The other arms are its peers, which send samples (their states). The position is called the
+    reference:
 
         q_des  = sum_j alpha_ij q_j                                  Eq. (6)
         qd_des = sum_j (alpha_ij qd_j + alpha_ij' q_j)
@@ -355,10 +365,11 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site; written.
-        links: Rows of the site's links.
+        site: State of the site (the process that runs the arm); written.
+        links: State of each link from another site, one row per link.
         ramps: Changes of the dominance factors, see `apply_ramps`.
     """
+    # Row 0 of the ramps has the factors at the start, which hold if there is no other row.
     if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)
     if site.degrades:

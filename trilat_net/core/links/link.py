@@ -36,7 +36,7 @@ from .delay import MAX_DELAY_US, DelayKind
 def link_dtype(shared: int) -> np.dtype[np.void]:
     """Returns the NumPy data type of the row that stores the state of a link, see `LinkRow`.
 
-    A link is the connection from one peer. A site has one row per peer, in scenario order.
+    A link is the connection from another arm. An arm has one row per link, in scenario order.
 
     Args:
         shared: Number of coordinates that sites share, the length of the row's vectors.
@@ -190,12 +190,14 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 
 @leaf
 def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
-    """Returns True if a sample's stamp is more than AHEAD_LIMIT_S ahead of tick k.
+    """Returns True if a sample claims to have been sent more than AHEAD_LIMIT_S in the future.
+
+    Such a sample is refused, because it would have to wait too long.
 
     Args:
         k: Present tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
-        tick: Stamp of the sample.
+        tick: Tick of the sender in which it sent the sample.
         peer_rate_hz: Tick rate of the sender, Hz.
     """
     # Compare whole seconds first: the nanoseconds of a hostile stamp would overflow int64.
@@ -206,15 +208,15 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Stores the numbers that a peer's control law sent with a sample, until its use.
+    """Stores the numbers that the control law of another arm sent, until they may be used.
 
-    A peer is the site at the sending end of the link. The numbers wait together with the sample
-    until its delay has passed.
+    The numbers came with a sample, the state of that arm. They wait together with the sample
+    until its simulated delay has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
-        page: Index of the page.
-        sent: Numbers as they arrived.
+        page: Index of the entry of the ring buffer in which the sample waits.
+        sent: Numbers as they arrived, in the order of the sender.
     """
     if channel is None:
         return
@@ -225,11 +227,14 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Passes the numbers that a peer's law sent with a sample to this law.
+    """Passes the numbers that the control law of another arm sent to the law of this arm.
+
+    The numbers came with a sample, the state of that arm. This function is called when the
+    simulated delay of the sample has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
-        page: Index of the sample's page.
+        page: Index of the entry of the ring buffer in which the sample waited.
     """
     if channel is not None:
         put(channel.received, channel.waiting[page])
@@ -267,12 +272,14 @@ def accept_sample(
     dues = link.dues
     calendar = link.calendar
     row.accepted += 1
-    if tick < 0 or (tick > row.scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
+    # The times of delivery are computed up to the sample `row.scheduled`.
+    is_scheduled = tick <= row.scheduled
+    if tick < 0 or (not is_scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
         return
 
-    index = tick % dues.shape[0]
-    has_due = row.scheduled - dues.shape[0] < tick <= row.scheduled
+    index = tick % dues.shape[0]  # a ring buffer
+    has_due = is_scheduled and tick > row.scheduled - dues.shape[0]
     if has_due and dues[index] <= _FILED:
         row.duplicate += 1
         return
@@ -290,15 +297,16 @@ def accept_sample(
     if release - k >= calendar.shape[0]:
         row.refused += 1
         return
-    dues[index] = _FILED - dues[index]
+    dues[index] = _FILED - dues[index]  # marks the sample as arrived
     if tick <= row.used:
         row.superseded += 1
         return
 
+    # The number of pages is a power of two, so a modulo is a mask.
     page = release & (calendar.shape[0] - 1)
     slot: SampleRow = calendar[page]
     if slot.tick >= 0:
-        row.superseded += 1
+        row.superseded += 1  # only the newer of two samples is used
     if slot.tick < tick:
         slot.tick = tick
         put(slot.q, q)
@@ -309,11 +317,12 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Puts into use the newest sample of a peer whose delay has passed in tick k.
+    """Puts into use the newest sample of another arm whose simulated delay has passed.
 
-    If there is no such sample, the last sample stays in use. This function must be called once
-    in each tick of the receiver, in order. Otherwise samples stay in the calendar, the ring
-    buffer with a page per tick in which `accept_sample` has put them.
+    A sample is the state that the other arm sent. If no sample is due in tick (control period)
+    k, the last one stays in use. This function must be called once in each tick of the
+    receiver, in order. Otherwise samples stay in the calendar, the ring buffer with a page per
+    tick in which `accept_sample` has put them.
 
     The due times of all samples with a stamp up to the time t_k of the tick are computed here,
     so that the first sample after a long silence costs no more than any other.

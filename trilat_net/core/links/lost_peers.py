@@ -49,8 +49,8 @@ def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
     Args:
         lost: Index of the peer that is lost.
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site.
-        links: Rows of the site's links, one per peer. `bit` is the bit of the peer, `followed`
+        site: State of the site.
+        links: State of each link, one row per peer. `bit` is the bit of the peer, `followed`
             the set of the sites that the peer follows, and `alpha` the weight with which this
             site follows the peer.
     """
@@ -83,8 +83,8 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if a returning peer turns the reference by at most the alignment limit.
 
     The reference, the orientation that the arm follows, is a weighted mean of the orientations
-    of the peers. With the rotation vector u_j from the orientation of peer j to that of the
-    site, and the weight alpha_j, the mean over the present peers is
+    of the other arms, its peers. With the rotation vector u_j from the orientation of peer j to
+    that of this arm, and the weight alpha_j, the mean over the present peers is
 
         mean = sum_j alpha_j u_j / sum_j alpha_j
 
@@ -97,9 +97,10 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
     Args:
         back: Index of the returning peer.
-        site: Row of the site, with its own pose x. The last three coordinates of a pose are the
-            rotation vector of its orientation, rad. `align_limit` is the limit.
-        links: Rows of the site's links, one per peer, with the pose q of the peer. `gone` is 0
+        site: State of the site (the process that runs the arm), with its own pose x. The last
+            three coordinates of a pose are the rotation vector of its orientation, rad.
+            `align_limit` is the limit.
+        links: State of each link, one row per peer, with the pose q of the peer. `gone` is 0
             for a present peer. The weights of the present peers must not all be 0.
     """
     orientation = rotation_matrix(three(site.x[3:]))
@@ -127,15 +128,16 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if a returning peer moves the reference by at most the alignment limit.
 
-    The reference, the position that the arm follows, is the mean of the positions of the peers
-    with their weights alpha. The limit applies to each linear coordinate, a position or a joint
-    angle, and to the orientation as a whole.
+    The reference, the position that the arm follows, is the mean of the positions of the other
+    arms, its peers, with their weights alpha. The limit applies to each linear coordinate, a
+    position or a joint angle, and to the orientation as a whole.
 
     Args:
         back: Index of the returning peer.
-        site: Row of the site, with the limit `align_limit`, m or rad.
-        links: Rows of the site's links, one per peer, with the position q of the peer. `gone`
-            is 0 for a present peer. The weights of the present peers must not all be 0.
+        site: State of the site (the process that runs the arm), with the limit `align_limit`, m
+            or rad.
+        links: State of each link, one row per peer, with the position q of the peer. `gone` is
+            0 for a present peer. The weights of the present peers must not all be 0.
     """
     if has_orientation(site) and not _is_orientation_near(back, site, links):
         return False
@@ -162,14 +164,18 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _redistribute_shares(links: RowArray) -> bool:
-    """Divides the shares of lost peers among the other peers, in proportion to their shares.
+    """Divides the weights of lost arms among the other arms that are followed.
+
+    The followed arms are called peers, and the weight of a peer is its dominance factor alpha.
+    The present peers get the factors of the lost ones in proportion to their own, so that the
+    sum is 1 again:
 
         alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
 
     Returns:
-        False, without a change, if no other peer has a share.
+        False, without a change, if all other peers have the factor 0.
     """
-    total = 0.0
+    total = 0.0  # the sum of the factors of the present peers, and its derivative
     total_rate = 0.0
     any_lost = False
     for j in range(links.shape[0]):
@@ -215,10 +221,11 @@ def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site; changed. `regrouped` becomes the reason if a peer was dropped or
-            restored in this tick, otherwise 0.
-        links: Rows of the site's links; changed. A peer is silent if its last sample came into
-            use more than `site.stale_ns` ago. `dispensable` is 1 if the site may drop the peer.
+        site: State of the site; changed. `regrouped` becomes the reason if a peer was dropped
+            or restored in this tick, otherwise 0.
+        links: State of each link, one row per peer; changed. A peer is silent if its last
+            sample came into use more than `site.stale_ns` ago. `dispensable` is 1 if the site
+            may drop the peer.
     """
     site.regrouped = 0
     for j in range(links.shape[0]):

@@ -147,16 +147,16 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
     """Draws a random number from a gamma distribution with scale 1.
 
-    The method is rejection after Marsaglia and Tsang, "A Simple Method for Generating Gamma
-    Variables", ACM TOMS 26 (2000). If the shape is below 1, a number of shape + 1 is drawn and
-    multiplied by u^(1 / shape), where u is uniformly distributed from 0 to 1.
+    The method, with its symbols, is the rejection of Marsaglia and Tsang, "A Simple Method for
+    Generating Gamma Variables", ACM TOMS 26 (2000). If the shape k is below 1, a number of
+    shape k + 1 is drawn and multiplied by u^(1 / k), where u is uniform from 0 to 1.
 
     Args:
         key: Seed of the network link for which the number is drawn.
         sample: Index of the message on this link.
         purpose: Distinguishes several draws for the same message. The draw uses the streams
             `purpose`, `purpose + 1` and `purpose + 2`.
-        shape: Shape of the distribution.
+        shape: Shape k of the distribution.
     """
     boost = 1.0
     k = shape

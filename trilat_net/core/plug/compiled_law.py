@@ -95,12 +95,14 @@ def _all_finite(values: Array) -> bool:
 
 @leaf
 def finish_law(s: Row, law: Array, sent: Array) -> None:
-    """Checks the results of a law, and limits its torque.
+    """Checks the results of a control law, and limits its torque to the range of the motors.
 
     Args:
-        s: Row of the site, with the torque and the estimate; the torque is limited.
-        law: Numbers of the law, those that it keeps from tick to tick first.
-        sent: Vectors that the law sends.
+        s: State of the site (the process that runs the arm), with the torque and the estimate;
+            the torque is limited.
+        law: Numbers of the law. Those that it keeps from tick to tick (control period) come
+            first, and are checked too.
+        sent: Vectors that the law sends to other arms.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -134,15 +136,15 @@ def law_stage(
     from the law.
 
     Args:
-        k: The tick.
+        k: Number of the tick (control period).
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         address: Address of the law's machine code.
         law: Numbers of the law, those that it keeps from tick to tick first; changed.
-        site: Row of the site, in which the torque is written.
-        links: Rows of the site's links.
-        chain: Rows of the chain of joints, or None for the planar arm.
+        site: State of the site (the process that runs the arm), in which the torque is written.
+        links: State of each link from another site, one row per link.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
         channel: Vectors that the peers' laws sent.
-        sent: Written: the vectors that this law sends.
+        sent: Receives the vectors that this law sends.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -158,13 +160,15 @@ def law_stage(
 class LawForm(NamedTuple):
     """Data types for which a control law is compiled. Laws with equal types share the code.
 
+    A peer is another arm, with which the law exchanges vectors.
+
     Attributes:
-        law: Layout of the law's numbers.
-        site: Layout of the site's row.
-        link: Layout of the links' rows.
-        received: Layout of the vectors that a peer sends, or None if there are none.
-        to_all: Layout of the vectors that go to all peers, or None if there are none.
-        sent: Layout of the vectors that go to one peer alone, or None if there are none.
+        law: Names and shapes of the law's numbers: its gains and its memory.
+        site: Data type of the state of the arm and its controller.
+        link: Data type of the state of a link from a peer.
+        received: Vectors that a peer sends. None if there are none.
+        to_all: Vectors that go to all peers. None if there are none.
+        sent: Vectors that go to one peer alone. None if there are none.
         peers: Number of peers.
     """
 
@@ -178,20 +182,28 @@ class LawForm(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the layout of vectors that stand one after another, or None if there are none.
+    """Returns the data type with which a row of floats is read as vectors with names.
+
+    A compiled law thus reads the vectors that other laws sent as fields, such as `received.F`.
+    The result is None if there are no vectors.
 
     Args:
-        vectors: The vectors.
-        width: Count of numbers in an array's row, if the row is longer than the vectors.
+        vectors: The vectors, one after another in the row.
+        width: Number of floats in the row, if it is longer than the vectors.
     """
     if not vectors:
         return None
-    lengths = [vector.length for vector in vectors]
+    float_bytes = 8
+    first = 0
+    offsets = []
+    for vector in vectors:
+        offsets.append(float_bytes * first)
+        first += vector.length
     layout: Any = {
         "names": [vector.name for vector in vectors],
-        "formats": [("f8", (length,)) for length in lengths],
-        "offsets": [8 * sum(lengths[:n]) for n in range(len(lengths))],
-        "itemsize": 8 * (width or sum(lengths)),
+        "formats": [("f8", (vector.length,)) for vector in vectors],
+        "offsets": offsets,
+        "itemsize": float_bytes * (width or first),
     }
     return np.dtype((np.record, layout))
 
@@ -199,11 +211,11 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 # Numba cannot return a record from a function, so the code becomes a part of each caller.
 @numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
 def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
-    """Returns the input of a control law in a tick, as views of the arrays, without copying.
+    """Returns the input of a control law in a control period, as views, without copying.
 
     Args:
-        s: Row of the site.
-        links: Rows of the links from the peers.
+        s: State of the site (the process that runs the arm).
+        links: State of each link, one row per peer.
         received: Vectors that came from each peer.
         sent: Vectors that go to each peer alone.
         to_all: Vectors that go to all peers.
@@ -236,16 +248,15 @@ def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any)
 
 @cache
 def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
-    """Returns the compiled form of a law's `torque`.
+    """Compiles the method `torque` of a control law to machine code that the simulation calls.
 
-    Its arguments are the law's numbers, the site's row, its links' rows, and the arrays of the
-    received and the sent vectors. They are views of arrays, from which the compiled function
-    builds the law's input. Laws of this package are stored on disk, laws of users are compiled
-    in each process.
+    The arguments of the compiled function are arrays: the numbers of the law, the state of the
+    site and of its links, and the vectors that the law receives and sends. Machine code of laws
+    of this package is stored on disk. Laws of users are compiled in each process.
 
     Args:
         torque: The method of the law's class.
-        form: Layouts of the arguments.
+        form: Data types of the arguments.
 
     Raises:
         NumbaError: The law cannot be compiled.
@@ -270,8 +281,8 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
 
         Args:
             law: Numbers of the law: its gains and what it remembers.
-            site: Row of the site, shape (1,).
-            links: Rows of the links from the peers, the other sites, in scenario order.
+            site: State of the site, shape (1,).
+            links: State of each link, one row per peer (other site), in scenario order.
             received: Vectors that came from each peer, one row per peer.
             sent: Vectors that this law sends: those for all peers, then those for each peer.
         """
@@ -359,7 +370,7 @@ _INPUTS = {
 
 
 def _explain(error: Exception, law: Any) -> str:
-    """Returns a sentence that says which part of a law Numba cannot compile.
+    """Tells a user in one sentence why Numba cannot compile a control law.
 
     The messages of Numba are long and name types of Numba. Frequent causes are recognised and
     explained in the terms of a law; otherwise the first sentence of the message is returned.
@@ -373,6 +384,7 @@ def _explain(error: Exception, law: Any) -> str:
     line_numbers = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
     location = f" (line {line_numbers[-1]})" if line_numbers else ""
 
+    # Numba's words for code that allocates memory.
     if "NRT required" in text or "returning of array" in text:
         return (
             f"the law creates an array or a list{location}: compute number by number, as in "
@@ -382,23 +394,26 @@ def _explain(error: Exception, law: Any) -> str:
     if field:
         return _explain_field(field[1], field[2], location)
     attribute = re.search(r"Unknown attribute '(\w+)' of type Record", text)
-    if isinstance(error, KeyError) and not _reads_own_attribute(law, error.args[0]):
-        return _explain_field(error.args[0], "Record(alpha", location)
     if isinstance(error, KeyError):
-        return _explain_attribute(error.args[0], law, location)
+        # Numba names the attribute, but not its object: the law itself or one of its peers.
+        name = error.args[0]
+        if _reads_own_attribute(law, name):
+            return _explain_attribute(name, law, location)
+        return _explain_field(name, "Record(alpha", location)
     if attribute:
         return _explain_attribute(attribute[1], law, location)
-    unknown = re.search(r"Untyped global name '(\w+)'", text)
-    if unknown:
+    global_name = re.search(r"Untyped global name '(\w+)'", text)
+    if global_name:
         return (
-            f"the law uses {unknown[1]}{location}, which is neither a number nor a function "
-            "with @trilat_net.compiled"
+            f"the law uses {global_name[1]}{location}, which is neither a number nor a "
+            "function with @trilat_net.compiled"
         )
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     noise = ("Failed in", "File", "During", "-", "^", "<", "[")
     sentences = [line for line in lines if not line.startswith(noise)]
-    return f"{(sentences or lines)[0].rstrip('.:')}{location}"
+    first_sentence = (sentences or lines)[0].rstrip(".:")
+    return f"{first_sentence}{location}"
 
 
 def _reads_own_attribute(law: Any, name: str) -> bool:
@@ -413,15 +428,16 @@ def _reads_own_attribute(law: Any, name: str) -> bool:
         name: Name of the attribute.
     """
     instructions = list(dis.get_instructions(type(law).torque))
-    own_name = type(law).torque.__code__.co_varnames[0]
+    self_name = type(law).torque.__code__.co_varnames[0]  # usually "self"
+    # `self.NAME` is compiled to two instructions: load `self`, then read the attribute.
     return any(
-        loaded.argval == own_name and read.argval == name
-        for loaded, read in pairwise(instructions)
+        loading.argval == self_name and reading.argval == name
+        for loading, reading in pairwise(instructions)
     )
 
 
 def _explain_field(name: str, kind: str, location: str) -> str:
-    """Returns a sentence that says that an input of a law has no such field.
+    """Tells a user that the input of a control law has no field with a name that the law uses.
 
     Args:
         name: Name of the field.
@@ -434,10 +450,10 @@ def _explain_field(name: str, kind: str, location: str) -> str:
 
 
 def _explain_attribute(name: str, law: Any, location: str) -> str:
-    """Returns a sentence that says why a compiled law cannot use an attribute of `self`.
+    """Tells a user why a compiled control law cannot use an attribute of `self`.
 
     Only numbers and lists of numbers can be compiled. The attribute is of another type, does
-    not exist, or is a method: then the sentence says what to write instead.
+    not exist, or is a method. For a method, the sentence says what to write instead.
 
     Args:
         name: Name of the attribute.
@@ -567,11 +583,20 @@ class CompiledLaw:
         Raises:
             LawFailed: The law raised an exception, or returned an invalid result.
         """
-        a = self._arrays
-        assert a.channel is not None
+        arrays = self._arrays
+        assert arrays.channel is not None
         try:
+            # Positional, because compiled functions take no names of arguments.
             self._stage(
-                k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent
+                k,
+                t_ns,
+                self.address,
+                self.row,
+                arrays.site,
+                arrays.links,
+                arrays.chain,
+                arrays.channel,
+                self._sent,
             )
         except Exception as error:  # the user's code may raise anything
             raise self.find_failure(error) or error from None
@@ -606,9 +631,12 @@ class CompiledLaw:
             origin.
         """
         s: Row = self._arrays.site[0]
-        if not s.asked:
+        was_law_running = bool(s.asked)
+        if not was_law_running:
             return None
+
         if isinstance(error, FloatingPointError):
+            # A result was not finite: find out which one.
             results = LawResults(
                 torque=s.tau.tolist(),
                 theta_hat=s.theta_hat.tolist(),

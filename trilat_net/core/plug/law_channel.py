@@ -115,6 +115,8 @@ class LawChannel(NamedTuple):
         This is the length of the field `ch` of a record. A vector of which each peer (the
         process of another arm) gets its own counts once for each peer.
         """
+        if not self.vectors:
+            return 0
         to_all = self.count_numbers(per_peer=False)
         to_each = self.count_numbers(per_peer=True)
         return to_all + self.peers * to_each
@@ -129,16 +131,19 @@ class LawChannel(NamedTuple):
             For each number of these vectors its index among the numbers that this law sends to
             a peer. The index is -1 for the numbers of a vector that this law does not send.
         """
-        start = 0
-        starts = {}
+        first_column = 0
+        first_columns = {}
         for vector in self.vectors:
-            starts[vector.name] = start
-            start += vector.length
-        columns = []
+            first_columns[vector.name] = first_column
+            first_column += vector.length
+
+        columns: list[int] = []
         for vector in vectors:
-            for n in range(vector.length):
-                is_sent = vector.name in starts
-                columns.append(starts[vector.name] + n if is_sent else -1)
+            if vector.name in first_columns:
+                first = first_columns[vector.name]
+                columns += range(first, first + vector.length)
+            else:
+                columns += [-1] * vector.length
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[_SentEntry]:
@@ -154,9 +159,9 @@ class LawChannel(NamedTuple):
             vector.
         """
         to_each = self.select_vectors(per_peer=True)
-        groups = [("", self.select_vectors(per_peer=False))]
-        groups += [(peer, to_each) for peer in peers]
-        for peer, vectors in groups:
+        vectors_by_receiver = [("", self.select_vectors(per_peer=False))]
+        vectors_by_receiver += [(peer, to_each) for peer in peers]
+        for peer, vectors in vectors_by_receiver:
             for vector in vectors:
                 for n in range(vector.length):
                     yield _SentEntry(vector, peer, n)
@@ -177,10 +182,12 @@ class LawChannel(NamedTuple):
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns all vectors that a law may receive from the other arms; equal names appear once.
+    """Returns all vectors that a control law may receive from the laws of other arms.
+
+    A vector that several laws send, such as the energy E, appears once.
 
     Args:
-        channels: Vectors that the laws of the peers send.
+        channels: Vectors that each of the other laws sends.
 
     Raises:
         ValueError: Two peers send vectors with the same name and different lengths.
@@ -188,9 +195,9 @@ def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
     by_name: dict[str, SentVector] = {}
     for channel in channels:
         for vector in channel.vectors:
-            other = by_name.setdefault(vector.name, vector)
-            if other.length != vector.length:
+            first = by_name.setdefault(vector.name, vector)
+            if first.length != vector.length:
                 count = count_nouns(vector.length, "number")
                 problem = f"peers send {vector.name} with different lengths"
-                raise ValueError(f"{problem}, {other.length} and {count}")
+                raise ValueError(f"{problem}, {first.length} and {count}")
     return tuple(by_name.values())

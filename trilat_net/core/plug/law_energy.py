@@ -98,14 +98,18 @@ class LawEnergies(NamedTuple):
 
 
 def sum_work(tau: Array, q: Array) -> Array:
-    """Returns the work of a joint torque since the first tick, for each tick, J, shape (K,).
+    """Returns the work of the joint torques since the start of a run, in each control period.
 
-    A torque is held from each tick to the next. Its work in this period is the torque times the
-    step of the joint angles, summed over the joints. The first number is 0.
+    A torque is constant from each tick (start of a period) to the next. Its work in the period
+    is the torque times the step of the joint angles, summed over the joints.
 
     Args:
         tau: Torque held from each tick to the next, shape (K, n), N m.
         q: Joint angles at each tick, shape (K, n), rad.
+
+    Returns:
+        The work at each tick, J, shape (K,). The first number is 0.
     """
-    steps: Array = np.einsum("kj,kj->k", tau[:-1], np.diff(q, axis=0))
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    angle_steps = np.diff(q, axis=0)
+    work_steps: Array = np.einsum("kj,kj->k", tau[:-1], angle_steps)
+    return np.concatenate([[0.0], np.cumsum(work_steps)])

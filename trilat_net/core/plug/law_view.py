@@ -31,8 +31,8 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
     """Writes the gravity torque G, the inertia matrix M and the bias torque of the arm.
 
     Args:
-        s: Row of the site.
-        chain: Rows of the chain of joints, or None for the planar arm.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
         two_link_stages.update_model(s)
@@ -81,7 +81,7 @@ _FIRST_PEER_VECTOR = PeerView._fields.index("q")
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
-    """Returns a namespace of vectors, filled with consecutive numbers.
+    """Divides a list of numbers into vectors with names, which a law reads as attributes.
 
     Args:
         vectors: Names and lengths of the vectors.
@@ -111,30 +111,32 @@ class PlainLaw:
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
         channel = setup.channel
         layout = setup.layout
-        n = layout.joints
-        m = layout.shared
+        joints = layout.joints
+        shared = layout.shared
         self._law = law
         self._setup = setup
         self._arrays = arrays
         self._sent = sent
         self._update = update_law_view
 
+        # Views of the arrays: reading them gives the present state of the site, and writing
+        # into them changes it.
         site = arrays.site[0]
         self._views: dict[str, Array] = {}
         for name in _PER_JOINT:
             field = _IN_ROW.get(name, name)
-            self._views[name] = site[field][:n]
+            self._views[name] = site[field][:joints]
         for name in _PER_COORDINATE:
-            self._views[name] = site[name][:m]
+            self._views[name] = site[name][:shared]
         self._views["theta_hat"] = site["theta_hat"][: layout.parameters]
-        self._inertia = site["M"][:n, :n]
-        self._limit = site["tau_limit"][:n]
+        self._inertia = site["M"][:joints, :joints]
+        self._limit = site["tau_limit"][:joints]
 
         self._peer_columns: list[Any] = []
         for name in PeerView._fields:
             column = arrays.links[name]
             is_vector = column.ndim > 1
-            self._peer_columns.append(column[:, :m] if is_vector else column)
+            self._peer_columns.append(column[:, :shared] if is_vector else column)
 
         self._received = None if arrays.channel is None else arrays.channel.received
         self._receives = setup.received_vectors
@@ -209,7 +211,7 @@ class PlainLaw:
         first the vectors that go to all peers, then for each peer those that go to it alone.
 
         Args:
-            k: Number of the tick.
+            k: Number of the tick (control period).
 
         Returns:
             The input.
@@ -263,7 +265,7 @@ class PlainLaw:
 
 
 def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) -> list[float]:
-    """Returns the numbers of a law's vectors one after another.
+    """Returns the numbers of the vectors that a law sends, one vector after another.
 
     Args:
         declared: Vectors that the law declares.

@@ -57,13 +57,12 @@ class LawContext(NamedTuple):
 
 
 def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
-    """Returns an arithmetic method of `LawVector` that works number by number.
+    """Creates an arithmetic method of `LawVector`, such as `__add__`, from an operation.
+
+    The method works number by number. Its arguments are the vector and the other operand.
 
     Args:
         operate: The operation on two numbers, for example `operator.add`.
-
-    Returns:
-        The method. Its arguments are the vector of which it is a method, and the other operand.
     """
 
     def compute(vector: "LawVector", other: Any) -> Any:
@@ -148,7 +147,7 @@ class LawInput(NamedTuple):
     numbers one by one.
 
     Attributes:
-        k: The tick.
+        k: Number of the tick (control period).
         t_s: Nominal time since the start of the session, s.
         h_s: The period, s.
         q: Joint angles, rad.
@@ -243,14 +242,16 @@ def call_law(
     Args:
         law: The law.
         site: Name of the site.
-        now: Input of the tick.
-        collect_sent: Function that returns the numbers of the vectors that the law sends.
+        now: Input of the law in this control period.
+        collect_sent: Function that returns the numbers that the law sends to other arms.
 
     Raises:
-        LawFailed: The law raised, or its results are not finite numbers of the right count.
+        LawFailed: The law raised an exception, or its results are not finite numbers of the
+            right count.
     """
     try:
         returned = law.torque(now)
+        # `now.tau` is NaN before the call.
         if returned is None and all(map(math.isnan, now.tau)):
             raise TypeError("torque returned None and did not write now.tau")
         torque_numbers = now.tau if returned is None else returned
@@ -293,8 +294,8 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 
     Args:
         law: The law, for the error.
-        site: Name of the site, for the error.
-        tick: The tick, for the error.
+        site: Name of the site (the process that runs the arm), for the error.
+        tick: Number of the tick (control period), for the error.
         results: Results of the law.
 
     Raises:
@@ -322,7 +323,7 @@ def describe_failure(
     Args:
         law: The law.
         site: Name of the site.
-        tick: The tick. None if the exception was raised outside of a tick.
+        tick: Number of the tick (control period). None if the law failed outside of a tick.
         error: The exception.
     """
     problem = describe_exception(error)
@@ -345,20 +346,21 @@ def _flatten(value: Any) -> Iterator[float]:
 
 
 def _fill(value: Any, numbers: Iterator[float]) -> Any:
-    """Returns a value of the same form as `value`, filled with the next numbers.
+    """Restores an attribute of a law from a list of numbers; the inverse of `_flatten`.
 
-    This is the inverse of `_flatten`. Types are kept: an integer attribute stays an integer as
-    long as its number is integral.
+    Example: the value [[1, 2], [3]] and the numbers 4, 5, 6 give [[4, 5], [6]]. Types are kept:
+    an integer stays an integer as long as its new number is integral.
 
     Args:
-        value: A number, an array, or nested lists of numbers.
-        numbers: The numbers, which are consumed in order.
+        value: Present value: a number, an array, or nested lists of numbers.
+        numbers: The new numbers. As many of them are consumed as `value` contains.
     """
     if isinstance(value, bool):
         return bool(next(numbers))
     if isinstance(value, Real):
         number = next(numbers)
-        return int(number) if isinstance(value, int) and number.is_integer() else number
+        stays_integer = isinstance(value, int) and number.is_integer()
+        return int(number) if stays_integer else number
     if isinstance(value, np.ndarray):
         entries = [next(numbers) for _ in range(value.size)]
         return np.array(entries, value.dtype).reshape(value.shape)
@@ -375,7 +377,7 @@ def list_remembered(law: Any) -> tuple[str, ...]:
 
 
 def read_memory(law: Any) -> list[float]:
-    """Returns the numbers that a law keeps from tick to tick.
+    """Returns the numbers that a control law keeps from one control period to the next.
 
     They come from the law's method `memory` if it has one, otherwise from the attributes that
     its class lists in `remembers`.
@@ -434,7 +436,7 @@ def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFa
     Args:
         law: The law.
         site: Name of the site.
-        tick: The tick; None outside of a tick.
+        tick: Number of the tick (control period). None outside of a tick.
         problem: The problem, a sentence for the user.
     """
     return LawFailed(problem, site=site, code=law_name(law), tick=tick)

@@ -176,11 +176,12 @@ def _clip(value: float, low: float, high: float) -> float:
 
 @leaf
 def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
-    """Returns the projection of an estimate into its box: each parameter limited to its range.
+    """Returns an estimate of the arm's parameters, with each parameter limited to its range.
 
-    If Gamma is diagonal and the true theta lies in the box, the projection never increases
-    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). V' <= 0 therefore still holds, where V is
-    the energy function of the stability proof.
+    The stability proof still holds with this projection: if the adaptation gain Gamma is
+    diagonal and the true parameters theta are within the limits, the projection never increases
+    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). The energy function V of the proof, which
+    contains this term, therefore still never rises.
 
     Args:
         theta_hat: Estimate of the parameters, shape (5,).

@@ -42,7 +42,9 @@ def _compute_sines(angles: Array, results: Array) -> None:
 
 
 def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
-    """Returns the setup of a site of the short run whose results are hashed.
+    """Returns the setup of one of the two arms in the simulation of the fingerprint.
+
+    The numbers are arbitrary, but must never change: the fingerprint depends on them.
 
     Args:
         name: Name of the site.
@@ -93,8 +95,9 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
 def compute_fingerprint() -> str:
     """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
 
-    It is a hash of many sines and cosines and of a short run of two sites. Two platforms with
-    the same fingerprint can be expected to compute the same bits.
+    Two platforms with the same fingerprint can be expected to compute the same bits. It is a
+    hash of many sines and cosines, and of a short simulation of two arms. Each arm follows the
+    other, and receives its state of the previous tick.
     """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))
@@ -109,6 +112,7 @@ def compute_fingerprint() -> str:
         from_a = Arrival(0, k - 1, record_a.q, record_a.qd)
         record_a = a.step(TickInput(k, [from_b]))
         record_b = b.step(TickInput(k, [from_a]))
-        numbers = [r.q + r.qd + r.tau + r.theta_hat for r in (record_a, record_b)]
-        digest.update(np.array(numbers).tobytes())
+        for record in (record_a, record_b):
+            numbers = [*record.q, *record.qd, *record.tau, *record.theta_hat]
+            digest.update(np.array(numbers).tobytes())
     return digest.hexdigest()[:16]

@@ -30,7 +30,7 @@ from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
 NEVER_NS = 2**63 - 1
-"""The time of the next tick of a site that has made all its ticks, ns."""
+"""Stands for the time of the next control period of an arm that has made all of them, ns."""
 
 PROGRESS_DTYPE = row_dtype("progress", {})
 """The layout of a site's progress, see `ProgressRow`."""
@@ -89,7 +89,7 @@ def max_over_joints(buckets: Array) -> Array:
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns the position of the numbers that a law sends, among all floats of a record."""
+    """Returns where the numbers that a control law sends begin among all floats of a record."""
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
@@ -123,18 +123,17 @@ class ReplayedInputs(NamedTuple):
 def _accept_record(
     k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
-    """Reads the sample of a peer from its record, and stores it as an arrival at the receiver.
+    """Lets a simulated arm receive the state (sample) of another arm, without a network.
 
-    A site is the process that runs one arm. The receiver is a site, and the peer another site,
-    whose samples (states) it receives. A record contains the results of one tick, a period of
-    the control loop. With n joints, m coordinates that the sites share and P parameters, its
-    floating-point numbers are
+    The sample is read from the record of the other arm, the peer. A record contains the results
+    of one tick, a period of the control loop. With n joints, m coordinates that the arms share
+    and P parameters, its floating-point numbers are
 
         q (n), qd (n), q_des (m), qd_des (m), tau (n), tau_x (n), theta_hat (P),
         x (m), xd (m), wrench (m),                                  only in task space
         the numbers that the control law of the peer sends
 
-    Sites that share joint angles send q, qd and tau_x. Sites in task space send the pose x, its
+    Arms that share joint angles send q, qd and tau_x. Arms in task space send the pose x, its
     velocity xd and the external wrench on the end effector instead.
 
     Args:
@@ -184,12 +183,11 @@ def _accept_prompt_records(
     sent: RecentRecords,
     link: LinkArrays,
 ) -> int:
-    """Accepts a peer's records with a stamp before time t, as if they arrived without delay.
+    """Lets an arm receive all states that another arm (peer) sent before time t, without delay.
 
-    A site is the process that runs one arm. The receiver is a site, and the peer another site
-    whose records it receives. A record contains the results of one tick, a period of the
-    control loop. Its stamp is the nominal time of this tick. Acceptance stores the record until
-    the simulated delay of the link has passed.
+    The states are in the records of the peer. A record contains the results of one tick, a
+    period of the control loop. A received state is stored until the simulated delay of the link
+    has passed.
 
     Args:
         k: The tick of the receiver.
@@ -258,16 +256,19 @@ def update_peaks(
     peaks: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the peaks of the present bucket, and the sums of errors, by a record.
+    """Updates the largest errors and speeds of an arm, and its sums of errors, by a record.
+
+    A simulation of many runs keeps these statistics instead of the records. The largest values
+    are kept for each interval of time (bucket).
 
     Args:
-        row: The floats of the record.
-        t_ns: Its nominal time, ns since the epoch.
-        settled_rad: Errors below this are settled, rad.
-        s: The row of the site.
-        progress: The progress of the site.
-        peaks: The peaks of the site in the present bucket, see `run_until`, shape (3 n,).
-        sums: The sums of the site.
+        row: Floating-point numbers of the record, the results of one control period.
+        t_ns: Nominal time of the period, ns since the start of the session.
+        settled_rad: Position error below which the arm counts as settled, rad.
+        s: State of the site (the process that runs the arm).
+        progress: Progress of the site. The time of the last larger error is updated.
+        peaks: Largest values in the present interval, see `run_until`, shape (3 n,).
+        sums: Sums over all records of the site.
     """
     largest_error = 0.0
     joints = peaks.shape[0] // 3
@@ -297,10 +298,13 @@ def update_peaks(
 
 @leaf
 def _advance_bucket(progress: ProgressRow) -> None:
-    """Advances to the next bucket if a site has made all ticks of the present one.
+    """Advances to the next interval of time (bucket) for which largest values are kept.
+
+    This happens once an arm has made all control periods of the present interval. The periods
+    are counted in parts of the interval, because an interval may not be a multiple of a period.
 
     Args:
-        progress: Progress of the site; changed.
+        progress: Progress of the site (the process that runs the arm); changed.
     """
     progress.part += BUCKETS_PER_S
     while progress.part >= progress.rate_hz:
@@ -310,13 +314,13 @@ def _advance_bucket(progress: ProgressRow) -> None:
 
 @leaf
 def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
-    """Writes the gravity torque at the pose of a record, N m.
+    """Computes the gravity torque of an arm at the pose that a record contains.
 
     Args:
-        s: Row of the site.
-        chain: Rows of the chain, or None for the planar arm.
-        row: Floats of the record.
-        torque: Written, shape (n,).
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        row: Floating-point numbers of the record. They begin with the joint angles.
+        torque: Receives the torque, shape (n,), N m.
     """
     if chain is None:
         two_link_stages.put_gravity_torque(s, torque)
@@ -335,17 +339,18 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Writes the torque of some actors at the state of a record, N m.
+    """Computes the torque of operators and environments at the motion that a record contains.
 
     Args:
-        t_s: Time since the epoch, s.
-        s: Row of the site.
-        chain: Rows of the chain, or None for the planar arm.
-        row: Floats of the record.
-        actors: Operators and environments.
-        table: Their tables.
-        sampled: 1: the actors that are held over a tick; 0: the others.
-        torque: Written, shape (n,).
+        t_s: Time since the start of the session, s.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        row: Floating-point numbers of the record. They begin with joint angles and velocities.
+        actors: Operators and environments, one row for each.
+        table: Their tables, for example of recorded torques.
+        sampled: 1 for those with a torque that is constant during a control period, 0 for all
+            others.
+        torque: Receives the torque, shape (n,), N m.
     """
     if chain is None:
         two_link_stages.put_source_torque(
@@ -375,21 +380,21 @@ def update_sums(
     row: Array,
     sums: SumsRow,
 ) -> None:
-    """Adds a record to the effort, and the period before it to the work of the environments.
+    """Updates the effort of an arm's motors, and the work of its environments, by a record.
 
-    The effort is the squared torque beyond gravity. The work over a period is the mean of the
-    present torque at both ends (trapezoid rule), plus the torque held over the period, times
-    the change of q.
+    The effort is the sum of the squared torques beyond gravity. The work in a control period is
+    the torque times the change of the joint angles q. The torque that varies during the period
+    is taken as the mean of both ends (trapezoid rule), and the constant torque is added.
 
     Args:
-        k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
-        s: Row of the site.
-        chain: Rows of the chain, or None for the planar arm.
-        environments: Environments of the site, without its operators.
-        table: Tables of all torque sources.
-        row: Floats of the record.
-        sums: Sums of the site.
+        k: Number of the tick (control period).
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        environments: Environments that the arm may touch, without its operators.
+        table: Tables of all operators and environments, for example of recorded torques.
+        row: Floating-point numbers of the record, the results of the tick.
+        sums: Sums over all records of the site; changed.
     """
     n = s.joints
     t_s = t_ns * 1e-9
@@ -465,7 +470,7 @@ def _compute_torque(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Computes the torque of a site's control law, stage 6 of a tick (see `kernel`).
+    """Computes the torque of an arm's control law in the present control period (tick).
 
     A law is built in, or a user wrote it. `torque_stage` computes the torque of built-in laws,
     and does nothing for users' laws. `law_stage` calls a user's law that was compiled. The
@@ -475,7 +480,7 @@ def _compute_torque(
         i: Index of the site, the process that runs one arm.
         progress: Progress of the site, with the tick and its nominal time.
         arrays: Arrays of all sites.
-        chain: Rows of the site's chain of joints, or None for the planar arm.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
         laws: The users' compiled laws. None if no site has one. The address of a law is 0 for a
             site that has no compiled law.
     """
@@ -504,13 +509,15 @@ def _compute_torque(
 
 @leaf
 def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
-    """Writes the numbers that the law of a site sends into its record.
+    """Writes the numbers that a control law sends to other arms into the record of its arm.
+
+    The other arms of the simulation read them from there.
 
     Args:
-        s: Row of the site.
+        s: State of the site (the process that runs the arm).
         i: Index of the site.
-        row: Floats of the record; changed.
-        laws: The users' compiled laws, or None.
+        row: Floating-point numbers of the record; changed.
+        laws: Compiled control laws that users wrote. None if there are none.
     """
     if laws is not None:
         first = first_sent_column(s)
@@ -694,25 +701,32 @@ def run_until(
     chains: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Steps all sites up to a time, or to the instant at which a site diverges.
+    """Simulates all arms of an experiment up to a time, or until an arm diverges.
+
+    A site is the process that runs one arm. The control periods of all sites are computed in
+    the order of their times.
 
     Args:
-        last_ns: The last nominal time to step, ns since the epoch.
-        settled_rad: `unsettled_ns` is the last time of an |e| of this or more, rad.
-        progress: The progress of the sites, shape (N,), PROGRESS_DTYPE.
-        next_samples: The next sample of each peer to accept, shape (N, P).
-        sent: The last records of the sites.
-        feed: The inputs of a recorded run.
-        peaks: Per bucket the largest |e| of each joint, then the largest |qd| of each joint,
-            then the last q of each joint; -1 where there is no record; shape (N, buckets, 3 n).
-        sums: The sums of the sites, shape (N,), see `sums_dtype`.
-        arrays: The arrays of all sites, see `SiteArrays.stack`.
-        chains: Its `chain` once more: as an argument that is None it keeps Numba from compiling
-            the leaves of chains.
-        laws: The users' compiled laws. None if there are none.
+        last_ns: Time of the last control period to compute, ns since the start of the session.
+        settled_rad: Position error below which an arm counts as settled, rad. The progress of a
+            site contains the last time of a larger error.
+        progress: Progress of the sites, shape (N,), PROGRESS_DTYPE.
+        next_samples: Number of the next sample (state of another arm) to accept, for each of N
+            sites and P peers (the other sites), shape (N, P).
+        sent: Latest records of the sites, from which the samples are taken.
+        feed: Inputs of a recorded run that is repeated.
+        peaks: For each interval of time (bucket) the largest position error |e| of each joint,
+            then the largest speed |qd| of each joint, then the last angle q of each joint; -1
+            if there is no record. The shape is (N, buckets, 3 n).
+        sums: Sums over the records of the sites, shape (N,), see `sums_dtype`.
+        arrays: Arrays of all sites, see `SiteArrays.stack`.
+        chains: The field `chain` of `arrays` once more. If this argument is None, Numba does
+            not compile the functions for chains of joints.
+        laws: Compiled control laws that users wrote. None if there are none.
     """
     count = progress.shape[0]
     while True:
+        # The time of the next control period of any site.
         t_ns = NEVER_NS
         for i in range(count):
             site_progress: ProgressRow = progress[i]

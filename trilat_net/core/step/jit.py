@@ -80,9 +80,10 @@ def _cache_root() -> Path:
 
 
 def _core_digest() -> str:
-    """Returns a hash of all sources of the machine code, and of Numba's version.
+    """Returns a hash that changes if stored machine code is out of date.
 
-    The sources are the files of the core, and the constants that it imports from `records`.
+    It covers Numba's version and all sources of the code: the files of the core, and `records`,
+    whose constants the core contains.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for source in (*sorted(_CORE.rglob("*.py")), _CORE.with_name("records.py")):
@@ -91,9 +92,9 @@ def _core_digest() -> str:
 
 
 def _writable_cache() -> Path | None:
-    """Returns the directory for compiled leaves; None if it cannot be written.
+    """Returns the directory in which compiled functions are stored, and creates it if needed.
 
-    Without a directory, compiled leaves are kept in memory only.
+    None if it cannot be written. Compiled functions are then kept in memory only.
     """
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
@@ -110,11 +111,10 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if the simulation can start at once, because its code is compiled.
+    """Returns True if the simulation can start at once, because its code was compiled before.
 
-    The stored code must be of the present version of the sources. Only the code of
-    `kernel.site_tick` is looked for. It is compiled last, so the other functions exist if it
-    does.
+    The stored code must be of the present version of the sources. Only the function
+    `kernel.site_tick` is looked for. It is compiled last, so if it is stored, all others are.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -135,10 +135,11 @@ COMPILING = (
 class _CompilingNotice(event.Listener):
     """Reports once that the core is compiled, which makes a first run take longer.
 
-    During a compilation signals end the process at once.
+    Numba calls this object at the start and the end of each compilation. During a compilation,
+    signals such as Ctrl-C end the process at once.
 
     Attributes:
-        is_reported: True: the notice was reported, or must not be.
+        is_reported: True if the notice was reported, or must not be reported.
         report: Writes the notice; by default to standard error.
     """
 
@@ -178,11 +179,12 @@ _register("numba:compile", compiling_notice)
 
 
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
-    """Returns the name that a record has in symbols of machine code, from a hash of its fields.
+    """Returns a unique name for a record type, for the symbols of compiled functions.
 
-    Numba itself numbers records in the order in which a process uses them. Leaves that two
-    processes compiled for two layouts would then have equal symbols, and a third process that
-    loads both from the cache would mix them up.
+    A record type describes the rows of a structured array. Numba itself numbers these types in
+    the order in which a process uses them. Two processes could then compile functions for
+    different types under the same symbol, and a third process that loads both from the cache
+    would mix them up. The name here is a hash of the type's fields.
     """
     digest = hashlib.sha256(record.name.encode()).hexdigest()
     return "Record", (f"r{digest[:16]}",)
@@ -221,10 +223,10 @@ def _hash_folder(folder: Path) -> str:
 
 
 class _LeafLocator:
-    """Locates the machine code of a function, with the interface of Numba's cache locators.
+    """Tells Numba where the machine code of a function is stored, and when it is out of date.
 
-    Numba compares the source stamp, here a hash of the files beside the function, instead of
-    the time of its file.
+    By default, Numba compares the time of the function's file. Here it compares a hash of all
+    files in the folder of the function, because the function may call others in them.
     """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -249,14 +251,15 @@ class _LeafLocator:
 
 
 class _LeafCacheImpl(CompileResultCacheImpl):
-    """Converts compiled leaves to the content of cache files, and back.
+    """Converts compiled functions to the content of cache files, and back.
 
-    An inner leaf is kept as LLVM code, other leaves as machine code.
+    A function that only other compiled functions call (an inner leaf) is stored as LLVM code.
+    All others are stored as machine code.
     """
 
     _locator_classes = cast(Any, [_LeafLocator])
 
-    def rebuild(self, context: Any, kept: Any) -> Any:
+    def rebuild(self, context: Any, content: Any) -> Any:
         """Converts the content of a cache file to a compiled function.
 
         A leaf is a function with the decorator `leaf`. Numba itself loads the machine code of a
@@ -266,17 +269,17 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
         Args:
             context: Numba's description of the target processor.
-            kept: Content of the file, as `CompileResult._reduce` wrote it. The first entry is
-                what `_LeafLibrary.serialize_using_object_code` returned, and the others are
+            content: Content of the file, as `CompileResult._reduce` wrote it. The first entry
+                is what `_LeafLibrary.serialize_using_object_code` returned, and the others are
                 arguments of `compile_result` in a fixed order.
 
         Returns:
             Numba's description of the compiled function.
         """
-        name, kind, code = kept[0]
+        name, kind, code = content[0]
         is_inner = kind == _INNER
         if not is_inner:
-            return super().rebuild(context, kept)
+            return super().rebuild(context, content)
 
         library = _LeafLibrary(context.codegen(), name)
         library.is_inner = True
@@ -294,7 +297,7 @@ class _LeafCacheImpl(CompileResultCacheImpl):
             "reload_init",
             "referenced_envs",
         )
-        fields = dict(zip(names, kept[1:], strict=True))
+        fields = dict(zip(names, content[1:], strict=True))
         result = compile_result(
             library=library,
             target_context=context,
@@ -305,7 +308,7 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
 
 class _CompressedFiles(IndexDataCacheFile):
-    """The cache files of one function, compressed to a quarter.
+    """The cache files of one compiled function, compressed to a quarter of their size.
 
     Numba numbers the files. Therefore two processes may write different code into one file.
     Here the name of a file contains a hash of its key.
@@ -343,10 +346,10 @@ class _CompressedFiles(IndexDataCacheFile):
 
 
 class _LeafCache(FunctionCache):
-    """Store of the machine code of a leaf.
+    """Stores the machine code of one compiled function on disk, and loads it.
 
-    Code is read from the user's folder, else from the wheel, and written into the user's
-    folder.
+    Code is read from the user's cache directory, or else from the installed wheel. New code is
+    written into the user's cache directory.
     """
 
     _impl_class = _LeafCacheImpl
@@ -381,11 +384,11 @@ class _LeafCache(FunctionCache):
             if result is not None or not _ships:
                 return result
             # The wheel's code is indexed by the platform and a processor named "generic".
-            triple = context.codegen().magic_tuple()[0]
-            generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
-            key = self._index_key(signature, generic)
-            kept = self._shipped.load(key)
-            return None if kept is None else self._impl.rebuild(context, kept)
+            platform = context.codegen().magic_tuple()[0]
+            generic_processor = SimpleNamespace(magic_tuple=lambda: (platform, "generic", ""))
+            key = self._index_key(signature, generic_processor)
+            content = self._shipped.load(key)
+            return None if content is None else self._impl.rebuild(context, content)
 
     def _save_overload(self, signature: Any, result: Any) -> None:
         if _CACHE is not None:
@@ -403,8 +406,8 @@ class _LeafCache(FunctionCache):
             these types.
         """
         key = self._index_key(argument_types, context.codegen())
-        kept = self._inner.load(key)
-        return None if kept is None else self._impl.rebuild(context, kept)
+        content = self._inner.load(key)
+        return None if content is None else self._impl.rebuild(context, content)
 
     def save_inner(self, argument_types: Any, result: Any) -> None:
         """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
@@ -426,10 +429,11 @@ class _LeafCache(FunctionCache):
 
 
 class _LeafLibrary(JITCodeLibrary):
-    """The code of a leaf; the code of an inner leaf is neither optimised nor made executable.
+    """Code of one compiled function, as LLVM code or as machine code.
 
-    An inner leaf is optimised once, as a part of the outer leaf. Numba would also optimise each
-    inner leaf alone, and add a wrapper for calls from Python: half of the time of compilation.
+    A function that only other compiled functions call (an inner leaf) is optimised once, as a
+    part of its caller. Numba would also optimise it alone, and add a wrapper for calls from
+    Python. This class saves both, which is half of the time of compilation.
     """
 
     is_inner = False
@@ -452,10 +456,10 @@ class _LeafLibrary(JITCodeLibrary):
 
 
 def _as_inner(result: Any) -> Any:
-    """Returns a compiled inner leaf that other leaves can call.
+    """Makes a function that exists only as LLVM code known to its compiled callers.
 
-    Leaves find a function by its entry point. An inner leaf has no machine code. Therefore any
-    object serves.
+    Numba finds a called function by its entry point, the Python object of its machine code.
+    LLVM code has none, so a new object takes its place.
     """
     result = result._replace(entry_point=object())
     context = result.target_context
@@ -464,10 +468,12 @@ def _as_inner(result: Any) -> Any:
 
 
 class _LeafCompiler(Compiler):
-    """Compiles a leaf, as an inner leaf or for calls from Python.
+    """Compiles a numerical function (leaf), for calls from Python or from another leaf.
+
+    A leaf that is compiled because another leaf calls it is called an inner leaf.
 
     Attributes:
-        depth: Number of leaves whose compilation is in progress.
+        depth: Number of leaves that are being compiled now, one within another.
         library_class: Class of the code of a leaf that is not an inner leaf.
         has_distinct_arguments: True if the arguments of a leaf that is not an inner leaf never
             overlap in memory.
@@ -522,16 +528,17 @@ class _LeafCompiler(Compiler):
 
 
 def _prefer_wide_vectors(llvm_code: str) -> str:
-    """Adds to all functions of a module that loops should use vectors of 512 bits.
+    """Asks LLVM to use vector instructions of 512 bits in the loops of a module.
 
     By default LLVM chooses 256 bits even if a processor has longer registers, because some
-    processors lower their clock rate for these. Arithmetic gains more than that. Processors
-    without such registers are not affected. llvmlite cannot set an attribute that has a value.
+    processors lower their clock rate for these. The arithmetic here gains more than that loses.
+    Processors without such registers are not affected. The text is changed, because llvmlite
+    cannot set an attribute that has a value.
 
     Args:
         llvm_code: The module as text.
     """
-    # The attributes of a function follow its arguments, and a mark of addresses.
+    # The attributes of a function follow its arguments and an optional "unnamed_addr".
     return re.sub(
         r"^(define .*\)(?: (?:local_)?unnamed_addr)?)(?=[^()]*\{$)",
         r'\1 "prefer-vector-width"="512"',
@@ -541,11 +548,10 @@ def _prefer_wide_vectors(llvm_code: str) -> str:
 
 
 class _LaneLibrary(_LeafLibrary):
-    """The code of a function with a long loop, or of a function of lanes.
+    """Code of a function with a long loop, with all functions that it calls inlined.
 
-    A function of lanes computes a tick of several runs side by side. All leaves that the
-    function calls are inlined, because the compiler turns a loop into vector instructions only
-    if the loop contains no calls.
+    The loop computes many control periods, or a period of several runs side by side (lanes).
+    The compiler turns a loop into vector instructions only if the loop contains no calls.
     """
 
     def _optimize_final_module(self) -> None:
@@ -558,7 +564,7 @@ class _LaneLibrary(_LeafLibrary):
 
 
 class _LoopCompiler(_LeafCompiler):
-    """Compiles a function with a long loop, into whose code all leaves are inlined."""
+    """Compiles a function with a long loop, and inlines all functions that it calls."""
 
     library_class = _LaneLibrary
 
@@ -574,7 +580,7 @@ class _LaneCompiler(_LeafCompiler):
 
 
 def _is_in_lanes(numba_type: Any) -> bool:
-    """Returns True if a value is a row of several runs side by side, or contains such values.
+    """Returns True if a value has the numbers of several runs side by side (lanes).
 
     Args:
         numba_type: Numba's type of the value. A type of rows in lanes has the attribute
@@ -589,10 +595,10 @@ def _is_in_lanes(numba_type: Any) -> bool:
 
 
 class _Leaf(CPUDispatcher):
-    """Numba's dispatcher of a leaf, which compiles the leaf for the types of its arguments.
+    """Replaces a numerical function (leaf) in all calls, and compiles it when it is called.
 
-    An inner leaf, which was compiled as a part of another leaf, is compiled again for calls
-    from Python.
+    The function is compiled for the types of its arguments (as Numba's dispatchers do). If it
+    was compiled as a part of another leaf, it is compiled again for calls from Python.
 
     Attributes:
         choose_lane_form: Returns the implementation of the leaf for rows in lanes, see
@@ -669,36 +675,49 @@ class _Leaf(CPUDispatcher):
         """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
-            known: Any = self.overloads.get(argument_types)
+            compiled: Any = self.overloads.get(argument_types)
             is_called_from_python = _LeafCompiler.depth == 0
             if is_called_from_python:
-                if known is not None and getattr(known.library, "is_inner", False):
+                if compiled is not None and getattr(compiled.library, "is_inner", False):
                     # Python cannot call LLVM code. Without this entry, Numba compiles again.
                     del self.overloads[argument_types]
                 return super().compile(signature)
 
             # A compiled caller can use machine code and LLVM code alike.
-            if known is None:
-                # Rows in lanes are defined outside of the core, whose hash names the cache.
-                is_stored = not any(map(_is_in_lanes, argument_types))
-                if is_stored:
-                    known = self._cache.load_inner(argument_types, self.targetctx)
-                if known is None:
-                    # Report the compilation, as Numba's own method does.
-                    data = {"dispatcher": self, "args": argument_types}
-                    with event.trigger_event("numba:compile", data=data):
-                        known = self._compiler.compile(argument_types, return_type)
-                    if is_stored:
-                        self._cache.save_inner(argument_types, known)
-                self.add_overload(known)
-            return known.entry_point
+            if compiled is None:
+                compiled = self._load_or_compile_inner(argument_types, return_type)
+                self.add_overload(compiled)
+            return compiled.entry_point
+
+    def _load_or_compile_inner(self, argument_types: Any, return_type: Any) -> Any:
+        """Returns the function as LLVM code, which becomes a part of a compiled caller.
+
+        The code is loaded from the cache on disk if it is there. Otherwise the function is
+        compiled, and its code is stored.
+        """
+        # The types of several runs side by side (lanes) are defined outside of the core, and
+        # the name of the cache directory contains a hash of the core only.
+        is_stored = not any(map(_is_in_lanes, argument_types))
+        if is_stored:
+            loaded = self._cache.load_inner(argument_types, self.targetctx)
+            if loaded is not None:
+                return loaded
+
+        # Report the compilation, as Numba's own method does.
+        data = {"dispatcher": self, "args": argument_types}
+        with event.trigger_event("numba:compile", data=data):
+            compiled = self._compiler.compile(argument_types, return_type)
+        if is_stored:
+            self._cache.save_inner(argument_types, compiled)
+        return compiled
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
     """Compiles a function for arguments of given types, so that calls need not check the types.
 
-    This form saves the time of the check in each call. It must only be called with arguments of
-    the same types as those given here. If Numba is disabled, the function itself is returned.
+    A control loop calls such a function in each period. The result must only be called with
+    arguments of the same types as those given here. If Numba is disabled, the function itself
+    is returned.
 
     Args:
         function: A function with the decorator `leaf`.
@@ -725,7 +744,7 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Callable[P, R]:
-    """Returns Numba's dispatcher of a leaf, which stands for the function in all calls.
+    """Returns the object that replaces a numerical function, and compiles it when it is called.
 
     Args:
         function: The Python function.
@@ -770,9 +789,10 @@ def _make_unstored(function: Callable[..., Any]) -> Any:
 
 
 def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
-    """Returns the address of a `lane_leaf` function, and compiles the function if needed.
+    """Returns the address of a function that computes several runs at once (`lane_leaf`).
 
-    The code is not stored on disk if the attribute `is_stored` of some type is False.
+    Compiled code calls the function by its address. It is compiled if needed. The code is not
+    stored on disk if the attribute `is_stored` of some type is False.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -788,7 +808,9 @@ def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, .
 
 
 def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
-    """Returns True if a `lane_leaf` function was compiled and stored on disk before.
+    """Returns True if the code of a function for several runs at once is on disk.
+
+    If not, its first use takes long, because it has to be compiled.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -803,7 +825,9 @@ def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any,
 
 
 def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
-    """Returns the machine code of a `lane_leaf` function as text, for tests.
+    """Returns the machine code of a function for several runs at once, as text.
+
+    A test checks that it contains vector instructions.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -834,9 +858,10 @@ def set_lane_form(
 
 
 class _NamedCache(_LeafCache):
-    """The machine code of a closure whose name identifies all that it is compiled from.
+    """Stores the machine code of a closure under a name, see `compile_named`.
 
-    Numba's own key contains the values that a closure captured; the name replaces them.
+    The name identifies all that the code is compiled from. Numba's own key contains the values
+    that the closure captured instead.
     """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:

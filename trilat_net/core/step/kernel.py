@@ -55,14 +55,15 @@ _USER = int(Law.USER)
 def _place_arm(
     s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
 ) -> None:
-    """Computes the kinematics of a chain, and the orientation of its reference if requested.
+    """Computes where the links of an arm are, which the tracking errors depend on.
 
-    The planar arm needs neither.
+    The orientation that the end effector should follow can be computed in addition. The planar
+    arm needs neither: its equations contain the positions of its links.
 
     Args:
-        s: Row of the site.
-        chain: Rows of the chain, or None.
-        links: Rows of the site's links.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        links: State of each link from another site, one row per link.
         updates_reference: True in a tick; false if the reference was restored from a record.
     """
     if chain is None:
@@ -77,8 +78,8 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
     """Runs stage 4: writes the errors e, ed and r, and the dynamics that the law needs.
 
     Args:
-        s: Row of the site; changed.
-        chain: Rows of the joints of a chain. None for the planar two-link arm.
+        s: State of the site (the process that runs the arm); changed.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
         two_link_stages.update_errors(s)
@@ -91,8 +92,8 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
     """Advances the estimate of the arm's parameters to theta_hat - gain_s Gamma Yr, in its box.
 
     Args:
-        s: Row of the site.
-        chain: Rows of the chain, or None.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
         gain_s: Duration of the step, s.
         Yr: Y' r of Eq. (15), one number per parameter.
     """
@@ -114,7 +115,7 @@ def adapts(s: SiteRow) -> bool:
 
 @leaf
 def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Updates the estimate of the arm's dynamic parameters by one tick, stage 5 of a tick.
+    """Updates the estimate of the arm's dynamic parameters (stage 5 of a tick).
 
     The estimate theta follows Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is
     the matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid
@@ -126,10 +127,11 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
     advances the estimate by the Euler rule at the end of the tick instead, in stage 8.
 
     Args:
-        k: The tick.
-        s: Row of the site. `Yr` is Y' r of tick k. `Yr_before` is that of tick k - 1, and is
-            overwritten with the sum of both; stage 8 sets it anew.
-        chain: Rows of the chain, or None.
+        k: Number of the tick (control period).
+        s: State of the site (the process that runs the arm). `Yr` is Y' r of tick k.
+            `Yr_before` is that of tick k - 1, and is overwritten with the sum of both; stage 8
+            sets it anew.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     # `adapts` is evaluated last, because it is the costly condition.
     if updates_estimate(k, s) and adapts(s):
@@ -180,15 +182,19 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
 
 @leaf
 def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
-    """Writes the gravity torque for the parameters that the law knows or has estimated.
+    """Computes the torque that holds the arm, from the parameters that are known or estimated.
+
+    It holds an arm at rest if the control law cannot. Laws that learn, and laws of arms with
+    unknown parameters, have an estimate.
 
     Args:
-        s: Row of the site.
-        chain: Rows of the chain, or None.
-        torque: Written, shape (n,), N m.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        torque: Receives the torque, shape (n,), N m.
     """
-    learns = s.law == _ADAPTIVE or (s.law == _USER and s.theta_known == 0)
-    theta = s.theta_hat if learns else s.known
+    is_model_unknown = s.law == _USER and s.theta_known == 0
+    uses_estimate = s.law == _ADAPTIVE or is_model_unknown
+    theta = s.theta_hat if uses_estimate else s.known
     if chain is None:
         two_link_stages.put_gravity(s, theta, torque)
     else:
@@ -235,39 +241,42 @@ def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None
 
 @leaf
 def _write_record(s: SiteRow, row: Array) -> None:
-    """Runs stage 7: writes the record's floats in the order of `Layout.columns`.
+    """Writes the results of the tick into its record (stage 7), as one vector of numbers.
 
-    A number that is not finite becomes 0, and the site becomes DIVERGED.
+    The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and
+    in task space the motion of the end effector. A number that is not finite becomes 0, and the
+    site enters the mode DIVERGED.
 
     Args:
-        s: Row of the site.
-        row: The record's floats; written.
+        s: State of the site (the process that runs the arm).
+        row: Receives the numbers.
     """
-    n = s.joints
-    m = s.shared
-    P = s.parameters
-    first = 2 * n
-    for i in range(n):
+    joints = s.joints
+    shared = s.shared
+    parameters = s.parameters
+    # `first` is the index of the first number of the next group.
+    first = 2 * joints
+    for i in range(joints):
         row[i] = s.q[i]
-        row[n + i] = s.qd[i]
-    for i in range(m):
+        row[joints + i] = s.qd[i]
+    for i in range(shared):
         row[first + i] = s.q_des[i]
-        row[first + m + i] = s.qd_des[i]
-    first += 2 * m
-    for i in range(n):
+        row[first + shared + i] = s.qd_des[i]
+    first += 2 * shared
+    for i in range(joints):
         row[first + i] = s.tau[i]
         # A subtraction and not a negation: where nothing acts the record has 0.0, never -0.0.
-        row[first + n + i] = 0.0 - s.on_arm[i]
-    first += 2 * n
-    for p in range(P):
+        row[first + joints + i] = 0.0 - s.on_arm[i]
+    first += 2 * joints
+    for p in range(parameters):
         row[first + p] = s.theta_hat[p]
-    first += P
+    first += parameters
     if s.task:
-        for i in range(m):
+        for i in range(shared):
             row[first + i] = s.x[i]
-            row[first + m + i] = s.xd[i]
-            row[first + 2 * m + i] = s.wrench[i]
-        first += 3 * m
+            row[first + shared + i] = s.xd[i]
+            row[first + 2 * shared + i] = s.wrench[i]
+        first += 3 * shared
     for i in range(first):
         if not isfinite(row[i]):
             row[i] = 0.0
@@ -278,14 +287,14 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments at time t_k, which stage 6 may use.
+    """Computes the torque with which operators and environments act on the arm at a time.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: Row of the site.
-        chain: Rows of the chain, or None.
-        actors: Operators and environments.
-        table: Their tables.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        actors: Operators and environments of the arm, one row for each.
+        table: Their tables, for example of recorded torques.
     """
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
@@ -304,15 +313,15 @@ def _advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Advances q and qd by one period.
+    """Simulates the motion of the arm, its angles q and velocities qd, over one control period.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
         h_s: The period, s.
-        s: Row of the site.
-        chain: Rows of the chain, or None.
-        actors: Operators and environments.
-        table: Their tables.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        actors: Operators and environments of the arm, one row for each.
+        table: Their tables, for example of recorded torques.
 
     Returns:
         False, without a change, if the result is not finite.
@@ -326,17 +335,18 @@ def _advance_arm(
 
 @leaf
 def hold_motor_torque(k: int, s: SiteRow) -> None:
-    """Begins stage 8: computes the motor torque that is held during the whole period.
+    """Computes the motor torque u that is held during the whole control period.
 
-    It is the torque of the middle of the period, extrapolated linearly:
+    The constant torque that represents the period best is that of its middle. It is
+    extrapolated from the torques of this tick and the previous tick:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
-    At the first tick, and under DIGITAL, u = tau_k.
+    At the first tick, and under the scheme DIGITAL, u = tau_k.
 
     Args:
-        k: The tick.
-        s: Row of the site; `u` and `q_before` are written.
+        k: Number of the tick (control period).
+        s: State of the site (the process that runs the arm); `u` and `q_before` are written.
     """
     for i in range(s.q.shape[0]):
         s.q_before[i] = s.q[i]
@@ -352,11 +362,14 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
 @leaf
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
-    """Ends stage 8: keeps numbers of this tick for the next one.
+    """Stores the torque and Y' r of this tick, which the next tick needs (end of stage 8).
+
+    Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
+    estimate itself is advanced here.
 
     Args:
-        s: Row of the site.
-        chain: Rows of the chain, or None.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
         is_adapting: What `adapts` returned before the arm moved.
     """
     h_s = 1.0 / s.rate_hz
@@ -377,15 +390,15 @@ def _advance(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> None:
-    """Runs stage 8: advances the state from t_k to t_{k+1}, and keeps numbers for tick k+1.
+    """Simulates the arm until the next tick (stage 8), and stores what the next tick needs.
 
     Args:
-        k: The tick.
+        k: Number of the tick (control period).
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: Row of the site.
-        chain: Rows of the chain, or None.
-        actors: Operators and environments.
-        table: Their tables.
+        s: State of the site (the process that runs the arm).
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        actors: Operators and environments of the arm, one row for each.
+        table: Their tables, for example of recorded torques.
     """
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
@@ -499,7 +512,7 @@ def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
     other arms for too long.
 
     Args:
-        k: Number of the tick.
+        k: Number of the tick (control period).
         t_ns: Nominal time of the tick, ns since the start of the session.
         s: State of the site, with the reference; changed.
         links: States of the links from the other sites.
@@ -569,7 +582,7 @@ def sense_stages(
     Finally, the torque of operators and environments on the arm is computed.
 
     Args:
-        k: Number of the tick.
+        k: Number of the tick (control period).
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         count: Number of samples that arrived since the previous tick.
         arrays: Arrays of the site (the process that runs the arm), see `SiteArrays`; written.
@@ -617,7 +630,8 @@ def emit_stages(k: int, t_ns: int, s: SiteRow, chain: RowArray | None, record: A
     """
     _guard_torque(k, t_ns, s, chain)
     for i in range(s.joints):
-        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
+        is_within_limit = abs(s.qd[i]) <= s.qd_limit[i]  # False for NaN
+        if s.on_stale != _GLIDE and not is_within_limit:
             s.mode = _DIVERGED
     # 7 emit
     _write_record(s, record)

@@ -35,16 +35,22 @@ _ALL_BITS = 0xFFFFFFFF
 
 
 def _list_checksums() -> NDArray[np.uint32]:
-    """Returns the effect of each byte of a word on the CRC-32 of the word, shape (8, 256).
+    """Returns tables with which a CRC-32 checksum is updated by eight bytes at once.
 
-    Row n is for the byte that n bytes follow. It is the checksum of that byte and n zeros, less
-    the checksum of n + 1 zeros: CRC-32 is linear in the bits except for a constant.
+    CRC-32 is linear in the bits of the message, except for a constant. Therefore the effect of
+    a byte depends only on its value and on the number of bytes that follow, which are taken as
+    zeros here.
+
+    Returns:
+        The effect by number of following bytes and value of the byte, shape (8, 256).
     """
     table = np.zeros((_WORD_BYTES, _BYTE_VALUES), np.uint32)
-    for zeros in range(_WORD_BYTES):
-        constant = zlib.crc32(bytes(1 + zeros))
+    for following in range(_WORD_BYTES):
+        zeros = bytes(following)
+        constant = zlib.crc32(b"\0" + zeros)
         for value in range(_BYTE_VALUES):
-            table[zeros, value] = zlib.crc32(bytes([value]) + bytes(zeros)) ^ constant
+            message = bytes([value]) + zeros
+            table[following, value] = zlib.crc32(message) ^ constant
     return table
 
 
@@ -53,16 +59,20 @@ _CHECKSUMS = _list_checksums()
 
 @leaf
 def _update_checksum(crc: int, word: int) -> int:
-    """Returns a CRC-32 after eight more bytes, both without the final inversion.
+    """Returns a CRC-32 checksum after eight more bytes of data.
+
+    The final inversion of all bits, which belongs to CRC-32, is left to the caller.
 
     Args:
-        crc: The checksum before.
-        word: The bytes as an integer, least byte first.
+        crc: The checksum of the data before.
+        word: The eight bytes as an integer, least byte first.
     """
     bits = crc ^ word
     result = 0
     for n in range(_WORD_BYTES):
-        result ^= int(_CHECKSUMS[_WORD_BYTES - 1 - n, (bits >> (8 * n)) & 0xFF])
+        byte = (bits >> (8 * n)) & 0xFF
+        following_bytes = _WORD_BYTES - 1 - n
+        result ^= int(_CHECKSUMS[following_bytes, byte])
     return result
 
 
@@ -109,8 +119,8 @@ class SiteViews(NamedTuple):
     and NaN is not equal to itself. A word is the bits of a number as an integer.
 
     Attributes:
-        site: Row of the site, as integers.
-        links: Rows of the links, one after another, as integers.
+        site: State of the site (the process that runs the arm), as integers.
+        links: State of each link, one row per peer, one after another, as integers.
         arrivals: Arrivals of a tick, shape (MAX_ARRIVALS, 2 + 2 m): peer, tick, q and qd.
         forces: External torques of the arrivals, shape (MAX_ARRIVALS, m), as words.
         record: Results of a tick, shape (floats,), as words.
@@ -130,7 +140,7 @@ class SiteViews(NamedTuple):
 
 
 class TickRules(NamedTuple):
-    """Properties of a site that stay the same during its run, for the compiled loop.
+    """Properties of an arm's control process (site) that stay the same during its run.
 
     Attributes:
         rate_hz: Tick rate, Hz.
@@ -164,20 +174,20 @@ def _has_room(
     rules: Any,
     rooms: IntArray,
 ) -> bool:
-    """Returns False if a calendar must become longer before the arrivals of a tick are written.
+    """Returns True if the samples that arrived in a tick fit into the buffers of their links.
 
-    A calendar is the ring buffer of a link with a page per tick, in which samples wait.
-    Compiled code cannot enlarge it. The loop then ends, and `Site.step` executes the tick. The
-    rule is that of `CalendarSizer.make_room`.
+    Each link has such a ring buffer (calendar), with one entry (page) per tick. Compiled code
+    cannot enlarge the buffers. If a sample does not fit, the loop ends, and `Site.step`
+    executes the tick. The rule is that of `CalendarSizer.make_room`.
 
     Args:
-        k: The tick.
+        k: Number of the tick (control period).
         first: Index of the first arrival of the tick.
         last: Index after its last arrival.
         arrivals: Peer and tick of each arrival, see `RecordedRows.arrivals`.
-        links: Rows of the links.
+        links: State of each link, one row per peer.
         pages: Number of pages of each calendar.
-        rules: Properties of the site, a `TickRules`.
+        rules: Properties of the site (the process that runs the arm), a `TickRules`.
         rooms: See `SiteViews.rooms`; updated.
     """
     for n in range(first, last):
@@ -199,52 +209,60 @@ def _has_room(
 def _put_arrivals(
     first: int, last: int, arrivals: IntArray, samples: IntArray, rules: Any, views: Any
 ) -> int:
-    """Writes the arrivals of a tick into its buffers, as `Site.step` does.
+    """Writes the samples that arrived in a tick into its input buffers, as `Site.step` does.
+
+    A sample is the state that another arm sent, and a tick a control period. The checksum of
+    the samples is computed at the same time, to compare it with the record.
 
     Args:
         first: Index of the first arrival of the tick.
         last: Index after its last arrival.
         arrivals: Peer, tick and sample of each arrival, see `RecordedRows.arrivals`.
         samples: Table of the samples, as words.
-        rules: Properties of the site, a `TickRules`.
+        rules: Properties of the site (the process that runs the arm), a `TickRules`.
         views: Memory of the site, a `SiteViews`; its arrivals are written.
 
     Returns:
         The CRC-32 of the arrivals, which the record must have, too.
     """
-    m = rules.shared
+    # A row of `samples` has positions, velocities and forces, `shared` numbers each.
+    shared = rules.shared
+    first_force = 2 * shared
     crc = _ALL_BITS
     for n in range(first, last):
-        offset = n - first
-        row = arrivals[n, 2]
-        views.arrivals[offset, 0] = arrivals[n, 0]
-        views.arrivals[offset, 1] = arrivals[n, 1]
-        for i in range(2 * m):
-            views.arrivals[offset, 2 + i] = samples[row, i]
-        for i in range(2 + 2 * m):
-            crc = _update_checksum(crc, views.arrivals[offset, i])
+        buffer_row = n - first
+        sample_row = arrivals[n, 2]
+        views.arrivals[buffer_row, 0] = arrivals[n, 0]
+        views.arrivals[buffer_row, 1] = arrivals[n, 1]
+        for i in range(2 * shared):
+            views.arrivals[buffer_row, 2 + i] = samples[sample_row, i]
+        for i in range(2 + 2 * shared):
+            crc = _update_checksum(crc, views.arrivals[buffer_row, i])
         if rules.keeps_forces:
-            for i in range(m):
-                views.forces[offset, i] = samples[row, 2 * m + i]
+            for i in range(shared):
+                views.forces[buffer_row, i] = samples[sample_row, first_force + i]
+
+    # `Site.step` computes the checksum of all forces after that of all motions.
     if rules.reflects:
         for n in range(first, last):
-            for i in range(m):
-                crc = _update_checksum(crc, samples[arrivals[n, 2], 2 * m + i])
+            sample_row = arrivals[n, 2]
+            for i in range(shared):
+                crc = _update_checksum(crc, samples[sample_row, first_force + i])
     return crc ^ _ALL_BITS
 
 
 @leaf
 def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
-    """Writes the other inputs of a tick: a live hand's action, and an external arm's motion.
+    """Writes those recorded inputs of a control period that did not come from other arms.
 
-    A live hand is a person or program that moved the arm. Without such a hand, and for an arm
-    that the site simulates, nothing is written.
+    These are the action of a person or program that moved the arm (live hand), and the motion
+    of a real arm that was measured. Most arms have neither.
 
     Args:
         row: Index of the record.
         arrays: Arrays of the site; changed.
         rows: The records, a `RecordedRows`.
-        rules: Properties of the site, a `TickRules`.
+        rules: Properties of the site (the process that runs the arm), a `TickRules`.
     """
     if rules.hand >= 0:
         hand = arrays.actors[rules.hand]
@@ -266,20 +284,22 @@ def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
 def _equals_record(
     row: int, crc: int, arrays: SiteArrays, rows: Any, rules: Any, views: Any
 ) -> bool:
-    """Returns True if the results of a tick have the same bits as its record.
+    """Returns True if the results of a tick (control period) have the same bits as its record.
 
-    The mode, the checksum of the arrivals, the samples in use, all numbers, and the memory
-    between ticks are compared.
+    Compared are the mode, the checksum of the samples (states of other arms) that arrived, the
+    tick of the sample in use of each other arm, all numbers, and the numbers that are kept for
+    the next tick.
 
     Args:
         row: Index of the record.
         crc: CRC-32 of the arrivals of the tick.
         arrays: Arrays of the site after the tick.
         rows: The records, a `RecordedRows`.
-        rules: Properties of the site, a `TickRules`.
+        rules: Properties of the site (the process that runs the arm), a `TickRules`.
         views: The same memory of the site as words, a `SiteViews`.
     """
     s: SiteRow = arrays.site[0]
+    # Any different bit makes `difference` nonzero; a single test at the end is fast.
     difference = rows.modes[row] ^ s.mode
     difference |= rows.checksums[row] ^ crc
     for p in range(arrays.links.shape[0]):
@@ -296,14 +316,17 @@ def _equals_record(
     if count != views.memory.shape[0]:
         return False
     for i in range(count):
+        is_of_link = views.memory[i, 0]
         index = views.memory[i, 1]
-        word = views.links[index] if views.memory[i, 0] else views.site[index]
-        logged = rows.memory[first + i]
-        if views.memory[i, 2]:
-            # The float of an integer is never -0.0.
-            if logged != float(word) or (word == 0 and 1.0 / logged < 0.0):
+        is_integer = views.memory[i, 2]
+        computed_bits = views.links[index] if is_of_link else views.site[index]
+        if is_integer:
+            # The record has the integer as a float, which is never -0.0.
+            logged = rows.memory[first + i]
+            is_negative_zero = computed_bits == 0 and 1.0 / logged < 0.0
+            if logged != float(computed_bits) or is_negative_zero:
                 return False
-        elif rows.memory_words[first + i] != word:
+        elif rows.memory_words[first + i] != computed_bits:
             return False
     return True
 
@@ -317,20 +340,22 @@ def _run_recorded_ticks(
     arrays: SiteArrays,
     buffers: TickBuffers,
 ) -> tuple[int, bool]:
-    """Executes ticks again until one of them differs from its record.
+    """Computes recorded control periods (ticks) again, until a result differs from its record.
 
     Args:
-        first_tick: Tick of the first row.
+        first_tick: Number of the first tick.
         rows: Records of the ticks.
-        samples: Table of the samples that arrived, shape (N, 3 m), as words: q, qd, tau_x.
-        rules: Properties of the site.
-        views: Memory of the site.
+        samples: Table of the samples that arrived, shape (N, 3 m), as the bits of the numbers:
+            q, qd, tau_x.
+        rules: Properties of the site (the process that runs the arm).
+        views: State of the site as integers.
         arrays: Arrays of the site; changed.
         buffers: Input and output of a tick; changed.
 
     Returns:
-        The number of rows before the first one that was not repeated, and True if this row was
-        executed and differs. It is False if the row was not executed.
+        The number of ticks that were repeated exactly, and True if the next tick was computed
+        and differs. It is False if the next tick was not computed, because its samples do not
+        fit into the buffers, or because there is no further tick.
     """
     for row in range(rows.modes.shape[0]):
         k = first_tick + row
@@ -367,15 +392,15 @@ _run_chain_ticks = leaf(_run_recorded_ticks)
 
 
 class TickRepeater:
-    """Executes recorded ticks of a site again, many at a time.
+    """Computes recorded control periods (ticks) of an arm again, many at a time.
 
     Args:
-        site: The site. Its control law must be built in.
+        site: State of the arm and its controller. The control law must be built in.
     """
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        self._parts = parts = site.parts
+        self._parts = parts = site.parts  # the parts that a compiled loop can use
         arrays = site.arrays
         buffers = parts.buffers
         self._rules = TickRules(
@@ -400,32 +425,36 @@ class TickRepeater:
         self._saved = [np.empty_like(array) for array in self._list_arrays()]
 
     def repeat(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> int:
-        """Executes ticks again until one of them differs from its record.
+        """Computes recorded control periods (ticks) again, until a result differs.
 
         Args:
-            first_tick: Tick of the first record. It must be the next tick of the site.
+            first_tick: Number of the first tick. It must be the next tick of the site.
             rows: Records of consecutive ticks.
-            samples: Table of the samples that arrived, shape (N, 3 m), as words: q, qd, tau_x.
+            samples: Table of the samples that arrived, shape (N, 3 m), as the bits of the
+                numbers: q, qd, tau_x.
 
         Returns:
-            The number of records that were repeated. The site is in the state after them.
+            The number of ticks that were repeated exactly. The site is in the state after them.
         """
+        # Save the state, because a tick that differs has changed it.
         arrays = self._list_arrays()
         newest = list(self._parts.calendar_sizer.newest)
-        if [array.shape for array in arrays] != [saved.shape for saved in self._saved]:
+        shapes = [array.shape for array in arrays]
+        saved_shapes = [saved.shape for saved in self._saved]
+        if shapes != saved_shapes:
             self._saved = [np.empty_like(array) for array in arrays]
         for saved, array in zip(self._saved, arrays, strict=True):
             saved[...] = array
 
         repeated, has_differed = self._run(first_tick, rows, samples)
         if has_differed:
-            # Return to the state before the tick that differs.
+            # Restore the state, and compute only the ticks before the one that differs.
             for saved, array in zip(self._saved, arrays, strict=True):
                 array[...] = saved
             self._parts.calendar_sizer.newest[:] = newest
             equal_rows = rows._replace(modes=rows.modes[:repeated])
-            again, _ = self._run(first_tick, equal_rows, samples)
-            assert again == repeated
+            repeated_again, _ = self._run(first_tick, equal_rows, samples)
+            assert repeated_again == repeated
         return repeated
 
     def _list_arrays(self) -> list[NDArray[Any]]:
@@ -435,9 +464,9 @@ class TickRepeater:
         return [array for array in changed if array is not None]
 
     def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
-        """Executes ticks with the compiled loop for the kind of arm.
+        """Calls the compiled loop for the kind of arm, see `_run_recorded_ticks`.
 
-        The arguments and the result are those of `_run_recorded_ticks`.
+        The loop and the object that enlarges the buffers exchange which samples fit into them.
         """
         site = self._site
         self._views.rooms[:] = self._parts.calendar_sizer.list_rooms()
@@ -458,27 +487,30 @@ class TickRepeater:
 
 
 def _view_words(array: NDArray[Any]) -> IntArray:
-    """Returns the memory of an array as integers, which are compared faster than floats.
+    """Returns the same memory as 64-bit integers, to compare all bits of floats.
 
-    No bit is copied: a change of the array changes the result.
+    Floats would compare 0.0 and -0.0 as equal. No bit is copied: a change of the array changes
+    the result.
 
     Args:
-        array: Array of numbers of 8 bytes, or of rows of such numbers.
+        array: Array of numbers of 8 bytes, or a structured array of such numbers.
 
     Returns:
-        The integers, shape (rows, words of a row).
+        The integers. A structured array becomes a matrix with one row per element.
     """
     if not array.size:
         return np.zeros(array.shape[:2], np.int64)
     bits = array.view(np.int64)
     assert np.shares_memory(bits, array)
-    return bits if array.dtype.fields is None else bits.reshape(len(array), -1)
+    is_structured = array.dtype.fields is not None
+    return bits.reshape(len(array), -1) if is_structured else bits
 
 
 def _list_memory_sources(site: Site) -> IntArray:
-    """Returns where the numbers of the field `mem` are, see `SiteViews.memory`.
+    """Returns where the site stores the numbers that a record has in its field `mem`.
 
-    The order is that of `Site.restore_state`.
+    These are the numbers that the next tick needs and no other field records. The order is that
+    of `Site.restore_state`, and `SiteViews.memory` describes the three columns of the result.
     """
     sources: list[tuple[int, int, int]] = []
     parts = site.parts
@@ -486,19 +518,21 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the places of the numbers of a field, in a row of the site or of its links.
+        """Adds the positions of the numbers of a field, counted in words of eight bytes.
 
         Args:
-            dtype: Type of the row.
+            dtype: Type of the row, that of the site or that of a link.
             field: Name of the field.
             row: Index of the row.
         """
         assert dtype.fields is not None
-        field_type, offset = dtype.fields[field][:2]
-        first = (row * dtype.itemsize + offset) // _WORD_BYTES
+        field_type, offset_bytes = dtype.fields[field][:2]
+        first_word = (row * dtype.itemsize + offset_bytes) // _WORD_BYTES
+        word_count = field_type.itemsize // _WORD_BYTES
+        is_of_link = int(dtype is link_type)
         is_integer = int(field_type.base.kind == "i")
-        bits = range(first, first + field_type.itemsize // _WORD_BYTES)
-        sources.extend((int(dtype is link_type), word, is_integer) for word in bits)
+        words = range(first_word, first_word + word_count)
+        sources.extend((is_of_link, word, is_integer) for word in words)
 
     add(site_type, "q_held")
     add(site_type, "return_from_ns")

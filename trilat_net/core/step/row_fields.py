@@ -392,7 +392,9 @@ _KINDS = {int: "i8", float: "f8", np.uint64: "u8", Array: "f8"}
 
 
 def _read_fields(row: type) -> dict[str, Field]:
-    """Returns the fields of a row's class by name, in the order of the class.
+    """Reads the fields of a structured array from the class that describes its elements.
+
+    The fields are in the order of the attributes of the class.
 
     Args:
         row: The class, for example `SiteRow`.
@@ -425,7 +427,10 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
     Returns:
         The shape. () for a field that holds a single number.
     """
-    axes = field.shape.split(" x ") if field.shape else []
+    if not field.shape:
+        return ()
+    axes = field.shape.split(" x ")
+    # An axis is a number, or the name of a length.
     return tuple(int(axis) if axis.isdigit() else lengths[axis] for axis in axes)
 
 

@@ -129,8 +129,9 @@ class SiteArrays(NamedTuple):
         kept_dues = pages or _count_kept_dues(setup)
         pages = pages or needed_pages(setup)
         calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
-        calendars["tick"] = -1
+        calendars["tick"] = -1  # no sample waits
         rows, models, points = _build_links(links, spare_models, layout.shared)
+        # A planar arm moves in two dimensions.
         axes = 3 if layout.chain else 2
         actors, table = torque_source_rows(setup.actors, layout.joints, axes)
         ramp_count = 1 + len(setup.ramps) + spare_ramps
@@ -209,13 +210,13 @@ class SiteArrays(NamedTuple):
         )
 
     def select(self, i: int, layout: Layout) -> "SiteArrays":
-        """Returns the arrays of one site of several stacked sites, as views.
+        """Returns the arrays of one site (one arm) of a simulation of several sites, as views.
 
-        The rows may be longer than the site's layout.
+        Vectors may be longer than this site needs, because all sites have equally long ones.
 
         Args:
             i: Index of the site.
-            layout: Layout of the site.
+            layout: Lengths of the vectors of the site.
         """
         channel = self.channel
         if channel is not None:
@@ -262,9 +263,9 @@ class TickBuffers(NamedTuple):
 
 
 def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
-    """Returns empty buffers for the arrivals and the record of one tick.
+    """Returns empty buffers for the inputs and the results of one control period (tick).
 
-    A site creates them once and uses them in all ticks.
+    A site, the process of one arm, creates them once and uses them in all ticks.
 
     Args:
         setup: Setup of the site, which determines the lengths of vectors.
@@ -300,27 +301,30 @@ def needed_pages(setup: SiteSetup) -> int:
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
-    """Returns the memory that the links of a site take, bytes.
+    """Returns the memory that the network links of an arm take, bytes.
+
+    `CalendarSizer` uses this number to limit the length of the ring buffers.
 
     Args:
-        setup: Setup of the site.
-        pages: Number of pages of each calendar, in which samples wait until their delay has
-            passed.
+        setup: Setup of the arm.
+        pages: Number of samples that can wait in the ring buffer of each link.
     """
-    numbers = 0
+    number_bytes = 8
+    law_numbers = 0  # that a user's control law receives with each sample
     if setup.law_factory is not None:
-        numbers = sum(vector.length for vector in setup.received_vectors)
-    page_bytes = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
-    dues_bytes = 8 * _count_kept_dues(setup)
+        law_numbers = sum(vector.length for vector in setup.received_vectors)
+    page_bytes = sample_dtype(setup.layout.shared).itemsize + number_bytes * law_numbers
+    dues_bytes = number_bytes * _count_kept_dues(setup)
     link_bytes = pages * page_bytes + dues_bytes
     return len(setup.links) * link_bytes
 
 
 def _count_kept_dues(setup: SiteSetup) -> int:
-    """Returns the number of due times that a link keeps, one per sample.
+    """Returns for how many samples a link stores when they are to be delivered.
 
-    A due time is kept for as long as its sample may still arrive, late or as a duplicate. The
-    longest possible delay and the farthest stamp ahead of the receiver bound this time.
+    A delivery time (due time) is stored for as long as its sample may still arrive, late or as
+    a duplicate. The longest possible delay, and the largest time by which the sender's clock
+    may be ahead of the receiver's, bound this time.
 
     Args:
         setup: Setup of the site. The fastest loop on either end determines the number.
@@ -394,7 +398,7 @@ class CalendarSizer:
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Notes that the delays of a link will change, so that longer delays get room.
+        """Takes note of a new model of a link's delays, so that longer delays get room.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -405,18 +409,20 @@ class CalendarSizer:
         self.newest[peer] = -1
 
     def list_rooms(self) -> list[tuple[int, int]]:
-        """Returns how long samples of each peer may wait in the calendar.
+        """Returns how long received samples may wait in their ring buffers, for each sender.
 
-        The compiled loop of `recorded_ticks` needs these numbers to check whether a sample fits
-        into the ring buffer.
+        A sample is the state of another arm. The compiled loop of `recorded_ticks` needs these
+        numbers to check whether a sample fits into its buffer.
 
         Returns:
-            For each peer its entry of `newest`, and how many ticks a sample waits at most.
+            For each sender its entry of `newest`, and how many ticks (control periods) a sample
+            waits at most.
         """
-        waits = [
-            span_ticks(delay_us * 1000, self._rate_hz) + _SLACK for delay_us in self._delay_us
-        ]
-        return list(zip(self.newest, waits, strict=True))
+        longest_waits = []
+        for delay_us in self._delay_us:
+            delay_ticks = span_ticks(delay_us * 1000, self._rate_hz)
+            longest_waits.append(delay_ticks + _SLACK)
+        return list(zip(self.newest, longest_waits, strict=True))
 
     def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
         """Makes sure that a sample fits into the ring buffer of its link.
@@ -478,6 +484,7 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
+    # Row 0 holds the weights before the first change, and stays first.
     starts_ns = ramps[1:count, 0]
     index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
     later_ramps = ramps[index:count].copy()
@@ -500,6 +507,7 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
     count = int(link.models)
+    # Row 0 is the model before the first change, and stays first.
     starts_ns = models["from_ns"][1:count]
     index = 1 + int(np.searchsorted(starts_ns, model.from_ns, side="right"))
     later_models = models[index:count].copy()
@@ -576,11 +584,11 @@ _NEVER_SAMPLED = 2
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
-    """Adds to each site's indices the place of its rows in the joined tables of all sites.
+    """Shifts the indices of table rows, because the tables of all sites are joined into one.
 
-    The points of delay traces and outages and the torques of operators lie in two tables per
-    site. `SiteArrays.stack` joins the tables of all sites, so the rows of the second site
-    begin after those of the first.
+    Each site (one arm) has a table with the points of delay traces and outages, and one with
+    the recorded torques of operators. `SiteArrays.stack` joins them for a simulation of all
+    sites, so that the rows of the second site begin after those of the first.
 
     Args:
         sites: Arrays of the sites, in the order of the joined tables. Their indices are
@@ -641,24 +649,25 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
     Example: arrays of the shapes (3,) and (5,) become one array of shape (2, 5).
     """
-    lengths = zip(*(array.shape for array in arrays), strict=True)
+    shapes = [array.shape for array in arrays]
+    largest_shape = [max(lengths) for lengths in zip(*shapes, strict=True)]
     dtype = arrays[0].dtype
     if any(array.dtype is not dtype for array in arrays):
-        dtype = np.result_type(*arrays)  # slow for rows
-    stacked = np.zeros((len(arrays), *map(max, lengths)), dtype)
+        dtype = np.result_type(*arrays)  # slow for structured arrays
+    stacked = np.zeros((len(arrays), *largest_shape), dtype)
     for padded, array in zip(stacked, arrays, strict=True):
-        padded[tuple(map(slice, array.shape))] = array
+        corner = tuple(slice(length) for length in array.shape)
+        padded[corner] = array
     return stacked
 
 
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
-    """Returns the row of a site before its first tick, shape (1,).
-
-    The layout may be larger than the site's: the numbers beyond stay zero.
+    """Returns the state of a site, the process of one arm, before its first tick, shape (1,).
 
     Args:
         setup: Setup of the site.
-        layout: Layout of the row.
+        layout: Lengths of the vectors of the result. They may be longer than the site needs;
+            the further numbers stay zero.
     """
     site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
@@ -707,10 +716,10 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
 
 
 def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
-    """Returns the vectors of a site's row before its first tick, by the name of the field.
+    """Returns gains, limits, and the start of the motion, by the names of their fields.
 
-    A law of known gravity starts with its known parameters as estimate, other laws with their
-    first estimate.
+    The estimate of the arm's parameters starts with the known parameters if the control law
+    assumes that they are known. Otherwise it starts with the estimate of the setup.
     """
     gains = setup.gains
     vectors: dict[str, Any] = {name: getattr(gains, name) for name in _GAINS}
@@ -730,11 +739,13 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    """Returns the arrays of the numbers that the peers' laws send, before the first sample.
+    """Returns empty arrays for the numbers that the control laws of other arms send.
+
+    Some control laws send numbers besides the motion of the arm, for example energies.
 
     Args:
-        setup: Setup of the site.
-        pages: Number of pages of each calendar.
+        setup: Setup of the site that receives the numbers.
+        pages: Number of samples that can wait on each link until their delay has passed.
     """
     vectors = setup.received_vectors
     peers = len(setup.links)
@@ -751,14 +762,17 @@ def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
 def _build_links(
     links: Sequence[LinkSetup], spare: int, shared: int
 ) -> tuple[RowArray, RowArray, Points]:
-    """Returns the links' rows, their models, and the points of their traces and outages.
-
-    In the table of points all traces come first, then all outages.
+    """Creates the arrays that describe the network links of an arm, before the first tick.
 
     Args:
         links: Setups of the links.
-        spare: Free rows for later changes of each link's model.
-        shared: Number of coordinates of a sample.
+        spare: Number of free rows for later changes of the delay model of each link.
+        shared: Number of coordinates of a sample, the state that another arm sends.
+
+    Returns:
+        The state of each link, shape (P,). The models of delay and loss, shape (P, M). The
+        points of all delay traces and then of all outages, to which the models and the links
+        refer by the index of their first row.
     """
     most_models = max(len(link.models) for link in links)
     model_rows = most_models + spare
@@ -791,9 +805,9 @@ def _build_links(
         row.outage_count = len(link.outages)
         outage_first += len(link.outages)
         row.models = len(link.models)
-        pairs = zip(link.models, link.traces, strict=True)
-        for n, (model, trace) in enumerate(pairs):
-            count = 0 if trace is None else len(trace)
-            models[n] = model._replace(trace_first=trace_first, trace_count=count)
-            trace_first += count
+        models_and_traces = zip(link.models, link.traces, strict=True)
+        for n, (model, trace) in enumerate(models_and_traces):
+            trace_count = 0 if trace is None else len(trace)
+            models[n] = model._replace(trace_first=trace_first, trace_count=trace_count)
+            trace_first += trace_count
     return rows, all_models, points

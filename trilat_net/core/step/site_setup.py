@@ -142,11 +142,10 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains in the form in which the state arrays store them.
+        """Returns the gains by the names of the fields in which the state of an arm holds them.
 
-        Returns:
-            By name: "damping", "integral" and "deceleration". The integral gain is the damping
-            divided by 4 `time_s`, in N m/rad.
+        They are "damping", "integral" and "deceleration". The integral gain is the damping
+        divided by 4 `time_s`, in N m/rad.
         """
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {
@@ -165,7 +164,8 @@ class RestGains(NamedTuple):
             The time in s for each set of n velocities, shape (...). If nothing else slows down
             the joints, their reference has stopped after this time.
         """
-        slowest_s = (np.abs(qd) / self.deceleration).max(axis=-1)
+        stop_times_s = np.abs(qd) / self.deceleration
+        slowest_s = stop_times_s.max(axis=-1)  # of the joints of an arm
         duration_s: Array = np.maximum(LEAST_STOP_S, slowest_s)
         return duration_s
 
@@ -213,7 +213,7 @@ class LinkSetup(NamedTuple):
 def make_layout(
     chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
 ) -> Layout:
-    """Computes the lengths of the vectors of an arm.
+    """Computes the lengths of the vectors that describe an arm, its parameters and its records.
 
     Args:
         chain: The arm if it is a chain of joints. None for the planar two-link arm.
@@ -223,16 +223,20 @@ def make_layout(
     """
     joints = JOINTS if chain is None else len(chain.joints)
 
-    live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
-    if live is None:
-        hand = 0
-    elif live is TorqueKind.LIVE_JOINT:
-        hand = count_hand_numbers(joints)
-    else:
-        hand = count_hand_numbers(2 if chain is None else 3)
+    # A person or program that moves the arm (live hand) pulls at its joints, or at its end
+    # effector in the plane or in space.
+    hand_numbers = 0
+    for actor in actors:
+        if actor.kind not in LIVE_KINDS:
+            continue
+        coordinates = 2 if chain is None else 3
+        if actor.kind is TorqueKind.LIVE_JOINT:
+            coordinates = joints
+        hand_numbers = count_hand_numbers(coordinates)
+        break
 
     if chain is None:
-        return Layout(sent=sent, hand=hand)
+        return Layout(sent=sent, hand=hand_numbers)
     task = chain.task
     return Layout(
         joints=joints,
@@ -241,7 +245,7 @@ def make_layout(
         chain=True,
         task=task is not None,
         sent=sent,
-        hand=hand,
+        hand=hand_numbers,
     )
 
 
@@ -267,7 +271,7 @@ class TaskSetup(NamedTuple):
 
 
 class ChainSetup(NamedTuple):
-    """The setup of an arm that is a chain of joints.
+    """Settings of an arm that is a chain of joints, as from a URDF file.
 
     Attributes:
         joints: The joints, from the base on.
@@ -285,9 +289,10 @@ class ChainSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Kind of control law of an arm, and its gains. Gains of other kinds have no effect.
+    """Kind of control law of an arm, and its gains, in the form that compiled code reads.
 
-    Diagonal matrices are vectors. A vector of one number has this number for all its entries.
+    Gains of other kinds of law have no effect. Diagonal matrices are vectors. A vector of one
+    number has this number for all its entries.
 
     Attributes:
         law: The law.
@@ -328,7 +333,9 @@ class Gains(NamedTuple):
 
 
 class SiteSetup(NamedTuple):
-    """All numbers and names from which a site is built.
+    """All settings of a site, the process that controls one arm, resolved to numbers.
+
+    The state of the site before its first control period follows from them.
 
     Attributes:
         name: The site's name.
@@ -342,7 +349,7 @@ class SiteSetup(NamedTuple):
         qd_limit_rad_s: Joint speed beyond which the run counts as diverged, rad/s.
         q0: The start pose, rad.
         qd0: The start velocity, rad/s.
-        actors: Operators and environments.
+        actors: Operators and environments of the arm, one row for each.
         links: The links from the peers, in scenario order.
         ramps: The scripted changes of the dominance factors, in the order of their starts.
         on_stale: The rule for a stale peer.
@@ -354,8 +361,8 @@ class SiteSetup(NamedTuple):
         channel: The numbers that the site's law sends to its peers.
         limits: Limits of the motion.
         rest: The gains with which the arm comes to rest.
-        bit: The bit of the site in sets of sites.
-        bodies: The number of bodies of the plant whose poses are recorded.
+        bit: The bit of the site in sets of sites, which are integers with a bit per site.
+        bodies: Number of bodies in the simulated scene with poses that are recorded.
     """
 
     name: str
@@ -410,14 +417,18 @@ class SiteSetup(NamedTuple):
 
         The dynamic parameters theta are empty for an external arm that was not identified.
         """
+        layout = self.layout
+        theta: tuple[float, ...] = ()
+        if self.theta_known:
+            theta = tuple(float(parameter) for parameter in self.theta)
         return LawContext(
             site=self.name,
             rate_hz=self.rate_hz,
             g_m_s2=self.g_m_s2,
             lengths_m=self.lengths_m,
-            theta=tuple(map(float, self.theta)) if self.theta_known else (),
+            theta=theta,
             tau_limit_nm=self.tau_limit_nm,
-            joints=self.layout.joints,
-            coordinates=self.layout.shared,
+            joints=layout.joints,
+            coordinates=layout.shared,
             peers=tuple(link.peer for link in self.links),
         )

@@ -68,17 +68,18 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class TickParts(NamedTuple):
-    """Parts of a `Site` that `recorded_ticks` needs to execute many of its ticks at once.
+    """Parts of a `Site` with which `recorded_ticks` computes many control periods at once.
 
     Attributes:
         buffers: Input and output of a tick.
         calendar_sizer: Enlarges the calendars, in which samples wait.
         has_user_law: True if a user wrote the control law.
-        reflects: True if the law uses the external torques of the peers.
+        reflects: True if the law uses the external torques on the other arms (peers).
         keeps_forces: True if the site stores these torques.
-        glides: True if the site is under the rule `glide`.
+        glides: True if the arm comes to rest while a peer is silent (the rule `glide`).
         degrades: True if the site continues without lost peers.
-        hand_index: Index of the live hand among the operators and environments, or -1.
+        hand_index: Index of the person or program that moves the arm among the operators and
+            environments. -1 if there is none.
     """
 
     buffers: TickBuffers
@@ -142,9 +143,9 @@ class Site:
         live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
         self._hand_index = live[0] if live else -1
         self._hand = self._find_hand(live[0]) if live else None
-        counts = [link.channel.received_size for link in setup.links]
-        receives = self._user_law is not None and any(counts)
-        self._received_counts = counts if receives else None
+        received_counts = [link.channel.received_size for link in setup.links]
+        reads_numbers = self._user_law is not None and any(received_counts)
+        self._received_counts = received_counts if reads_numbers else None
         self._glides = setup.on_stale.action is StaleAction.GLIDE
         self._degrades = setup.on_stale.degrades
         self._law_memory: list[float] = []
@@ -167,17 +168,17 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the numbers of the live hand, which change during the run.
+        """Returns the inputs of the operator model that a person or program moves.
 
-        A live hand is a person or program that moves the arm during the run. A simulated spring
-        pulls the arm to the target of the hand, with a force that is multiplied by the grip.
+        This operator model, the live hand, pulls the arm to a target by a simulated spring. The
+        grip multiplies the force. Grip and target change in each tick.
 
         Args:
             index: Index of the live hand among the operators and environments.
 
         Returns:
-            The grip, shape (1,), the target, and the target one second later, as views: who
-            writes into them changes the row of the live hand.
+            The grip, shape (1,), the target, and the target one second later. They are views:
+            writing into them moves the live hand.
         """
         actors = self._arrays.actors
         # The field `hand` of a record has grip, number, source, target and rate of the target.
@@ -246,14 +247,14 @@ class Site:
             self._sizer.add_model(command.peer, command.model)
 
     def start_at(self, k: int) -> None:
-        """Makes tick `k` the first tick of a site that joins a running session.
+        """Makes tick (control period) `k` the first one of an arm that joins a running session.
 
-        The site must not have made a tick. Its arm stands at the start pose, no sample (state)
-        of a peer is in use or waits, and the links have the state of tick k - 1: the models of
-        delay and loss have processed all samples that the peers have sent by then.
+        No tick must have been computed before. The arm stands at its start pose, and no sample
+        (state) of another arm is in use or waits. The models of delay and loss of the links
+        process all samples that the other arms have sent until tick k - 1.
 
         Args:
-            k: The first tick.
+            k: Number of the first tick.
         """
         links_may_be_ahead = k <= self._site["first"]
         if links_may_be_ahead:
@@ -331,13 +332,14 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Runs the eight stages of a tick (see `kernel`) on the buffers.
+        """Computes a whole control period: from the received samples to the record and motion.
 
-        Without a user's law, one compiled function runs all stages. A user's law is called
-        between two compiled functions, of the stages before the torque and after it.
+        Without a user's control law, one compiled function runs all eight stages (`kernel`
+        lists them). A user's law is called between two compiled functions, one for the stages
+        before the torque and one for those after it.
 
         Args:
-            k: The tick.
+            k: Number of the tick (control period).
             t_ns: Nominal time of the tick, ns since the start of the session.
             count: Number of arrivals in the buffers.
 
@@ -369,10 +371,7 @@ class Site:
         return memory
 
     def _write_measurement(self, measured: PlantState) -> None:
-        """Writes the motion of an external arm, which its driver measured, into the site's row.
-
-        The site does not simulate such an arm. The measured numbers take the place of a
-        simulated state.
+        """Applies the measured motion of a real arm, in place of a simulated motion.
 
         Args:
             measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque
@@ -385,10 +384,10 @@ class Site:
         s.sensed = [-torque for torque in measured.tau_x] or 0.0
 
     def _compute_law(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque by the user's law (stage 6 of a tick), and returns its memory.
+        """Computes the torque of a control period by the control law that a user wrote.
 
-        The law writes the torque into the row of the site. Its memory are the numbers that it
-        keeps from tick to tick.
+        The law writes the torque into the state of the site. The result of this method is the
+        memory of the law, the numbers that it keeps from period to period.
 
         The rule `glide` brings the arm to rest when something fails. Under this rule, a law
         that fails gives NaN as torque. `act_stages` then enters the mode FAULT with the reason
@@ -396,7 +395,7 @@ class Site:
         from the memory that it had before the failure.
 
         Args:
-            k: The tick.
+            k: Number of the tick (control period).
             t_ns: Nominal time of the tick, ns since the start of the session.
 
         Raises:
@@ -443,7 +442,7 @@ class Site:
 
     @property
     def parts(self) -> "TickParts":
-        """Parts of the site for `recorded_ticks`, which executes many ticks at once."""
+        """Parts of the site by which `recorded_ticks` computes many control periods at once."""
         return TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
@@ -466,9 +465,7 @@ class Site:
         return angles
 
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
-        """Writes the action of a live hand into its row, and returns the `hand` of the record.
-
-        A live hand is a person or program that moves the arm during the run.
+        """Applies how a person or program pulls the arm in a control period (live hand).
 
         Args:
             vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
@@ -476,7 +473,7 @@ class Site:
                 holds the arm.
 
         Returns:
-            The action in force. Empty if the site has no live hand.
+            The action for the record of the tick. Empty if the site has no live hand.
         """
         if self._hand is None:
             return ()
@@ -492,12 +489,12 @@ class Site:
         return action
 
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
-        """Returns the checksum of the arrivals in the buffers, `TickRecord.rx_crc`.
+        """Returns the checksum of the samples (states of other arms) that arrived, for the log.
 
-        An arrival is a sample (the state of a peer) that came since the last tick. Only what
-        the site uses is part of the checksum: peer, tick and motion of each arrival, then the
-        forces if the site reflects forces, then the numbers that the peers' laws send if the
-        law of this site reads such numbers.
+        A later verification of the log compares it. Only what this site uses is part of the
+        checksum: sender, tick and motion of each sample, then the forces if the site reflects
+        forces to its user, then the numbers that the other control laws send if the law of this
+        site reads such numbers.
 
         Args:
             packed_bytes: Number of bytes of the packed arrivals: peers, ticks and motions.
@@ -518,11 +515,10 @@ class Site:
         return crc
 
     def _held_memory(self) -> list[float]:
-        """Returns the part of `TickRecord.mem` that belongs to the site and not to its law.
+        """Lists the numbers of the site that the next tick needs and no other field records.
 
-        A run can be continued from the records of a tick. These are the numbers of the site
-        that the next tick needs and that no other field of the record contains. A site that is
-        not under the rule `glide`, which brings arms to rest, has only the first two items:
+        With them in the field `mem` of its record, a run can be continued from any tick. A site
+        that is not under the rule `glide`, which brings arms to rest, has only the first two:
 
         - `q_held`: the reference (position that the arm follows) that is held, or the start
           value of an offset that falls to zero,
@@ -553,7 +549,7 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns counts of the samples that arrived, came late or were lost, for each link.
+        """Returns how many messages (samples) arrived, came late or were lost, for each link.
 
         The links are in scenario order. `LinkCounts` explains the counts.
         """
@@ -582,7 +578,7 @@ class Site:
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if the real network alone delays the samples of a link.
+        """Returns True if no delay is simulated on a link: only the real network delays it.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -592,12 +588,10 @@ class Site:
         return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the rate of a peer's control loop, Hz.
-
-        It may differ from the rate of this site.
+        """Returns the rate of another arm's control loop, which may differ from this one's, Hz.
 
         Args:
-            peer: Index of the peer among the peers of this site.
+            peer: Index of the other arm (peer), in scenario order.
         """
         return int(self._links[peer]["rate_hz"])
 
@@ -774,7 +768,7 @@ class Site:
         are replaced by larger ones.
 
         Args:
-            k: Number of the tick.
+            k: Number of the tick (control period).
             arrivals: Samples that arrived since the previous tick.
 
         Returns:

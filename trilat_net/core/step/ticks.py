@@ -32,7 +32,7 @@ def tick_ns(tick: int, rate_hz: int) -> int:
     """Returns the nominal time of a tick, ns since the epoch, the common start of the session.
 
     Args:
-        tick: The tick.
+        tick: Number of the tick (control period).
         rate_hz: Tick rate, Hz.
     """
     return tick * 1_000_000_000 // rate_hz
@@ -40,14 +40,14 @@ def tick_ns(tick: int, rate_hz: int) -> int:
 
 @leaf
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
-    """Returns the first tick whose nominal time is at or after a due time.
+    """Returns the number of the first tick (control period) that begins at or after a time.
 
     It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact:
     floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The division of the negative
     number rounds up.
 
     Args:
-        due_ns: The due time, ns since the epoch, the common start of the session.
+        due_ns: The time, ns since the epoch, the common start of the session.
         rate_hz: Tick rate, Hz.
     """
     return -(-due_ns * rate_hz // 1_000_000_000)
@@ -246,13 +246,13 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns the reason for the last change of mode of a site, from its record.
+    """Returns why an arm last changed its mode, for example from RUN to HOLD, from its record.
 
-    The site must be under the rule `glide`, by which an arm comes to rest while a peer is
+    The arm must be under the rule `glide`, by which it comes to rest while another arm is
     silent. Only then does a record contain the reason.
 
     Args:
-        output: Record of the site, the result of one tick.
+        output: Record of the arm, the result of one control period.
     """
     shared = len(output.q_des)
     return LifeReason(int(output.mem[2 * shared + 1]))
@@ -293,11 +293,11 @@ class LifeAlarm(NamedTuple):
         shared: int,
         lost: Sequence[str] = (),
     ) -> "LifeAlarm | None":
-        """Returns the alarm that tells people why a site does not follow its peers.
+        """Returns the alarm that tells people why an arm does not follow the other arms.
 
-        Only a site under the rule `glide` has alarms. By this rule an arm comes to rest while a
-        peer is silent, and follows again after a person's order. All facts come from the site's
-        record, the stored result of one tick.
+        Only an arm under the rule `glide` has alarms. By this rule it comes to rest while
+        another arm (peer) is silent. After a fault or a stop, it follows again after a person's
+        order. All facts come from the arm's record, the stored result of one control period.
 
         Args:
             session: Name of the session, which the advice of the alarm quotes.
@@ -315,7 +315,7 @@ class LifeAlarm(NamedTuple):
         try:
             reason = LifeReason(int(mem[2 * shared + 1]))
         except (IndexError, ValueError, OverflowError):
-            # another rule, or a record of a stranger
+            # The site is under another rule, or another program wrote the record.
             return None
         is_too_far = (mode, reason) == ("waiting", LifeReason.ALIGN_LIMIT)
         if mode not in _ALARM_MODES and not is_too_far:
@@ -353,13 +353,13 @@ _DEFAULT_ADVICE = "it goes on by itself once all its peers are heard"
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
-    """Returns the alarm of a site that goes on without lost peers. None if no peer is lost.
+    """Returns the alarm of an arm that goes on without lost arms. None if no arm is lost.
 
-    Example of its word: "WITHOUT m2". The alarm asks for no order, because a lost peer gets its
-    share back by itself.
+    The other arms (peers) have got the weight (share) of the lost one. Example of the alarm's
+    word: "WITHOUT m2". It asks for no order, because a lost arm gets its share back by itself.
 
     Args:
-        lost: Names of the peers whose shares the others have.
+        lost: Names of the lost peers.
     """
     if not lost:
         return None

@@ -77,10 +77,10 @@ def put_five(a: Any, values: Five) -> None:
 
 @leaf
 def choose(condition: bool, if_true: float, if_false: float) -> float:
-    """Returns one of two numbers. Both are computed, so that compiled code has no branch.
+    """Returns one of two numbers, without a branch in the compiled code.
 
-    Functions with `choose` can also be compiled for numbers of several runs, see
-    `execution/lanes`.
+    Both numbers are computed. Functions with `choose` in place of `if` can also be compiled for
+    the numbers of several runs side by side, see `execution/lanes`.
 
     Args:
         condition: The condition.
@@ -106,11 +106,12 @@ def whole(number: float) -> int:
 def count_started(table: Any, first: int, count: int, now: float) -> int:
     """Returns how many rows of a time table start at a given time or before.
 
-    The rows are sorted by time, which is their first column, so that bisection finds the count.
+    For example, this finds the row of a recorded torque that applies now. The rows are sorted
+    by time, their first column, so that bisection finds the count.
 
     Args:
         table: The table.
-        first: Index of the first row to search; the table may contain rows of other owners.
+        first: Index of the first row to search. Rows before it have another purpose.
         count: Number of rows to search.
         now: The time, in the unit of the first column.
 

@@ -44,44 +44,59 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def _place_nothing(_chain: Any, _q: Any) -> None:
-    """Version of `place_joints` for one lane: all joints have been placed before."""
+    """Does nothing: the version of `place_joints` for a single run of several.
+
+    The frames of the joints of all runs have been computed before, eight runs at a time.
+    """
 
 
 def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
-    """Version of `put_gravity_torque` for one lane: all have been computed before."""
+    """Does nothing: the version of `put_gravity_torque` for a single run of several.
+
+    The torques of all runs have been computed before, eight runs at a time.
+    """
 
 
 def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the version of `place_joints` for the types of the arguments."""
+    """Returns the version of `place_joints` for one run or for eight runs at once.
+
+    The compiler calls this function with the types of the arguments.
+    """
     dispatcher: Any = place_joints
     is_one_lane = isinstance(argument_types[0], RowsInLane)
     return _place_nothing if is_one_lane else dispatcher.py_func
 
 
 def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the version of `put_gravity_torque` for the types of the arguments."""
+    """Returns the version of `put_gravity_torque` for one run or for eight runs at once.
+
+    The compiler calls this function with the types of the arguments.
+    """
     dispatcher: Any = chain_stages.put_gravity_torque
     is_one_lane = isinstance(argument_types[0], LaneRow)
     return _put_no_gravity if is_one_lane else dispatcher.py_func
 
 
 def _skip_pose(_s: Any, _chain: Any) -> None:
-    """Version of `update_pose` for eight runs that does nothing: they use no task space."""
+    """Does nothing in place of `update_pose`: runs in task space are not computed together."""
 
 
 def _skip_task_errors(_s: Any) -> None:
-    """Version of `update_task_errors` for eight runs that does nothing, without task space."""
+    """Does nothing in place of `update_task_errors`, which only runs in task space need."""
 
 
 def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torque: Any) -> None:
-    """Version of `add_task_torque` for eight runs that does nothing: they use no task space."""
+    """Does nothing in place of `add_task_torque`, which only runs in task space need."""
 
 
 def _skip_group(function: Any, skipped: Callable[..., None]) -> None:
-    """Leaves out a function of task space for eight runs, as the compiler sees all branches.
+    """Makes the compiler leave out a function when it compiles code for eight runs at once.
+
+    Functions of task space are never called in such runs. But the compiler also compiles
+    branches that are never taken, and it cannot compile these functions for eight runs.
 
     Args:
-        function: The function, whose first argument is the row of a site.
+        function: The function, whose first argument is the state of a site (arm controller).
         skipped: A function with the same arguments that does nothing.
     """
 

@@ -62,10 +62,11 @@ _UNIFORM = int(DelayKind.UNIFORM)
 
 
 class DelayNumbers(NamedTuple):
-    """Parameters of a random delay that does not depend on earlier delays, for `draw_delay_us`.
+    """Parameters of a distribution of network delays, for the function `draw_delay_us`.
 
-    In contrast to a row of the table of models, the kind can be known to the compiler, which
-    then removes the branches for other kinds. See `DelayKind` for the meaning of the others.
+    The delays of successive samples (sent states) are independent. The kind of the distribution
+    may be a constant that the compiler knows. The compiler then removes the branches for other
+    kinds. See `DelayKind` for the meaning of the parameters.
     """
 
     kind: int
@@ -76,18 +77,22 @@ class DelayNumbers(NamedTuple):
 
 
 class LinkStates(NamedTuple):
-    """State of the simulated network of several runs: L runs with N sites and P peers each.
+    """State of the simulated networks of L runs, each with N sites that have P peers.
+
+    A site (arm controller) receives samples (states) from its peers, the other sites, over one
+    link per peer. The times of samples are computed for a block of ticks (control periods) at a
+    time.
 
     Attributes:
-        links: Rows of the links, shape (L, N, P), see `LinkRow`.
+        links: States of the links, shape (L, N, P), see `LinkRow`.
         models: Models of delay and loss, shape (L, N, P, M).
-        points: Traces and outages of each run, shape (L, n, 2).
-        releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
-            R), a ring buffer. R is a power of two.
-        newest: Sample in use at the last tick, or -1, shape (L, N, P).
-        uniforms: Room for two random numbers of each sample of a block.
-        delays_us: Room for the delay of each sample of a block, us.
-        stamps_ns: Room for the stamp of each sample of a block, ns.
+        points: Recorded delays (traces) and outages of each run, shape (L, n, 2).
+        releases: For each tick, the newest sample that comes into use in this tick, or -1,
+            shape (L, N, P, R). It is a ring buffer, and R is a power of two.
+        newest: Sample in use in the last computed tick, or -1, shape (L, N, P).
+        uniforms: Memory for two random numbers of each sample of a block.
+        delays_us: Memory for the delay of each sample of a block, us.
+        stamps_ns: Memory for the time stamp of each sample of a block, ns.
     """
 
     links: RowArray
@@ -101,10 +106,13 @@ class LinkStates(NamedTuple):
 
 
 def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
-    """Copies the state of the links of several runs, before their first tick, to common arrays.
+    """Copies the states of the network links of several runs to common arrays.
+
+    The runs are simulated together, each in one lane. This function is called before their
+    first tick (control period).
 
     Args:
-        tables: Arrays of all sites of each run. They are not changed.
+        tables: Arrays of all sites (arm controllers) of each run. They are not changed.
     """
     sites, peers, _ = tables[0].calendars.shape
     pages = max(arrays.calendars.shape[2] for arrays in tables)
@@ -130,11 +138,11 @@ def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
 
 
 def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
-    """Returns the state of the network links of those runs that continue.
+    """Returns the states of the network links of those runs that continue.
 
     Args:
-        states: The state of all lanes.
-        lanes: Indices of the lanes.
+        states: State of all runs that have been simulated together.
+        lanes: Indices (lanes) of the runs that continue.
     """
     chosen = list(lanes)
     return states._replace(
@@ -161,17 +169,18 @@ def _is_constant(link: LinkRow, model: Row) -> bool:
 def _use_after_constant_delay(
     first: int, count: int, rate_hz: int, model: Row, used: IntArray
 ) -> int:
-    """Finds the samples in use on a link with a constant delay, see `use_samples`.
+    """Determines which sample a receiver uses in each tick, on a link with a constant delay.
 
-    Sample m is used from tick m + w on. The wait w is the same for all samples, because the
-    period is a whole number of nanoseconds. Otherwise the function must not be called.
+    Sample m is the state that the sender computed in tick m. It is used from tick m + w on. The
+    number w of ticks is the same for all samples if the period of the control loop is a whole
+    number of nanoseconds. Otherwise this function must not be called.
 
     Args:
-        first: First tick of the block.
-        count: Number of ticks.
+        first: First tick of a block of ticks.
+        count: Number of ticks in the block.
         rate_hz: Tick rate of both sites, Hz.
         model: Model of the link.
-        used: Written, one entry per tick.
+        used: Receives the sample in use, one entry per tick. -1 before the first sample.
 
     Returns:
         The sample in use at the end of the block.
@@ -187,15 +196,15 @@ def _use_after_constant_delay(
 def _draw_uniform_delays(
     first: int, count: int, key: DrawKey, location: float, scale: float, delays_us: IntArray
 ) -> None:
-    """Draws uniformly distributed delays of several samples, us.
+    """Draws uniformly distributed network delays for several consecutive samples (sent states).
 
     Args:
         first: Index of the first sample.
         count: Number of samples.
-        key: Key of the link.
+        key: Key of the link, which makes its random numbers differ from those of other links.
         location: Mean delay, us.
         scale: Largest deviation from the mean, us.
-        delays_us: Written.
+        delays_us: Receives the delays, us, shape (count,).
     """
     numbers = DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
     for index in range(count):
@@ -205,13 +214,13 @@ def _draw_uniform_delays(
 
 @lane_leaf
 def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -> None:
-    """Draws two random numbers for each of several samples, which decide whether it is lost.
+    """Draws the random numbers that decide which of several samples the network loses.
 
     Args:
-        first: Index of the first sample.
+        first: Index of the first sample (sent state).
         count: Number of samples.
-        key: Key of the link.
-        uniform_numbers: Written, shape (2, count).
+        key: Key of the link, which makes its random numbers differ from those of other links.
+        uniform_numbers: Receives two numbers between 0 and 1 per sample, shape (2, count).
     """
     for index in range(count):
         u, v = uniforms(key, first + index, LOSS, 0)
@@ -222,7 +231,8 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
 class DrawAddresses(NamedTuple):
     """Addresses of compiled functions that draw the random numbers of many samples in one call.
 
-    Their loops use vector instructions, which needs all functions in them to be inlined.
+    The loops of these functions use vector instructions. This is possible because the compiler
+    inlines every function that they call.
     """
 
     delays: int
@@ -230,7 +240,10 @@ class DrawAddresses(NamedTuple):
 
 
 def find_draw_addresses() -> DrawAddresses:
-    """Returns the addresses of these functions, and compiles the functions if needed."""
+    """Returns the addresses of the functions that draw delays and losses of many samples.
+
+    The functions are compiled if their code is not stored on the disk.
+    """
     integer = types.int64
     number = types.float64
     delays = types.Array(integer, 1, "C")
@@ -258,7 +271,7 @@ def _release_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes in which ticks samples are released that one model of a link delays.
+    """Computes in which ticks the samples of one link model come into use at the receiver.
 
     The random numbers of all samples are drawn first, in loops that use vector instructions.
 
@@ -346,7 +359,7 @@ def _use_samples_of_link(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the samples in use on any link, see `use_samples`.
+    """Determines which sample a receiver uses in each tick, on a link of any kind.
 
     Args:
         first: First tick of the block.

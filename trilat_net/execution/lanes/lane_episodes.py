@@ -94,13 +94,17 @@ def _use_samples_of_lanes(
 def _put_actions(
     actions: Array, hand_row: int, columns: IntArray, actors: Array, runs: int
 ) -> None:
-    """Passes the actions of all programs in a tick to the operators of the simulated arms.
+    """Copies the actions of all programs in a tick to the simulated operators of the arms.
+
+    In each of several runs, one program moves an arm, like an operator. The runs are stored
+    side by side, each in a lane.
 
     Args:
-        actions: The actions, shape (5, LANES).
-        hand_row: Row of the operator.
-        columns: Word of each number of an action in this row, shape (5,).
-        actors: Rows of operators and environments, seen as floats, shape (rows, words, LANES).
+        actions: Five numbers per action (grip and target), shape (5, LANES).
+        hand_row: Index of the operator's row in `actors`.
+        columns: Index of each number of an action within this row, shape (5,).
+        actors: Rows of operators and environments, viewed as floats, shape (rows, numbers of a
+            row, LANES).
         runs: Number of runs.
     """
     for n in range(columns.shape[0]):
@@ -224,10 +228,11 @@ def _run_span(
 
 
 class LaneEpisodes(LaneRun):
-    """Simulates the episodes of several environments together, each in one lane.
+    """Simulates the episodes of several training environments together.
 
-    When an episode has ended, `load` puts a new run into its lane, while the other lanes
-    continue.
+    Each environment has a lane, an element of the vector registers, so that one instruction
+    computes a number of several environments. When an episode has ended, `load` puts a new run
+    into its lane, while the other lanes continue.
 
     Args:
         run: Any run of this structure before its first tick, see `explain_run`.
@@ -289,11 +294,9 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: FusedRun, hand_site: int) -> str:
-        """Returns why a run cannot be computed in lanes, or "" if it can.
+        """Returns why a run cannot be computed together with others, or "" if it can.
 
-        To find out, this function compiles the code.
-
-        The code is compiled for this answer.
+        The function finds the answer by compiling the code.
 
         Args:
             run: The run before its first tick.
@@ -303,11 +306,14 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
-        """Starts a new episode: puts a run into a lane, in place of the run that was there.
+        """Starts a new episode: copies the state of a run into a lane, over the run before.
+
+        A lane is the place of one of the runs that are simulated together.
 
         Args:
-            lane: The lane.
-            run: The run before its first tick, of the same structure as the others.
+            lane: Index of the lane.
+            run: The run before its first tick (control period), of the same structure as the
+                others.
             rules: Limits of the program's hand, see `HandRules`.
         """
         memory = run.memory
@@ -327,6 +333,7 @@ class LaneEpisodes(LaneRun):
             self._laws[:, :, lane] = memory.laws.rows.view(np.int64)
             self._sent[:, :, lane] = memory.laws.sent.view(np.int64)
         self._received[:, :, lane] = 0
+
         self.ticks[lane] = 0
         self._ended.ticks[lane] = -1
         self._put_first_states(lane, tables)
@@ -335,11 +342,20 @@ class LaneEpisodes(LaneRun):
         self.runs[lane] = run
 
     def _load_links(self, lane: int, run: FusedRun) -> None:
-        """Copies the state of a run's network links into a lane, and enlarges the arrays."""
+        """Copies the state of a run's simulated network links into a lane.
+
+        A lane is the place of one of the runs that are simulated together. The arrays that all
+        lanes share are enlarged if they are too small for the delay models of this run.
+
+        Args:
+            lane: Index of the lane.
+            run: The run before its first tick (control period).
+        """
         tables = run.memory.tables
         links = self._deliveries
         pages = tables.calendars.shape[2]
-        # A sample that is sent in a span waits at most as long as the calendar has pages.
+        # `releases` is a ring buffer over the ticks. A sample that is sent in a block of ticks
+        # waits at most as long as the calendar has pages.
         needed = 1 << (pages + BLOCK_TICKS).bit_length()
         old_room = links.releases.shape[3]
         if needed > old_room:
@@ -348,6 +364,9 @@ class LaneEpisodes(LaneRun):
                 due = np.arange(self.ticks[other], self.ticks[other] + old_room)
                 releases[other, ..., due % needed] = links.releases[other, ..., due % old_room]
             links = links._replace(releases=releases)
+
+        # The run may have more delay models, or more points of recorded delays, than any run
+        # before.
         models = tables.models.shape[2]
         if models > links.models.shape[3]:
             wider = np.zeros((*links.models.shape[:3], models), LINK_MODEL_DTYPE)
@@ -358,6 +377,7 @@ class LaneEpisodes(LaneRun):
             more = np.zeros((len(links.points), points, 2), np.int64)
             more[:, : links.points.shape[1]] = links.points
             links = links._replace(points=more)
+
         links.links[lane] = tables.links
         links.models[lane, ..., :models] = tables.models
         links.points[lane, :points] = tables.points
@@ -462,7 +482,11 @@ class LaneEpisodes(LaneRun):
         self.ticks[idle == 0] += count
 
     def _keep_states(self, ticks: int) -> None:
-        """Makes room for the states of more ticks; each lane has a tick of its own."""
+        """Enlarges the memory for past states of the sites (arm controllers), if necessary.
+
+        Each lane (position of a run among the runs that are simulated together) has a present
+        tick (control period) of its own.
+        """
         while self._pages <= ticks:
             old_pages = self._pages
             self._pages *= 2
@@ -488,7 +512,10 @@ class LaneEpisodes(LaneRun):
         return self._read(self._site, self._ended.site_rows, self._layout.site, name, dtype)
 
     def read_links(self, name: str, i: int) -> NDArray[Any]:
-        """Returns a field of the rows of the links of site `i`, shape (P, runs, numbers)."""
+        """Returns one quantity of the links over which site `i` receives, in all runs.
+
+        The shape is (P, runs, numbers), for links from P other sites.
+        """
         dtype: Any = self._layout.link.fields[name][0]  # type: ignore[index]
         rows = slice(i * self._structure.peers, (i + 1) * self._structure.peers)
         return self._read(
@@ -503,7 +530,18 @@ class LaneEpisodes(LaneRun):
         name: str,
         dtype: np.dtype[Any],
     ) -> NDArray[Any]:
-        """Returns a field of rows, from `ended` for the runs that have ended."""
+        """Returns one field of the state of all sites (arm controllers) or links, for each run.
+
+        Several runs are stored side by side, each in a lane. The state of a run that has ended
+        is read from `ended`, because its lane contains no valid numbers any more.
+
+        Args:
+            present: Present rows of all lanes, shape (rows, numbers of a row, LANES).
+            ended: The same rows at the end of each run that has ended.
+            layout: Data type of a row.
+            name: Name of the field.
+            dtype: Data type of the field.
+        """
         words = find_words(layout, name)
         columns = slice(words.start, words.stop)
         runs = len(self.runs)
@@ -515,7 +553,11 @@ class LaneEpisodes(LaneRun):
         return in_order.view(dtype.base)
 
     def read_new(self, i: int) -> NDArray[np.bool_]:
-        """Returns which samples site `i` uses since its latest tick, shape (P, runs)."""
+        """Returns from which sites site `i` has used a new sample in its latest tick.
+
+        A sample is the state that one of P other sites (arm controllers) sent. The shape is (P,
+        runs).
+        """
         runs = len(self.runs)
         lanes = np.arange(runs)
         ticks = np.where(self.has_ended, self._ended.ticks[:runs], self.ticks[:runs])
@@ -527,12 +569,13 @@ class LaneEpisodes(LaneRun):
         return is_new
 
     def write_back(self, lane: int) -> None:
-        """Copies the present state of a lane into its `FusedRun`, where the caller reads it.
+        """Copies the present state of a run into its `FusedRun` object, where callers read it.
 
-        The run cannot continue alone from there: its links still have their first state.
+        The run cannot continue alone from there, because its simulated network links still have
+        their initial state.
 
         Args:
-            lane: The lane.
+            lane: Index of the run among the runs that are simulated together.
         """
         memory = self.runs[lane].memory
         has_ended = bool(self.has_ended[lane])

@@ -52,13 +52,13 @@ class LaneLaw(NamedTuple):
     Runs for which these properties are equal share the code.
 
     Attributes:
-        name: Name of the law, from all that its code depends on. `NO_LAW` without such a law.
+        name: Name that identifies the code of the law. `NO_LAW` for laws of the kernel.
         is_stored: True if the compiled code may be stored on disk.
-        size: Count of numbers of the law.
-        constants: Flags among them: integers that are 0 or 1 and do not change. They are equal
-            in all runs.
-        columns: For each peer the indices of the numbers that the law receives among the
-            numbers that the peer sends; -1: the peer does not send the number.
+        size: Count of numbers (gains and memory) of the law.
+        constants: Names and values of flags among these numbers: integers that are 0 or 1 and
+            do not change. They are equal in all runs.
+        columns: For each other site (peer), the indices of the numbers that the law receives
+            among the numbers that the peer sends. -1 for a number that the peer does not send.
     """
 
     name: str
@@ -82,7 +82,11 @@ _user_law_numbers = count()
 
 @cache
 def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
-    """Returns a name for the code of a law, and whether the code may be stored on disk."""
+    """Returns a name that identifies the code of a law, and whether it may be stored on disk.
+
+    Compiled code is stored under the name. Code of users is not stored, because it may use
+    other files, of which a change would remain unnoticed.
+    """
     sources = digest_sibling_sources(torque)
     text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
     name = hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -95,9 +99,12 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
 def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
     """Returns the properties of a site's law on which the compiled code of its tick depends.
 
+    Runs with equal properties can be simulated together by the same code.
+
     Args:
-        law: The law; None if the law of the site is a part of the kernel.
-        columns: Indices of the numbers that the law receives, shape (P, C).
+        law: The law. None if the law of the site (arm controller) is a part of the kernel.
+        columns: Indices of the C numbers that the law receives from each of P peers (other
+            sites), shape (P, C).
     """
     if law is None:
         return LaneLaw(NO_LAW, is_stored=True, size=0, constants=(), columns=())
@@ -154,13 +161,17 @@ class _CodeModel(models.PrimitiveModel):
 def _make_view(
     dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
 ) -> Any:
-    """Returns a compiled function that reads the numbers of a row as a row with named fields.
+    """Returns a compiled function that gives a vector of plain numbers named fields.
+
+    A control law declares the names of its gains and of the numbers that it sends. The arrays
+    of the simulation store them as plain numbers. The function converts no number: it only
+    views the same memory with another type.
 
     Args:
-        dtype: Layout of the rows. None if there are no such rows.
-        rows: Number of rows.
-        first_word: Index of the first number.
-        constants: Fields that are equal in all lanes.
+        dtype: Names and types of the fields. None if there are no such numbers.
+        rows: Number of rows, each of which has these fields.
+        first_word: Index of the number at which the first row begins.
+        constants: Names and values of fields that are equal in all runs.
     """
     if dtype is None:
         return _no_rows
@@ -210,19 +221,21 @@ def compute_law(
     received: RowArray,
     sent: RowArray,
 ) -> None:
-    """Computes the torque of a compiled control law for one of the runs, see `law_stage`.
+    """Computes the torque of a compiled control law in one tick of one of several runs.
 
-    Nothing happens if the law of the site is a part of the kernel.
+    Nothing happens if the law of the site is a part of the kernel, which computes such laws
+    itself. The function body is only a placeholder: the compiler replaces it by the version of
+    the law that the type of `code` selects (`_choose_law`).
 
     Args:
-        code: Stands for the code of the law.
-        k: The tick.
+        code: Tells the compiler which law to call.
+        k: Number of the tick (period of the control loop).
         t_ns: Nominal time of the tick, ns since the epoch.
-        site: Row of the site, in which the torque is written.
-        links: Rows of the site's links.
-        law: Row with the numbers of the law; changed.
-        received: Rows with the numbers that the peers' laws sent.
-        sent: Row with the numbers that this law sends; written.
+        site: State of the site, the arm with its controller. It receives the torque.
+        links: States of the links from other sites (peers).
+        law: Numbers of the law (gains and memory), of which the memory is changed.
+        received: Numbers that the laws of the peers sent.
+        sent: Receives the numbers that this law sends.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -240,11 +253,15 @@ def _compute_nothing(
     _received: Any,
     _sent: Any,
 ) -> None:
-    """Version of `compute_law` that does nothing: the kernel computes the law of this site."""
+    """Does nothing: the version of `compute_law` for laws that the kernel computes itself."""
 
 
 def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the version of `compute_law` for the law of a site."""
+    """Returns the version of `compute_law` that calls the control law of a site.
+
+    The compiler calls this function with the types of the arguments, of which the first one
+    names the law.
+    """
     code = argument_types[0]
     if code.law_name == NO_LAW:
         return _compute_nothing

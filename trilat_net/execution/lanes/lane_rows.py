@@ -55,7 +55,9 @@ Constants = tuple[tuple[str, int], ...]
 
 
 class LaneField(NamedTuple):
-    """One field of a row, with its position among the numbers of the row.
+    """One field of a row, the state of one arm in one run, with its position in the row.
+
+    All numbers of a row have eight bytes.
 
     Attributes:
         name: Name of the field.
@@ -71,9 +73,11 @@ class LaneField(NamedTuple):
 
 
 class LaneTable(types.Type):
-    """Numba's type of an array that holds the rows of all lanes, such as the states of an arm.
+    """Numba's type of an array with the states of an arm in several runs side by side.
 
-    A value of this type is a pointer to the first number of the array.
+    The state in one run is a row of numbers with named fields. Each run has a lane: a number of
+    the row becomes `LANES` adjacent numbers, one per run. A value of this type is a pointer to
+    the first number of the array.
 
     Args:
         dtype: Data type of a row of one run. All its numbers have 64 bits.
@@ -173,14 +177,15 @@ def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
 
 
 def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
-    """Generates LLVM code for the address of rows that begin `words` numbers behind a pointer.
+    """Generates LLVM code for an address that lies some numbers of a row behind a pointer.
 
-    Each number of a row occupies `LANES` numbers in memory.
+    The rows of several runs are stored side by side, so that each number of a row occupies
+    `LANES` numbers in memory.
 
     Args:
         builder: Appends LLVM instructions.
         pointer: The pointer.
-        words: Count of numbers in a row of one run.
+        words: Count of numbers (64-bit words) in a row of one run.
     """
     word = ir.IntType(64)
     return _offset_pointer(builder, pointer, ir.Constant(word, words * LANES * _WORD))
@@ -227,7 +232,19 @@ def _find_number(
 
 @lower_getattr_generic(LaneRow)
 def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
-    """Generates LLVM code for reading `row.field`: a constant, a number or an array."""
+    """Generates LLVM code for reading `row.field` of a row in one lane.
+
+    Numba calls this function when it compiles such an expression. The result is a constant if
+    the field is equal in all lanes, a number if the field is a single number, and otherwise an
+    array whose numbers are `LANES` numbers apart in memory.
+
+    Args:
+        context: Numba's context of the compilation.
+        builder: Appends LLVM instructions.
+        row_type: Numba's type of the row.
+        row: The row, as an LLVM value.
+        name: Name of the field.
+    """
     constant = row_type.find_constant(name)
     if constant is not None:
         return context.get_constant(types.int64, constant)
@@ -286,7 +303,16 @@ def _find_row(
     index: Any,
     row_type: Any,
 ) -> Any:
-    """Generates LLVM code for the row with an index, of the type `row_type`."""
+    """Generates LLVM code for `rows[index]`, the row with an index, in one lane.
+
+    Args:
+        context: Numba's context of the compilation.
+        builder: Appends LLVM instructions.
+        rows_type: Numba's type of the rows.
+        rows_value: The rows, as an LLVM value.
+        index: The index, as an LLVM value.
+        row_type: Numba's type of the row.
+    """
     rows = cgutils.create_struct_proxy(rows_type)(context, builder, value=rows_value)
     row = cgutils.create_struct_proxy(row_type)(context, builder)
     row_bytes = ir.Constant(index.type, rows_type.row_length * LANES * _WORD)
@@ -345,7 +371,11 @@ def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _select_row(_context: Any, rows: Any, index: Any) -> Any:
-    """Generates LLVM code for a row whose index is known to the compiler."""
+    """Generates LLVM code for a row whose index is a constant.
+
+    Only then does the compiler know the constant fields of this row, such as the kind of an
+    operator, and can remove the branches for other kinds.
+    """
     if not isinstance(index, types.IntegerLiteral):
         return None
     number = index.literal_value
@@ -360,7 +390,11 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
 
 @intrinsic
 def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
-    """Generates LLVM code for the integer of one lane, which all lanes may share."""
+    """Generates LLVM code for an integer of one lane, such as its present tick.
+
+    The first argument is an array with one integer per lane, or a single integer that is equal
+    in all lanes.
+    """
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         numbers_type = sig.args[0]
@@ -400,14 +434,14 @@ pointer_to: Any = _pointer_to
 
 
 def allocate_words(rows: int, row_length: int) -> Words:
-    """Returns an array of zeros for the rows of all lanes, aligned to a cache line.
+    """Returns an array of zeros for the states of several runs side by side.
 
-    The shape is (rows, numbers of a row, LANES). Vector instructions read an aligned array
-    faster.
+    The shape is (rows, numbers of a row, LANES), and each run has one of the lanes. The array
+    is aligned to a cache line, because vector instructions read an aligned array faster.
 
     Args:
         rows: Number of rows.
-        row_length: Numbers in a row of one run.
+        row_length: Count of numbers in a row of one run.
     """
     count = rows * row_length * LANES
     room = np.zeros(count + _ALIGNMENT // _WORD, np.int64)

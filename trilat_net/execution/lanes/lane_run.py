@@ -57,23 +57,28 @@ _STATE_FIELDS = ("q", "qd", "tau_x")
 
 
 class SiteTables(NamedTuple):
-    """Arrays with the state of one site in all lanes, as `advance_site` takes them.
+    """The state of one site (simulated arm with its controller) in several runs side by side.
+
+    Each run has a lane, an element of the vector registers. In each array, the numbers of all
+    lanes are adjacent. The compiled function `advance_site` receives these arrays. A row is a
+    record with named fields, see `row_fields`.
 
     Attributes:
-        site: Row of the site.
-        links: Rows of its links.
-        actors: Rows of its operators and environments.
-        environments: The rows of its environments.
-        ramps: Row with the changes of its dominance factors.
-        record: Row with the floats of its record.
-        peaks: Peaks, one row per bucket.
-        sums: Row of its sums.
-        progress: Row of its progress.
-        scratch: Row with room for the stages of the integrator.
-        law: Row with the numbers of its compiled law.
-        received: Rows with the numbers that the peers' laws sent.
-        sent: Row with the numbers that its law sends.
-        code: Stands for the code of the law. The table itself is not used.
+        site: Row with the state of the site.
+        links: Rows of the links from other sites.
+        actors: Rows of the operators and environments that act on the arm.
+        environments: The rows of the environments alone.
+        ramps: Row with the planned changes of the dominance factors (how strongly the site
+            follows each other site).
+        record: Row with the results of a tick (control period), which a log would contain.
+        peaks: Largest values, one row per interval of 50 ms (bucket).
+        sums: Row with sums over the run.
+        progress: Row that states how far the run is.
+        scratch: Row with intermediate results of the integrator.
+        law: Row with the numbers of a compiled control law.
+        received: Rows with the numbers that the laws of other sites sent.
+        sent: Row with the numbers that this law sends.
+        code: Tells the compiler which law to call. The array itself is not used.
         chain: Rows of the joints, if the arm is a chain.
     """
 
@@ -95,21 +100,23 @@ class SiteTables(NamedTuple):
 
 
 class LaneLayout(NamedTuple):
-    """Data types and lengths of the arrays of a run, on which its code depends.
+    """Data types and lengths of the arrays of a run, which its compiled code must know.
+
+    Runs with equal layouts can use the same code.
 
     Attributes:
-        site: Of the row of a site.
-        link: Of the row of a link.
-        actor: Of the row of an operator or environment.
-        sums: Of the sums of a site.
-        progress: Of the progress of a site.
-        floats: Number of floats in a record.
-        columns: Number of columns of the peaks.
+        site: Data type of the state of a site, the simulated arm with its controller.
+        link: Data type of the state of a link between two sites.
+        actor: Data type of an operator or environment.
+        sums: Data type of the sums over the run of a site.
+        progress: Data type of the progress of a site.
+        floats: Number of floats in a record, the result of one tick (control period).
+        columns: Number of columns of the array of largest values (peaks).
         ramps: Shape of the table of dominance factors.
-        chain: Of the row of a joint. None for planar arms.
-        joints: Number of joints that sites share.
-        law: Largest count of numbers of a compiled law.
-        received: Largest count of numbers that a law receives from a peer.
+        chain: Data type of a joint. None for planar arms.
+        joints: Number of joints whose angles the sites exchange.
+        law: Largest count of numbers of a compiled control law.
+        received: Largest count of numbers that a law receives from another site (peer).
         sent: Largest count of numbers that a law sends.
     """
 
@@ -129,7 +136,10 @@ class LaneLayout(NamedTuple):
 
 
 def find_layout(run: FusedRun) -> LaneLayout:
-    """Returns the data types and lengths of all arrays of a run, on which its code depends."""
+    """Returns the data types and lengths of all arrays of a run, on which its code depends.
+
+    A run without compiled control laws has arrays of length 0 in their place.
+    """
     memory = run.memory
     tables = memory.tables
     return LaneLayout(
@@ -157,8 +167,11 @@ def list_argument_types(
 ) -> tuple[Any, ...]:
     """Returns Numba's types of the arguments with which the tick of a site is compiled.
 
+    The types contain everything that the compiled code depends on: the layouts of the arrays,
+    and properties that are equal in all runs, such as the kinds of the operators.
+
     Args:
-        layout: Layouts of the tables.
+        layout: Data types and lengths of the arrays.
         structure: Structure of the run.
         site: Structure of the site.
         clock: Type of the tick and of its nominal time: an integer if they are equal in all
@@ -214,15 +227,18 @@ def choose_code(layout: LaneLayout) -> Callable[..., None]:
 
 
 def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -> IntArray:
-    """Returns the addresses of the code for a tick of each site, and compiles it if needed.
+    """Returns the address of the compiled code that computes a tick of each site.
+
+    The code computes a tick (period of the control loop) for several runs at once. It is
+    compiled if it has not been stored on the disk before.
 
     Args:
-        run: The run.
-        structure: Its structure.
-        clock: Type of the ticks, see `list_argument_types`.
+        run: One of the runs.
+        structure: The structure that all these runs have, see `find_structure`.
+        clock: Numba's type of the ticks, see `list_argument_types`.
 
     Raises:
-        NumbaError: A law of a user cannot be compiled in lanes.
+        NumbaError: A law of a user cannot be compiled for several runs at once.
     """
     layout = find_layout(run)
     addresses = []
@@ -235,13 +251,12 @@ def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -
 def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
     """Returns why a control law cannot be compiled for several runs at once, for a message.
 
-    Such a law may still be compiled for a single run. To find out, this function compiles the
-    code.
-
-    The code is compiled for this answer.
+    Such a law may still be compiled for a single run. The function finds the answer by
+    compiling the code.
 
     Args:
-        run: The run before its first tick. There must be no obstacle, see `find_obstacle`.
+        run: The run before its first tick (control period). There must be no obstacle, see
+            `find_obstacle`.
         clock: Type of the ticks, see `list_argument_types`.
 
     Returns:
@@ -269,13 +284,16 @@ def read_assembly(run: FusedRun, i: int) -> str:
 
 @leaf
 def _copy_records(first: int, kept: Array, records: Array) -> None:
-    """Copies records from the lanes to arrays of each run.
+    """Copies records from the common array of all runs to an array in the order of the runs.
+
+    A record has the results of one tick (control period). In the common array, the same number
+    of all runs is adjacent in memory (each run has a lane), as vector instructions require.
 
     Args:
         first: First tick.
-        kept: Latest records of all sites, shape (N, rows, floats, LANES). The record of tick k
-            is in row k modulo the number of rows.
-        records: Written, shape (runs, N, ticks, floats).
+        kept: Latest records of all N sites (arm controllers), shape (N, rows, floats, LANES).
+            The record of tick k is in row k modulo the number of rows, which is a power of two.
+        records: Receives the records, shape (runs, N, ticks, floats).
     """
     # The numbers of all lanes in a record lie in few cache lines.
     for i in range(records.shape[1]):
@@ -287,9 +305,10 @@ def _copy_records(first: int, kept: Array, records: Array) -> None:
 
 
 def has_lane_code(run: FusedRun) -> bool:
-    """Returns True if the code for these runs has been compiled and stored before.
+    """Returns True if the code that simulates a run in lanes is stored on the disk already.
 
-    The runs can then start at once.
+    A lane is the position of one of several runs that are simulated at once. Without stored
+    code, the compilation takes some time before the runs can start.
 
     Args:
         run: The run. There must be no obstacle, see `find_obstacle`.
@@ -303,10 +322,13 @@ def has_lane_code(run: FusedRun) -> bool:
 
 
 class _LinksOfRun:
-    """Brings the network links of a run up to date, but only if the run needs them.
+    """Brings the simulated network links of a run up to date, but only if this is needed.
+
+    While several runs are simulated together, their deliveries are computed in another way,
+    which leaves the state of the links behind. Only a run that then continues alone needs it.
 
     Args:
-        run: The run before its first tick.
+        run: The run before its first tick (control period).
     """
 
     def __init__(self, run: FusedRun) -> None:
@@ -316,19 +338,23 @@ class _LinksOfRun:
     def set_pending(
         self, ticks: int, links: NDArray[Any], states: Array, received: Array
     ) -> None:
-        """Notes that the run has advanced, and with which results.
+        """Stores the results of the latest ticks, with which the links can be updated later.
 
         Args:
-            ticks: Number of ticks that the run has made.
-            links: Rows of its links after these ticks. Only fields of the sample in use, and
-                fields that stage 3 of a tick writes, are up to date.
-            states: The latest states of its sites, see `repeat_deliveries`.
-            received: Numbers of laws that came with the samples in use, shape (N P, C).
+            ticks: Number of ticks (control periods) that the run has made.
+            links: Rows of its links after these ticks. Only some fields are up to date: those
+                of the sample in use, and those that the computation of references writes.
+            states: The latest states of its sites (arm controllers), see `repeat_deliveries`.
+            received: Numbers of control laws that came with the samples in use, shape (N P, C),
+                for N sites with P peers each.
         """
         self._run.pending_deliveries = partial(self._update, ticks, links, states, received)
 
     def _update(self, ticks: int, links: NDArray[Any], states: Array, received: Array) -> None:
-        """Computes the state of the links up to the tick that `set_pending` noted."""
+        """Computes the state of the links up to the tick that was passed to `set_pending`.
+
+        The run calls it before it continues alone, see `FusedRun.pending_deliveries`.
+        """
         memory = self._run.memory
         tables = memory.tables
         repeat_deliveries(
@@ -344,6 +370,8 @@ class _LinksOfRun:
             joints=tables.links["q"].shape[2],
             states=states,
         )
+
+        # Fields that `repeat_deliveries` cannot know come from the computed ticks.
         self._ticks = ticks
         memory.next_samples[:] = max(ticks - 1, 0)
         for name in (*_REFERENCE_FIELDS, *_STATE_FIELDS):
@@ -355,10 +383,14 @@ class _LinksOfRun:
 class LaneRun:
     """Simulates several runs of equal structure together with vector instructions.
 
+    Each run has a lane, an element of the vector registers, so that one instruction computes
+    the same number of several runs.
+
     Args:
-        runs: The runs before their first tick, at most `LANES`. They must have the same
-            structure, see `find_structure`, and no obstacle, see `find_obstacle`.
-        record_rows: Number of latest records of each site that are kept, a power of two.
+        runs: The runs before their first tick (control period), at most `LANES`. They must have
+            the same structure, see `find_structure`, and no obstacle, see `find_obstacle`.
+        record_rows: Number of latest records of each site (arm controller) that are kept, a
+            power of two.
 
     Attributes:
         runs: The runs that are in the lanes. `advance_to` writes the results into them.
@@ -395,7 +427,11 @@ class LaneRun:
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
 
         def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
-            """Returns the tables of all runs side by side, shape (rows, words, LANES)."""
+            """Stores arrays of several runs side by side, as vector instructions require.
+
+            Returns:
+                The numbers of all runs, shape (rows, numbers of a row, LANES).
+            """
             tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
             rows, row_length = tables_of_lanes[0].shape
             packed = allocate_words(rows, row_length)
@@ -440,11 +476,15 @@ class LaneRun:
         self._addresses = _find_addresses(runs[0], structure, self.clock)
 
     def _put_first_states(self, lane: int, arrays: SiteArrays) -> None:
-        """Writes the states of all sites before the first tick, which their peers start with.
+        """Copies the initial state of each site, as the other sites know it, into a lane.
+
+        A site (arm controller) uses these initial states of its peers (the other sites) until
+        the first sample has arrived. The lane is the position of the run among the runs that
+        are simulated together.
 
         Args:
-            lane: The lane.
-            arrays: Arrays of the sites of its run.
+            lane: Index of the lane.
+            arrays: Arrays of the sites of the run.
         """
         for j in range(self._sites):
             # The peers of a site are all other sites: site 0 is a peer of site 1.
@@ -456,7 +496,9 @@ class LaneRun:
                 self._states[j, self._pages, lane, columns] = link[name]
 
     def _put_laws(self, memories: Sequence[RunMemory]) -> None:
-        """Copies the numbers of compiled laws into the lanes.
+        """Copies the gains and memory of compiled control laws into the arrays of all lanes.
+
+        A lane is the position of one run among the runs that are simulated together.
 
         Args:
             memories: Arrays of each run.
@@ -472,7 +514,11 @@ class LaneRun:
             self._columns[:] = channel.columns
 
     def _find_tables(self) -> IntArray:
-        """Returns the address of each table of each site, shape (N, 15)."""
+        """Returns the memory address of each array of each of the N sites, shape (N, 15).
+
+        The compiled code of a tick (control period) receives the addresses of these 15 arrays
+        (`SiteTables`).
+        """
         structure = self._structure
         addresses = []
         for i in range(self._sites):
@@ -502,7 +548,9 @@ class LaneRun:
     def advance_to(self, until_s: float) -> None:
         """Continues all runs until they are as long as a run with a duration of `until_s` s.
 
-        A run ends earlier if an arm leaves its limits. The results are written into the runs.
+        A run ends earlier if an arm leaves its limits. The results, and the records (results of
+        control periods) of the latest ticks (control periods) if they are kept, are written
+        into the `FusedRun` objects.
 
         Args:
             until_s: The time, s, later than that of the previous call.
@@ -510,12 +558,15 @@ class LaneRun:
         lanes = [lane for lane in range(len(self.runs)) if self._ended.ticks[lane] < 0]
         if not lanes:
             return
+
         ticks = max(1, round(until_s * self._rate_hz))
         for lane in lanes:
             self.runs[lane].plan([ticks] * self._sites)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
         first = self._ticks
         self._step_to(ticks)
+
+        # The records of the latest ticks, in the order of the runs.
         records = None
         if self._records.shape[1] > 1:
             count = min(self._ticks - first, self._records.shape[1])
@@ -528,14 +579,16 @@ class LaneRun:
             self._write_back(lane, self.runs[lane], until_s)
 
     def _use_samples(self, first: int, count: int) -> int:
-        """Finds the samples that are used in a block of ticks, see `use_samples`.
+        """Determines which samples (states of other sites) the sites use in a block of ticks.
+
+        The result is stored in `self._used`, see `use_samples`.
 
         Args:
-            first: First tick of the block.
+            first: First tick (control period) of the block.
             count: Number of ticks.
 
         Returns:
-            The largest age of a sample in use, ticks.
+            The largest age of a sample in use, in ticks.
         """
         return use_samples(
             first,
@@ -548,16 +601,19 @@ class LaneRun:
         )
 
     def _step_to(self, ticks: int) -> None:
-        """Simulates all runs until they have made a number of ticks, or have ended.
+        """Simulates all runs in blocks of ticks, up to a tick or until all runs have ended.
+
+        For each block, the deliveries of the network are computed first, and then the motion.
 
         Args:
-            ticks: Number of ticks since the start of the runs.
+            ticks: Number of ticks (control periods) since the start of the runs.
         """
         present = self._list_present()
         site_fields: Any = self._layout.site.fields
         _, mode_offset = site_fields["mode"]
         tables = self._find_tables()
-        running = 1
+
+        running = 1  # number of runs that have not ended
         while self._ticks < ticks and running:
             count = min(BLOCK_TICKS, ticks - self._ticks)
             self._keep_states(self._use_samples(self._ticks, count))
@@ -583,7 +639,10 @@ class LaneRun:
             self._ticks += count
 
     def _list_present(self) -> EndedRuns:
-        """Returns the present state of all runs, as `keep_ended_runs` reads it."""
+        """Returns the present state of all runs, as views.
+
+        `keep_ended_runs` copies the state of a run at the moment at which it ends.
+        """
         return EndedRuns(
             ticks=self._ended.ticks,
             site_rows=self._site,
@@ -597,13 +656,15 @@ class LaneRun:
         )
 
     def _keep_states(self, ticks: int) -> None:
-        """Makes room for the states of more ticks, if necessary.
+        """Enlarges the memory for past states of the sites (arm controllers), if necessary.
 
-        A sample that is older than the sample in use is never used any more. Therefore far
+        A site uses a past state of another site, its sample, because the network delays it.
+        Samples that are older than the sample in use are never used any more. Therefore far
         fewer states are needed than a link could delay.
 
         Args:
-            ticks: Number of ticks before the present one whose states are needed.
+            ticks: Number of ticks (control periods) before the present one for which the states
+                are needed.
         """
         while self._pages <= ticks:
             old_pages = self._pages
@@ -617,9 +678,11 @@ class LaneRun:
     def keep(self, chosen: Sequence[int]) -> None:
         """Continues with some of the runs only, so that no time is spent on the others.
 
+        A search, for example, drops runs that cannot be the best any more.
+
         Args:
-            chosen: Indices of the runs to keep in `runs`, in rising order. None of them may
-                have ended.
+            chosen: Indices in `runs` of the runs that continue, in ascending order. None of
+                them may have ended.
         """
         assert all(self._ended.ticks[lane] < 0 for lane in chosen)
         lanes = list(chosen)
@@ -636,7 +699,10 @@ class LaneRun:
         self.runs = [self.runs[lane] for lane in lanes]
 
     def _widen_peaks(self, buckets: int) -> None:
-        """Makes room for the peaks of more intervals of time. -1 marks an empty interval."""
+        """Enlarges the memory for the largest values in intervals of 50 ms (buckets).
+
+        -1 marks an interval in which no tick has been executed.
+        """
         wider = allocate_words(self._sites * buckets, self._layout.columns)
         peaks = wider.reshape(self._sites, buckets, self._layout.columns, LANES)
         peaks.view(np.float64)[:] = -1.0
@@ -644,13 +710,16 @@ class LaneRun:
         self._peaks = peaks
 
     def _write_records(self, lane: int, run: FusedRun, records: Array) -> None:
-        """Writes the latest records of a lane into its run.
+        """Copies the latest records of one lane into the object of its run.
+
+        A lane is the position of a run among the runs that are simulated together. The caller
+        reads the records from the run with `FusedRun.pop_records`.
 
         Args:
-            lane: The lane.
+            lane: Index of the lane.
             run: The run.
-            records: Records of all sites in the latest ticks of the lanes, shape (N, ticks,
-                floats).
+            records: Records of all N sites (arm controllers) in the latest ticks (control
+                periods), shape (N, ticks, floats).
         """
         sent = run.memory.sent
         ended_ticks = int(self._ended.ticks[lane])
@@ -658,16 +727,16 @@ class LaneRun:
         first = self._ticks - records.shape[1]
         ticks = np.arange(max(first, end - sent.t_ns.shape[1]), end)
         pages = ticks % sent.t_ns.shape[1]
-        # The equation of `tick_ns`.
+        # The nominal times of the ticks, by the equation of `tick_ns`.
         sent.t_ns[:, pages] = ticks * NS_PER_S // self._rate_hz
         sent.rows[:, pages] = records[:, ticks - first]
 
     def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
-        """Writes the numbers of a lane into its run.
+        """Copies the state of a run that was simulated with others into its `FusedRun` object.
 
         Args:
-            lane: The lane.
-            run: The run.
+            lane: Index (lane) of the run among the runs that are simulated together.
+            run: The object of the run.
             until_s: Planned end of the run, s.
         """
         memory = run.memory
@@ -725,7 +794,10 @@ def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the rows that belong to site i. Each site has the same number of rows."""
+    """Returns the part of an array that belongs to one site.
+
+    The array contains the rows of all sites one after another, equally many for each site.
+    """
     rows = len(table) // sites
     return table[i * rows : (i + 1) * rows]
 
@@ -750,12 +822,12 @@ def put_rows(rows: NDArray[Any], numbers: Words) -> None:
 
 
 def _write_progress(progress: Any, ticks: int, rate_hz: int) -> None:
-    """Writes how far the sites of a run are, after a number of ticks.
+    """Stores how far the sites of a run have been simulated: the number of ticks and the time.
 
     Args:
-        progress: Rows of all sites, see `ProgressRow`; written.
-        ticks: Number of ticks of each site.
-        rate_hz: Tick rate, Hz.
+        progress: Receives the progress of all sites (arm controllers), see `ProgressRow`.
+        ticks: Number of ticks (control periods) that each site has executed.
+        rate_hz: Tick rate of all sites, Hz.
     """
     parts = ticks * BUCKETS_PER_S
     progress["tick"] = ticks

@@ -70,18 +70,19 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Version of `torque_on_arm` for an arm without operators and environments."""
+    """Returns no torque: the version of `torque_on_arm` for an arm that nothing acts on."""
     return NO_TORQUE
 
 
 def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
-    """Returns a version of `torque_on_arm` for a fixed number of operators and environments.
+    """Returns a function that adds the torques of a fixed number of operators and environments.
 
-    Each of them has a kind that is known to the compiler. Therefore it is not selected by the
-    variable of a loop.
+    It replaces the loop in `torque_on_arm`. The compiler knows the kind of each operator and
+    environment only if its index is a constant and not the variable of a loop. Therefore the
+    loop is unrolled: the function for n of them calls that for n - 1.
 
     Args:
-        count: Number of operators and environments.
+        count: Number of operators and environments that act on the arm.
     """
     if count == 0:
         return _no_torque
@@ -105,7 +106,10 @@ def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
 
 
 def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]:
-    """Returns the version of `torque_on_arm` for the types of the arguments."""
+    """Returns the version of `torque_on_arm` for the number of operators and environments.
+
+    The compiler calls this function with the types of the arguments.
+    """
     actors = argument_types[4]
     return _unroll_sources(actors.count)
 
@@ -123,16 +127,18 @@ def _advance_stage(
     actors: Any,
     table: TorqueTable,
 ) -> Any:
-    """Evaluates a stage of the integrator, see `two_link_stages.advance_stage`.
+    """Evaluates one stage of the Runge-Kutta step of a planar arm in one of several runs.
+
+    It calls `two_link_stages.advance_stage` with the numbers of the run.
 
     Args:
         t_s: Time at the beginning of the period, s.
         ahead_s: Time of the stage after the beginning of the period, s.
-        s: Row of the site.
+        s: State of the site, the arm with its controller.
         qd_before: Joint velocities at the stage before, rad/s.
         qdd_before: Joint accelerations at the stage before, rad/s^2.
-        actors: Rows of its operators and environments.
-        table: Their tables.
+        actors: Rows of the operators and environments that act on the arm.
+        table: Tables of numbers to which these rows refer.
     """
     return two_link_stages.advance_stage(
         t_s=t_s,
@@ -404,12 +410,13 @@ def advance_site(
 class EndedRuns(NamedTuple):
     """States of runs that have ended, at the time at which one of their arms left its limits.
 
-    A run that has ended stays in its lane, and its later numbers have no meaning. N is the
-    number of sites, and the last axis of each array is the lane.
+    Several runs are simulated side by side, each in a lane. A run that has ended stays in its
+    lane, but its later numbers have no meaning. Therefore its last valid state is copied here.
+    N is the number of sites (arm controllers), and the last axis of each array is the lane.
 
     Attributes:
-        ticks: Number of ticks that each run has made, shape (LANES,). -1: the run has not
-            ended.
+        ticks: Number of ticks (control periods) that each run has made, shape (LANES,). -1 if
+            the run has not ended.
         site_rows: Rows of the sites, shape (N, words of a row, LANES).
         links: Rows of the links, shape (N P, words of a row, LANES). Only `LaneEpisodes` keeps
             them: in `keep_ended_runs` their copy makes all ticks slower by half.
@@ -434,12 +441,12 @@ class EndedRuns(NamedTuple):
 
 @leaf
 def copy_lane(lane: int, source: Words, target: Words) -> None:
-    """Copies all numbers of one run (lane) from one array to another.
+    """Copies all numbers of one run from one array of several runs to another.
 
     Args:
-        lane: The lane.
-        source: Numbers of all sites, shape (N, words, LANES).
-        target: Written.
+        lane: Index of the run (its lane).
+        source: Numbers of all sites in all runs, shape (N, numbers, LANES).
+        target: Receives the numbers of the run, in the same form.
     """
     for i in range(source.shape[0]):
         for word in range(source.shape[1]):

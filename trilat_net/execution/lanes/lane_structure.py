@@ -33,11 +33,13 @@ _ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
 class SiteStructure(NamedTuple):
     """Properties of one site that select its equations, such as the kind of its control law.
 
+    A site is a simulated arm with its controller. Sites with equal properties share code.
+
     Attributes:
-        constants: Constants of the site.
-        actors: Constants of each operator and environment, the operators first.
-        first_environment: Index of the first environment; -1: none.
-        law: Compiled law of the site.
+        constants: Values of the fields of the site that select equations, by name.
+        actors: The same for each operator and environment of the arm, the operators first.
+        first_environment: Index of the first environment. -1 if there is none.
+        law: Properties of a compiled control law.
     """
 
     constants: Constants
@@ -49,11 +51,13 @@ class SiteStructure(NamedTuple):
 class RunStructure(NamedTuple):
     """Properties of a run that select its equations. Runs with equal properties share code.
 
+    Runs that differ only in numbers, such as gains or delays, have equal structures.
+
     Attributes:
-        sites: Structure of each site.
-        peers: Number of peers of each site.
-        ramps: Number of rows of the tables of dominance factors.
-        table: Content of the table of the operators and environments.
+        sites: Structure of each site (arm controller).
+        peers: Number of other sites from which each site receives samples (sent states).
+        ramps: Largest number of planned changes of the dominance factors.
+        table: Shape and content of the table of numbers of the operators and environments.
         duration_s: Duration of the scenario, s.
         settled_rad: Position error below which an arm counts as settled, rad.
     """
@@ -80,9 +84,9 @@ def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
     """Returns why a run cannot be computed together with other runs, for a message to the user.
 
     Args:
-        run: The run before its first tick.
-        hand_site: Index of a site whose live operator the caller replaces, because it knows the
-            actions of this operator. -1: there is none.
+        run: The run before its first tick (control period).
+        hand_site: Index of a site (arm controller) whose live operator the caller replaces,
+            because it knows the actions of this operator. -1: there is none.
 
     Returns:
         The property of the run that lanes do not support. Empty if there is none.
@@ -99,6 +103,7 @@ def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
         return "control laws in plain Python"
     if run.programmed_sites - {hand_site}:
         return "programs that move an arm"
+
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
     # Live operators whom no program replaces do nothing.
     if hand_site < 0 and kinds.intersection(LIVE_KINDS):
@@ -116,7 +121,7 @@ def _find_obstacle_of_chains(tables: SiteArrays) -> str:
     """Explains why runs with chains of joints cannot be computed together.
 
     Args:
-        tables: Arrays of all sites of a run.
+        tables: Arrays of all sites (arm controllers) of a run.
     """
     if tables.channel is not None:
         return "compiled laws of arms that are chains of joints"
@@ -132,6 +137,8 @@ def _find_obstacle_of_chains(tables: SiteArrays) -> str:
 
 def find_structure(run: FusedRun) -> RunStructure:
     """Returns the properties of a run that decide with which other runs it can be computed.
+
+    For example, two runs with the same control laws but different gains have the same result.
 
     Args:
         run: The run. There must be no obstacle, see `find_obstacle`.

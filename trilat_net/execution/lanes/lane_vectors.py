@@ -117,7 +117,15 @@ def _is_number(numba_type: Any) -> bool:
 
 
 def _define_binary(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
-    """Tells Numba how to compute an operation such as `+` on one or two vectors."""
+    """Tells Numba how to compute an operation such as `a + b` with vectors of eight numbers.
+
+    One of the operands may be a single number, which is then used for all eight.
+
+    Args:
+        function: The operation as a function, such as `operator.add`.
+        result: Type of the result.
+        generate: Function that appends the LLVM instruction.
+    """
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -203,7 +211,13 @@ _define_unary(np.floor, _call_llvm("llvm.floor"))
 
 
 def _define_integers(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
-    """Tells Numba how to compute an operation on a vector of integers and an integer."""
+    """Tells Numba how to compute an operation on a vector of eight integers and an integer.
+
+    Args:
+        function: The operation as a function, such as `operator.eq`.
+        result: Type of the result.
+        generate: Function that appends the LLVM instruction.
+    """
 
     @infer_global(function)
     class _Template(AbstractTemplate):
@@ -252,12 +266,12 @@ truncate_vector: Any = _truncate
 
 
 def _choose_vector(condition: Any, if_true: Any, if_false: Any) -> Any:
-    """Version of `choose` for vectors."""
+    """Chooses between two vectors by eight conditions: `choose` for eight runs at once."""
     return select_vector(condition, if_true, if_false)
 
 
 def _whole_vector(number: Any) -> Any:
-    """Version of `whole` for vectors."""
+    """Converts eight floats to integers: `whole` for eight runs at once."""
     return truncate_vector(number)
 
 
@@ -265,7 +279,7 @@ set_lane_form(choose, lambda _types: _choose_vector)
 
 
 def _round_vector_down(number: Any) -> Any:
-    """Version of `round_down` for vectors."""
+    """Rounds eight floats down: `round_down` for eight runs at once."""
     return np.floor(number)
 
 
@@ -358,7 +372,19 @@ def _find_numbers(builder: Any, pointer: Any, field: LaneField) -> Any:
 
 @lower_getattr_generic(RowInGroup)
 def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name: str) -> Any:
-    """Generates LLVM code for reading `row.field`: a constant, a vector or an array."""
+    """Generates LLVM code for reading `row.field` of a row in eight lanes (runs) at once.
+
+    Numba calls this function when it compiles such an expression. The result is a constant if
+    the field is equal in all lanes, a vector of eight numbers if the field is a single number,
+    and otherwise an array of such vectors.
+
+    Args:
+        context: Numba's context of the compilation.
+        builder: Appends LLVM instructions.
+        row_type: Numba's type of the row.
+        row: The row, as an LLVM value.
+        name: Name of the field.
+    """
     constant = row_type.find_constant(name)
     if constant is not None:
         return context.get_constant(types.int64, constant)
@@ -430,7 +456,7 @@ def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @intrinsic
 def _in_group(_context: Any, table: Any, _group: Any) -> Any:
-    """Generates LLVM code for the rows of an array that belong to eight adjacent lanes."""
+    """Generates LLVM code for the rows of eight adjacent runs (lanes) in a common array."""
     assert isinstance(table, LaneTable)
     rows_type = RowsInGroup(table, table.constants)
 

@@ -36,10 +36,12 @@ class RunGroup:
 
     Args:
         members: Indices of the runs in the sequence that was divided into groups.
-        runs: The runs before their first tick.
-        in_lanes: True to compute them in lanes. They must have the same structure.
-        obstacle: Property because of which the runs cannot be computed in lanes, or empty.
-        record_rows: Number of latest records of each site that lanes keep, a power of two.
+        runs: The runs before their first tick (control period).
+        in_lanes: True to compute them together, each in a lane of the vector registers. They
+            must have the same structure.
+        obstacle: Property because of which the runs cannot be computed together, or empty.
+        record_rows: Number of latest records of each site (arm controller) that are kept, a
+            power of two.
 
     Attributes:
         members: Indices of the runs that are left in the group.
@@ -82,8 +84,8 @@ class RunGroup:
         """Continues with some of the runs only, so that no time is spent on the others.
 
         Args:
-            chosen: Places in `members` of the runs to keep, in rising order. No arm of these
-                runs may have left its limits.
+            chosen: Indices in `members` of the runs that continue, in ascending order. No arm
+                of these runs may have left its limits.
         """
         if self._lanes is not None:
             self._lanes.keep(chosen)
@@ -96,12 +98,14 @@ def prepare_lanes(
 ) -> bool:
     """Decides whether a study computes its runs together, and compiles the code in this case.
 
-    Lanes are used if the runs are long enough for the compilation, or if the code exists.
+    Runs are computed together, with vector instructions, if the code exists already, or if they
+    are so long that compiling it pays off.
 
     Args:
         scenario: Scenario of one of the runs.
         runs: Number of runs with this structure.
-        least_site_ticks: Number of site ticks from which the code is worth its compilation.
+        least_site_ticks: Number of simulated ticks (control periods), summed over all sites
+            (arm controllers) and runs, from which compiling the code pays off.
     """
     rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
     site_ticks = runs * scenario.duration_s * sum(rates_hz)
@@ -122,9 +126,9 @@ def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGr
     be computed alone gets a group of its own.
 
     Args:
-        runs: The runs before their first tick.
+        runs: The runs before their first tick (control period).
         record_rows: Number of ticks, a power of two, of which `FusedRun.pop_records` must find
-            the records after each call of `RunGroup.advance_to`.
+            the records (results of control periods) after each call of `RunGroup.advance_to`.
 
     Yields:
         The groups, each when the work on the previous one has ended.
@@ -136,6 +140,8 @@ def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGr
             yield RunGroup([index], [run], in_lanes=False, obstacle=obstacle)
         else:
             groups.setdefault(find_structure(run), []).append(index)
+
+    # A group has at most as many runs as the vector code has lanes.
     for indices in groups.values():
         for first in range(0, len(indices), LANES):
             members = indices[first : first + LANES]

@@ -26,24 +26,26 @@ from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
-    """Error if a run and its twins cannot continue in lanes.
+    """Error if a run and its displaced copies (twins) cannot be simulated together any more.
 
-    An arm left its limits, or a control law failed. The caller then repeats the runs one by
-    one.
+    The reason is that an arm left its limits, or that a control law failed. The caller then
+    simulates the runs again, one by one.
     """
 
 
 def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> bool:
     """Returns True if a run and its twins are computed faster together than one by one.
 
-    This requires that lanes support the run, and that the runs are long enough for the
-    compilation of the code, unless the code exists.
+    The twins are copies of the run that start slightly displaced. Computing them together, with
+    vector instructions, has two conditions: all features of the scenario are supported; and the
+    compiled code exists, or the runs are so long that compiling it pays off.
 
     Args:
-        run: The run before its first tick.
+        run: The run before its first tick (control period).
         runs: Number of runs, the twins included.
-        ticks: Number of ticks of each site.
-        least_site_ticks: Number of site ticks for which the code is worth its compilation.
+        ticks: Number of ticks of each site (arm controller).
+        least_site_ticks: Number of simulated ticks, summed over all sites and runs, from which
+            compiling the code pays off.
     """
     if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
         return False
@@ -55,9 +57,10 @@ class TwinLanes(LaneRun):
     """A run and its twins (slightly displaced copies), each in a lane. The run is in lane 0.
 
     Args:
-        run: The run before its first tick, which does not advance. See `suits_twins`.
+        run: The run before its first tick (control period), which does not advance. See
+            `suits_twins`.
         count: Number of runs, the twins included.
-        ticks: Number of ticks of each site in the whole run.
+        ticks: Number of ticks of each site (arm controller) in the whole run.
         feed: Inputs of a recorded run that is repeated.
         kept: Number of records of each site that are kept between two calls of `step_to`.
     """
@@ -84,7 +87,7 @@ class TwinLanes(LaneRun):
         self._changing = floats
 
     def step_to(self, last_ns: int) -> None:
-        """Executes all planned ticks of the run and its twins up to a time.
+        """Executes all planned ticks (control periods) of the run and its twins up to a time.
 
         Args:
             last_ns: Time of the last tick to be executed, ns since the epoch.
@@ -102,7 +105,19 @@ class TwinLanes(LaneRun):
             raise LaneEndedError
 
     def _use_samples(self, first: int, count: int) -> int:
-        """Computes which samples the runs use in a block of ticks: all use the same."""
+        """Determines which samples (states of other sites) the sites use in a block of ticks.
+
+        A run and its twins use the same samples in the same ticks (control periods). Therefore
+        the samples are determined for the run, either from the simulated network or from the
+        arrivals of a log, and copied for the twins.
+
+        Args:
+            first: First tick of the block.
+            count: Number of ticks.
+
+        Returns:
+            The largest age of a sample in use, in ticks.
+        """
         if self._feed.first.shape[2] == 0:
             age = super()._use_samples(first, count)
         else:
@@ -121,7 +136,7 @@ class TwinLanes(LaneRun):
                 state=self._states[0, 0, 0],
                 used=self._used,
             )
-        # Whole vector registers.
+        # The number of runs is rounded up to whole vector registers of eight numbers.
         lanes = -(-self._count // 8) * 8
         self._used[:, :, 1:lanes] = self._used[:, :, :1]
         return age
@@ -132,12 +147,13 @@ class TwinLanes(LaneRun):
         return np.arange(self._last_ticks, self._ticks) * NS_PER_S // self._rate_hz
 
     def read_records(self, i: int, columns: slice, runs: slice) -> Array:
-        """Returns numbers of the records of the last call of `step_to`.
+        """Returns numbers of the ticks that the last call of `step_to` executed.
 
         Args:
-            i: Index of the site.
-            columns: Columns of the records, see `Layout.columns`.
-            runs: The runs.
+            i: Index of the site (arm controller).
+            columns: Which numbers of a tick's record (result of a control period), see
+                `Layout.columns`.
+            runs: Which runs. Run 0 is the run itself, the others are its twins.
 
         Returns:
             The numbers, shape (ticks, columns, runs).
@@ -169,10 +185,11 @@ class LaneTwin:
     def scale_difference(self, other: "LaneTwin", factor: float) -> None:
         """Multiplies the difference between the states of this run and another run by a factor.
 
-        See `FusedRun.scale_difference`.
+        Every floating-point number x of the state becomes x_other + factor (x - x_other), as in
+        `FusedRun.scale_difference`. This includes the states that are in transit.
 
         Args:
-            other: The other run in the lanes.
+            other: The other run that is simulated together with this one.
             factor: The factor.
         """
         lanes = self._lanes
@@ -203,12 +220,15 @@ class LaneTwin:
 
 
 def _scale(mine: Words, others: Words, is_float: NDArray[np.bool_], factor: float) -> None:
-    """Multiplies the differences between numbers of two runs by a factor.
+    """Moves the numbers of one run closer to those of another run, or away from them.
+
+    Every floating-point number x becomes x_other + factor (x - x_other). All other numbers are
+    copied from the other run.
 
     Args:
-        mine: Numbers of a run, as words; changed.
+        mine: Numbers of the run that is changed, as integers with the same bits.
         others: The same numbers of the other run.
-        is_float: Which of them are floating-point numbers. All others are copied.
+        is_float: True for the floating-point numbers.
         factor: The factor.
     """
     bits = mine.copy()

@@ -41,19 +41,19 @@ AT_UNKNOWN = 2
 class MessageRun(NamedTuple):
     """The messages that one pass over a chunk found, and counts for each channel.
 
-    A slot is a small number that stands for a channel. The arrays have one entry per message,
-    or one entry per slot.
+    A chunk is an unpacked block of messages. A slot is a small number that stands for a
+    channel. The arrays have one entry per message, or one entry per slot.
 
     Attributes:
         slots: Slot of each message's channel.
-        begins: Place of the payload's first byte in the chunk.
-        ends: Place after its last byte.
+        begins: Offset of the payload's first byte in the chunk.
+        ends: Offset after its last byte.
         log_ns: Time of arrival at the recorder, in Unix time, in ns, as a signed number.
         publish_ns: Time of sending, in the same form.
         counts: Number of messages, per slot.
         lengths: Sum of the lengths of the messages with their heads, per slot, in bytes.
         excess: Sum of the lengths beyond a limit, per slot, in bytes.
-        firsts: Number of the first message, per slot with messages.
+        firsts: Index of the first message, per slot with messages.
     """
 
     slots: NDArray[np.int32]
@@ -68,10 +68,10 @@ class MessageRun(NamedTuple):
 
 
 def allocate_run(slots: int, messages: int = 1) -> MessageRun:
-    """Returns arrays for the messages of one walk.
+    """Returns empty arrays for the messages that one call of `walk_messages` finds.
 
     Args:
-        slots: Number of slots.
+        slots: Number of slots, the small numbers that stand for channels.
         messages: Largest number of messages.
     """
     places = [np.zeros(messages, np.int64) for _ in range(4)]
@@ -83,10 +83,10 @@ def allocate_run(slots: int, messages: int = 1) -> MessageRun:
 def walk_messages(
     data: Bytes, offset: int, slot_of_channel: NDArray[np.int32], long_bytes: int, run: Any
 ) -> tuple[int, int, int]:
-    """Finds the messages in an unpacked chunk, beginning at an offset.
+    """Finds the messages in an unpacked chunk (block of messages), beginning at an offset.
 
-    It runs as compiled code, and stops at the first record that is neither a message of a known
-    channel nor a record to ignore, and after `CAPACITY` messages.
+    This compiled code stops at the first record that is neither a message of a known channel
+    nor a record to ignore, and after `CAPACITY` messages.
 
     Args:
         data: The unpacked chunk.
@@ -96,8 +96,8 @@ def walk_messages(
         run: `MessageRun` that receives the messages. Its sums are increased.
 
     Returns:
-        The number of messages, the place of the next record, and the reason why the walk
-        ended.
+        The number of messages, the offset of the next record, and the reason for stopping:
+        `WALKED`, `AT_DEFINITION` or `AT_UNKNOWN`.
     """
     size = data.shape[0]
     count = 0
@@ -146,14 +146,16 @@ def copy_payloads(
 ) -> None:
     """Collects the payloads of one channel from a chunk, one after another.
 
+    A chunk contains messages of all channels in the order of their arrival.
+
     Args:
         data: The unpacked chunk.
-        count: Number of messages that the walk found.
-        slot: Slot of the channel.
-        run: The messages that the walk found.
+        count: Number of messages that `walk_messages` found.
+        slot: Small number that stands for the channel.
+        run: The messages that `walk_messages` found, a `MessageRun`.
         payloads: Receives the payloads one after another.
-        offset: Offset of the first byte in `payloads`.
-        ends: Receives the place after each payload in `payloads`.
+        offset: Offset in `payloads` at which the first payload begins.
+        ends: Receives the offset after each payload in `payloads`, shape (messages,).
         times: Receives the times of arrival and of sending, shape (2, messages).
     """
     number = 0

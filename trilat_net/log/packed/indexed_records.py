@@ -48,15 +48,15 @@ class IndexedRecords:
 
     Args:
         messages: The encoded records.
-        peers: Names of the site's peers.
+        peers: Names of the site's peers (other sites).
         layout: Lengths of the vectors of a record.
-        exact: The exact layout.
+        exact: The constant bytes between the values of a record.
         heads: Tick, boot and mode of each record, shape (K, 3).
-        marks: Places of values in each record, shape (K, MARKS).
-        counts: Lengths of lists in each record, shape (K, COUNTS).
+        marks: Offsets of values in each record, see `record_scan.MARKS`, shape (K, MARKS).
+        counts: Lengths of lists in each record, see `record_scan.COUNTS`, shape (K, COUNTS).
 
     Attributes:
-        messages: See above.
+        messages: The encoded records.
     """
 
     def __init__(
@@ -103,17 +103,20 @@ class IndexedRecords:
 
     @property
     def boots(self) -> Ints:
-        """Boot of each record, shape (K,), as a signed number with the same bits."""
+        """Number that identifies the start of the process (boot) in each record, shape (K,).
+
+        It is an unsigned number of 64 bits, given as the signed number with the same bits.
+        """
         return self._heads[:, _BOOT]
 
     @property
     def mode_codes(self) -> Ints:
-        """Number of the mode in each record, shape (K,), see `Mode`."""
+        """Number of the operating mode in each record, shape (K,), see `Mode`."""
         return self._heads[:, _MODE]
 
     @property
     def modes(self) -> NDArray[np.object_]:
-        """Name of the mode in each record, shape (K,)."""
+        """Name of the operating mode in each record, such as "run", shape (K,)."""
         bits = np.empty(max(map(int, MODE_WORDS)) + 1, np.object_)
         for mode, word in MODE_WORDS.items():
             bits[int(mode)] = word
@@ -130,11 +133,15 @@ class IndexedRecords:
         return np.ascontiguousarray(self._gather_ints(mark, gaps)[:, -1])
 
     def has_ints(self, field: str) -> bool:
-        """True if `ints` returns a field."""
+        """True if a field of the records is an integer that `ints` can read."""
         return field in _INTS
 
     def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
-        """Returns integers that follow a mark, shape (K, number of gaps)."""
+        """Returns integers that follow a position (mark) in each record.
+
+        The result has the shape (K, number of gaps). A gap is the number of bytes before an
+        integer.
+        """
         numbers = np.zeros((len(self), len(gaps)), np.int64)
         record_scan.gather_ints(
             self.messages.data,
@@ -147,7 +154,11 @@ class IndexedRecords:
 
     @property
     def used(self) -> Ints:
-        """Tick of the sample of each peer that was in use, shape (K, P) for P peers."""
+        """Which sample of each peer the control law used in each tick, shape (K, P).
+
+        A peer is another site, and a sample is the state that it sent in one tick. The number
+        of that tick is given for each of P peers, or -1 before the first sample.
+        """
         peers = self._exact.peers
         lengths = self._exact.lengths
         return self._gather_ints(record_scan.USED, lengths[len(lengths) - peers :].tolist())
@@ -155,31 +166,43 @@ class IndexedRecords:
     def vector_words(self, fields: Sequence[str]) -> Ints:
         """Returns the bits of all numbers of some vectors, shape (K, numbers).
 
+        Bits are returned because equal bits mean equal numbers, also for NaN and signed zeros.
+        Compiled code reads the numbers at fixed distances after a position in each record, the
+        mark. The vectors lie after one of two marks. Therefore the numbers are read in up to
+        two groups.
+
         Args:
             fields: Names of the vectors. The records must have all of them.
         """
-        groups: dict[int, list[int]] = {record_scan.VECTORS: [], record_scan.OPTIONAL: []}
+        offsets: dict[int, list[int]] = {record_scan.VECTORS: [], record_scan.OPTIONAL: []}
         columns: dict[int, list[int]] = {record_scan.VECTORS: [], record_scan.OPTIONAL: []}
         places = self._vector_places()
-        width = 0
+        column_count = 0
         for field in fields:
-            mark, first, count = places[field]
-            groups[mark] += range(first, first + count * NUMBER_BYTES, NUMBER_BYTES)
-            columns[mark] += range(width, width + count)
-            width += count
-        parts = {
-            mark: self._gather_floats(mark, group) for mark, group in groups.items() if group
+            mark, first_offset, count = places[field]
+            end_offset = first_offset + count * NUMBER_BYTES
+            offsets[mark] += range(first_offset, end_offset, NUMBER_BYTES)
+            columns[mark] += range(column_count, column_count + count)
+            column_count += count
+
+        bits_by_mark = {
+            mark: self._gather_floats(mark, mark_offsets)
+            for mark, mark_offsets in offsets.items()
+            if mark_offsets
         }
-        if len(parts) == 1:
-            [only] = parts.values()
-            return only
-        bits = np.zeros((len(self), width), np.int64)
-        for mark, part in parts.items():
-            bits[:, columns[mark]] = part
+        if len(bits_by_mark) == 1:
+            [all_bits] = bits_by_mark.values()
+            return all_bits  # spares a copy
+        bits = np.zeros((len(self), column_count), np.int64)
+        for mark, mark_bits in bits_by_mark.items():
+            bits[:, columns[mark]] = mark_bits
         return bits
 
     def _gather_floats(self, mark: int, places: Sequence[int]) -> Ints:
-        """Returns the bits of numbers at fixed places after a mark, shape (K, numbers)."""
+        """Returns the bits of numbers at fixed offsets from a position (mark) in each record.
+
+        The result has the shape (K, count of offsets).
+        """
         bits = np.zeros((len(self), len(places)), np.int64)
         record_scan.gather_floats(
             self.messages.data,
@@ -191,7 +214,12 @@ class IndexedRecords:
         return bits
 
     def _vector_places(self) -> dict[str, tuple[int, int, int]]:
-        """Returns the mark, the place after the mark, and the length of each vector."""
+        """Returns where the vectors lie in a record, by their names.
+
+        Returns:
+            For each vector: the column of `marks` with the position from which its offset
+            counts, the offset of its first number in bytes, and its length in numbers.
+        """
         exact = self._exact
         names = list(self._layout.lengths())
         first_optional = len(exact.vectors)
@@ -200,9 +228,10 @@ class IndexedRecords:
         offset = 0
         for n, (name, count) in enumerate(zip(names, counts, strict=True)):
             if n == first_optional:
-                offset = 0
+                offset = 0  # the optional vectors have a mark of their own
             mark = record_scan.VECTORS if n < first_optional else record_scan.OPTIONAL
-            offset += int(exact.lengths[FIRST_VECTOR + n])
+            name_bytes = int(exact.lengths[FIRST_VECTOR + n])  # the name and the list's head
+            offset += name_bytes
             places[name] = (mark, offset, count)
             offset += count * NUMBER_BYTES
         return places
@@ -228,7 +257,11 @@ class IndexedRecords:
 
     @property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Number of arrivals of each record, shape (K,), and all N arrivals, shape (N, 3)."""
+        """Which samples (states of other sites) arrived in each tick (control period).
+
+        The first array has the number of arrivals of each record, shape (K,). The second one
+        has all N arrivals in order: sender, tick of the sample and delay in us, shape (N, 3).
+        """
         counts = self._counts[:, record_scan.ARRIVAL_COUNT].astype(np.int64)
         numbers = np.zeros((int(counts.sum()), 3), np.int64)
         record_scan.gather_stamps(
@@ -247,7 +280,11 @@ class IndexedRecords:
 
     @property
     def memory_words(self) -> tuple[Ints, Ints]:
-        """Length of the field `mem` in each record, shape (K,), and the bits of all numbers."""
+        """Internal state of the control law (field `mem`) in each record.
+
+        The first array has the count of numbers of each record, shape (K,). The second one has
+        the bits of the numbers of all records, one after another.
+        """
         counts = self._counts[:, record_scan.MEMORY_COUNT].astype(np.int64)
         bits = np.zeros(int(counts.sum()), np.int64)
         record_scan.gather_memories(
@@ -275,7 +312,9 @@ class IndexedRecords:
 def index_records(
     payloads: PackedMessages, site: str, peers: Sequence[str], layout: Layout
 ) -> IndexedRecords | None:
-    """Finds the places of the values in records that have the exact layout.
+    """Prepares records for reading their fields without decoding them one by one.
+
+    This is possible only if all of them have the exact layout that this program writes.
 
     Args:
         payloads: The encoded records.

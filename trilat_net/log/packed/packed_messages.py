@@ -53,8 +53,9 @@ class PackedMessages(Sequence[bytes]):
         if isinstance(payloads, PackedMessages):
             return payloads
         data = np.frombuffer(b"".join([*payloads, bytes(PADDING)]), np.uint8)
-        ends = np.cumsum(np.fromiter(map(len, payloads), np.int64, len(payloads)))
-        starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(payloads)]
+        lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+        ends = np.cumsum(lengths)
+        starts = ends - lengths
         return cls(data, starts, ends)
 
     def select(self, rows: Ints | slice) -> "PackedMessages":

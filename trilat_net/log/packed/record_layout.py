@@ -45,7 +45,7 @@ class RecordLayout(NamedTuple):
             follows literal `FIRST_VECTOR` + n.
         optional_vectors: Length of each vector after the field `echo`, shape (O,). Their
             literals follow those of the other vectors.
-        peers: Number of peers. Their literals come last.
+        peers: Number of peers (other sites). Their literals come last.
         modes: Words of the names of the modes, shape (M, 2): the name, and its mask.
         mode_codes: Number of each mode, shape (M,).
     """
@@ -62,12 +62,12 @@ class RecordLayout(NamedTuple):
 
 
 def _array_head(length: int) -> bytes:
-    """Returns the head of an encoded list: all of its bytes but those of the items."""
+    """Returns the bytes with which an encoded list (MessagePack) of a given length begins."""
     return _encode([None] * length)[:-length] if length else _encode([])
 
 
 def _map_head(length: int) -> bytes:
-    """Returns the head of an encoded map."""
+    """Returns the bytes with which an encoded map (MessagePack) of a given length begins."""
     pair_bytes = len(_encode("00")) + len(_encode(None))
     encoded = _encode({f"{n:02}": None for n in range(length)})
     return encoded[: len(encoded) - length * pair_bytes]

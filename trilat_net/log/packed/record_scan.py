@@ -76,12 +76,18 @@ _SIZES = _list_sizes()
 
 @leaf
 def _read_int(data: Bytes, offset: int) -> int:
-    """Returns the encoded integer at a place. One of 2^63 or more has the sign changed."""
+    """Decodes the integer (MessagePack) that begins at an offset.
+
+    The result is a signed number of 64 bits. An unsigned number of 2^63 or more becomes the
+    negative number with the same bits.
+    """
     first = int(data[offset])
-    if first < _SHORT_MAP:
+    if first < _SHORT_MAP:  # a small number, which is its own code
         return first
-    if first >= _NEGATIVE:
+    if first >= _NEGATIVE:  # a small negative number, from -32 on
         return first - 256
+    # The number follows the first byte, with the most significant byte first. Eight bytes are
+    # loaded, of which the last ones may belong to the next value.
     unused_bits = 72 - 8 * _SIZES[first]
     word = load_big(data, offset + 1)
     value: int = word >> unused_bits
@@ -92,7 +98,10 @@ def _read_int(data: Bytes, offset: int) -> int:
 
 @leaf
 def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the place after a literal. -1 if the record has other bytes there."""
+    """Returns the offset after a literal, the constant bytes between two values of a record.
+
+    The result is -1 if the record has other bytes there.
+    """
     after: int = offset + layout.lengths[literal]
     if after > end:
         return _NOT_ACCEPTED
@@ -106,7 +115,18 @@ def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any
 
 @leaf
 def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the place of the integer after a literal. -1 if there is no whole integer."""
+    """Returns the offset of the integer that follows some constant bytes (a literal).
+
+    Args:
+        data: The records.
+        offset: Offset at which the literal must begin.
+        end: Offset after the record.
+        literal: Index of the literal in `layout`.
+        layout: The exact layout of the records, a `RecordLayout`.
+
+    Returns:
+        The offset. -1 if the record has other bytes there, or no complete integer.
+    """
     offset = _after_literal(data, offset, end, literal, layout)
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED
@@ -121,7 +141,7 @@ def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) ->
 
 @leaf
 def _list_count(data: Bytes, offset: int, end: int) -> int:
-    """Returns the number of items of the list at a place. -1 if there is no list."""
+    """Returns the number of items of the list that begins at an offset. -1 if there is none."""
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED
     first = int(data[offset])
@@ -134,13 +154,13 @@ def _list_count(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _list_head_bytes(data: Bytes, offset: int) -> int:
-    """Returns the length of the head of the list at a place."""
+    """Returns the length in bytes of the head of the list that begins at an offset."""
     return 3 if data[offset] == _LIST_16 else 1
 
 
 @leaf
 def _after_floats(data: Bytes, offset: int, end: int, count: int) -> int:
-    """Returns the place after some finite floating-point numbers. -1 if there are others."""
+    """Returns the offset after some floating-point numbers. -1 if one of them is not finite."""
     after = offset + NUMBER_BYTES * count
     if after > end:
         return _NOT_ACCEPTED
@@ -156,7 +176,7 @@ def _after_floats(data: Bytes, offset: int, end: int, count: int) -> int:
 def _after_vectors(
     data: Bytes, offset: int, end: int, first: int, vectors: Ints, layout: Any
 ) -> int:
-    """Returns the place after some vectors with their literals. -1 if they are not there."""
+    """Returns the offset after some vectors with their names. -1 if they are not all there."""
     for n in range(vectors.shape[0]):
         offset = _after_literal(data, offset, end, first + n, layout)
         if offset >= 0:
@@ -168,12 +188,17 @@ def _after_vectors(
 
 @leaf
 def _after_stamps(data: Bytes, offset: int, end: int) -> int:
-    """Returns the place after a list of arrivals. -1 if there is no such list."""
+    """Returns the offset after a list of arrivals: entries of three integers each.
+
+    An entry states which sample of another arm arrived, and when. The result is -1 if there is
+    no such list, or if a number is too large to be a time.
+    """
     count = _list_count(data, offset, end)
     if count < 0:
         return _NOT_ACCEPTED
     offset += _list_head_bytes(data, offset)
     for _ in range(count):
+        # An entry is a list of three items.
         if offset >= end or data[offset] != _SHORT_LIST + 3:
             return _NOT_ACCEPTED
         offset += 1
@@ -193,7 +218,11 @@ def _after_stamps(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _after_texts(data: Bytes, offset: int, end: int) -> int:
-    """Returns the place after a list of texts in ASCII. -1 if there is no such list."""
+    """Returns the offset after a list of texts in ASCII, such as the changes of a record.
+
+    The result is -1 if there is no such list. Other characters than ASCII are left to the
+    general decoder, which checks their encoding.
+    """
     count = _list_count(data, offset, end)
     if count < 0:
         return _NOT_ACCEPTED
@@ -201,6 +230,7 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
     for _ in range(count):
         if offset >= end:
             return _NOT_ACCEPTED
+        # The head of a text contains its length, in 1, 2 or 3 bytes.
         first = int(data[offset])
         if _SHORT_TEXT <= first < _FIRST_WORD:
             length = first - _SHORT_TEXT
@@ -216,7 +246,7 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
         if offset + length > end:
             return _NOT_ACCEPTED
         for n in range(length):
-            if data[offset + n] >= _SHORT_MAP:
+            if data[offset + n] >= _SHORT_MAP:  # not ASCII
                 return _NOT_ACCEPTED
         offset += length
     return offset
@@ -224,7 +254,10 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
-    """Returns the index of the mode whose name is at a place. -1 if there is none."""
+    """Returns the index of the operating mode whose name begins at an offset. -1 for no mode.
+
+    A name has at most eight letters. It is compared with all names as one integer.
+    """
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED
     length = int(data[offset]) - _SHORT_TEXT
@@ -241,7 +274,7 @@ def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
 
 @leaf
 def _mask_bytes(mask: int) -> int:
-    """Returns the number of bytes that a mask selects, from the least byte on."""
+    """Returns the number of bytes that a mask selects, from the least significant one on."""
     count = 0
     while count < 8 and (mask >> (8 * count)) & 1:
         count += 1
@@ -252,7 +285,13 @@ def _mask_bytes(mask: int) -> int:
 def _scan_record(
     data: Bytes, start: int, end: int, layout: Any, heads: Ints, marks: Any, counts: Any
 ) -> bool:
-    """Checks one record, and finds the places of its values, see `scan_records`."""
+    """Checks that one record has the exact layout, and finds where its values lie.
+
+    The arguments are those of `scan_records`, for one record from `start` to before `end`.
+
+    Returns:
+        True if the record is accepted.
+    """
     offset = _after_literal(data, start, end, BEFORE_BOOT, layout)
     if offset < 0 or offset >= end:
         return False
@@ -352,15 +391,20 @@ def scan_records(
 ) -> int:
     """Checks that each record has the exact layout, and finds where its values lie.
 
+    A record is the encoded state of an arm in one period of its control loop (tick). With the
+    offsets that this function finds, a field of all records can be read without decoding.
+
     Args:
         data: The records, followed by padding.
-        starts: Place of the first byte of each of the K records, shape (K,).
-        ends: Place after the last byte of each record, shape (K,).
+        starts: Offset of the first byte of each of the K records, shape (K,).
+        ends: Offset after the last byte of each record, shape (K,).
         layout: The exact layout of the records, a `RecordLayout`.
-        heads: Receives the tick, the boot and the number of the mode of each record, shape
-            (K, 3). A boot of 2^63 or more is stored as the signed number with the same bits.
-        marks: Receives the places of values, see `MARKS`, shape (K, MARKS).
-        counts: Receives the lengths of lists, see `COUNTS`, shape (K, COUNTS).
+        heads: Receives the tick, the boot (identifier of the process) and the number of the
+            operating mode of each record, shape (K, 3). A boot of 2^63 or more is stored as the
+            signed number with the same bits.
+        marks: Receives the offsets of values (TIME, ...) from the start of each record,
+            shape (K, MARKS).
+        counts: Receives the lengths of lists (ARRIVAL_COUNT, ...), shape (K, COUNTS).
 
     Returns:
         The number of records before the first one that is not accepted.
@@ -378,13 +422,14 @@ def scan_records(
 
 @loop_leaf
 def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints) -> None:
-    """Reads integers that follow each other in each record.
+    """Reads some integers that follow each other, such as the used samples, from each record.
 
     Args:
-        data: The records, followed by padding.
-        starts: Place of the first byte of each record, shape (K,).
-        marks: Place before the first number from the start of a record, shape (K,).
-        gaps: Number of bytes before each of the N numbers, shape (N,).
+        data: The encoded records, followed by padding.
+        starts: Offset of the first byte of each of the K records, shape (K,).
+        marks: Offset at which the search for the numbers begins, from the start of each record,
+            shape (K,).
+        gaps: Number of other bytes before each of the N numbers, shape (N,).
         numbers: Receives the numbers, shape (K, N).
     """
     for k in range(starts.shape[0]):
@@ -397,40 +442,42 @@ def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints
 
 @loop_leaf
 def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Ints) -> None:
-    """Reads floating-point numbers, as their bits, from every record.
+    """Reads some floating-point numbers, as their bits, from each record.
 
-    The numbers lie at fixed distances after a position in each record, the mark.
+    Vectors have fixed lengths, so that their numbers lie at fixed distances after a position in
+    each record, the mark.
 
     Args:
-        data: The records, followed by padding.
-        starts: Place of the first byte of each record, shape (K,).
-        marks: Place of the mark from the start of a record, shape (K,).
-        places: Place of each of the N numbers after the mark, shape (N,).
+        data: The encoded records, followed by padding.
+        starts: Offset of the first byte of each of the K records, shape (K,).
+        marks: Offset of the mark from the start of each record, shape (K,).
+        places: Offset of each of the N numbers from the mark, shape (N,).
         bits: Receives the bits of the numbers, shape (K, N).
     """
     for k in range(starts.shape[0]):
-        offset = starts[k] + marks[k] + 1
+        offset = starts[k] + marks[k] + 1  # the first byte of a number states its type
         for n in range(places.shape[0]):
             bits[k, n] = load_big(data, offset + places[n])
 
 
 @loop_leaf
 def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
-    """Reads which samples of other arms arrived, and when, from every record.
+    """Reads which samples (states of other arms) arrived, and when, from every record.
 
     Args:
-        data: The records, followed by padding.
-        starts: Place of the first byte of each record, shape (K,).
-        marks: Place of the list of arrivals from the start of a record, shape (K,).
-        counts: Number of arrivals of each record, shape (K,).
-        numbers: Receives the N arrivals in order, shape (N, 3).
+        data: The encoded records, followed by padding.
+        starts: Offset of the first byte of each of the K records, shape (K,).
+        marks: Offset of the list of arrivals from the start of each record, shape (K,).
+        counts: Number of arrivals in each record, shape (K,).
+        numbers: Receives the N arrivals of all records in order, three numbers each, shape
+            (N, 3).
     """
     row = 0
     for k in range(starts.shape[0]):
         offset = starts[k] + marks[k]
         offset += _list_head_bytes(data, offset)
         for _ in range(counts[k]):
-            offset += 1
+            offset += 1  # the head of the entry, a list of three numbers
             for n in range(3):
                 numbers[row, n] = _read_int(data, offset)
                 offset += _SIZES[data[offset]]
@@ -439,18 +486,18 @@ def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: I
 
 @loop_leaf
 def gather_memories(data: Bytes, starts: Ints, marks: Any, counts: Any, bits: Ints) -> None:
-    """Reads the numbers of the field `mem` of all records, as their bits.
+    """Reads the internal state of the control law (field `mem`) from every record, as bits.
 
     Args:
-        data: The records, followed by padding.
-        starts: Place of the first byte of each record, shape (K,).
-        marks: Place of the first number from the start of a record, shape (K,).
-        counts: Number of numbers in each record, shape (K,).
+        data: The encoded records, followed by padding.
+        starts: Offset of the first byte of each of the K records, shape (K,).
+        marks: Offset of the first number from the start of each record, shape (K,).
+        counts: Count of numbers in each record, shape (K,).
         bits: Receives the bits of the N numbers of all records, shape (N,).
     """
     row = 0
     for k in range(starts.shape[0]):
-        offset = starts[k] + marks[k] + 1
+        offset = starts[k] + marks[k] + 1  # the first byte of a number states its type
         for n in range(counts[k]):
             bits[row] = load_big(data, offset + NUMBER_BYTES * n)
             row += 1

@@ -115,9 +115,9 @@ class SiteMessages:
     def __init__(self, scenario: Scenario, site: str, epoch_unix_ns: int) -> None:
         self._arm = scenario.arms[site]
         self._epoch_unix_ns = epoch_unix_ns
-        spec = scenario.sites[site]
+        settings = scenario.sites[site]
         # Sites share positions in units of 1 / scale metres.
-        self._scale = spec.task.scale
+        self._scale = settings.task.scale
         channels = Ros2SiteChannels(scenario, site)
         self._channels = channels
         self._robot = RobotModel(scenario, site)
@@ -126,6 +126,7 @@ class SiteMessages:
             "reference_pose": QuaternionSigns(),
         }
         self._link_signs = [QuaternionSigns() for _ in self._robot.frames]
+
         # The mode and the dominance factors are published when they change.
         self._mode = ""
         self._shares = tuple[float, ...]()
@@ -134,10 +135,12 @@ class SiteMessages:
         _, self.frame = self._robot.frames[0]
         self._pack_shared_frame: Callable[..., bytes] | None = None
         # With a displaced base, the poses are in the frame that the sites share.
-        if any(spec.arm.base_xyz_m) or any(spec.arm.base_rpy_rad):
+        if any(settings.arm.base_xyz_m) or any(settings.arm.base_rpy_rad):
             self.frame = f"{site}/shared"
             frame_packer = cdr.TransformPacker([(WORLD, self.frame)])
             self._pack_shared_frame = frame_packer.pack
+
+        # Functions that encode the messages. The constant bytes are computed once, here.
         state_packer = cdr.JointStatePacker(channels.joints)
         self._pack_joint_states = state_packer.pack
         reference_packer = cdr.JointStatePacker(channels.joints, effort=False)
@@ -148,7 +151,14 @@ class SiteMessages:
         self.topics = self._list_topics(peers)
 
     def _list_topics(self, peers: Sequence[str]) -> Topics:
-        """Lists the topics of the site, by their names in trilat-net."""
+        """Lists the topics of the site (arm controller), by their names in trilat-net.
+
+        The sites exchange either joint angles or the pose of the end effector, on which the
+        topics of the reference depend.
+
+        Args:
+            peers: Names of the other sites.
+        """
         channels = self._channels
         topics: Topics = {}
         topics["joint_states"] = channels.joint_states(channels.joints)
@@ -166,6 +176,8 @@ class SiteMessages:
         else:
             topics["reference"] = channels.joint_states(channels.joints, effort=False)
             topics["tip_pose"] = self._describe_pose("the end effector")
+
+        # Late subscribers receive the last message of these topics, which change rarely.
         mode = {"content": "mode of the site"}
         topics["mode"] = Ros2Channel(cdr.STRING, mode, latched=True)
         shares = {
@@ -203,6 +215,7 @@ class SiteMessages:
             topics[topic] = array.channel
         is_full_pose = self._arm.counts.shared == POSE
         if is_full_pose and self._arm.shares_pose:
+            # The error then contains a rotation, whose form is not obvious.
             error = topics["error"]
             rotation_text = "rotation vector of the law's error, at most half a turn long"
             about = {**error.about, "orientation": rotation_text}
@@ -226,7 +239,7 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> NamedMessages:
-        """Converts a record of a site to ROS 2 messages.
+        """Converts a record of a site (arm controller) to ROS 2 messages.
 
         A record contains the state of the site in one period of its control loop: motion,
         reference, torques and mode.
@@ -249,6 +262,8 @@ class SiteMessages:
             yield from self._pack_shared_motion(record, stamp_ns, is_wanted)
         else:
             yield from self._pack_joint_reference(record, stamp_ns, is_wanted)
+
+        # The mode and the dominance factors are published only when they change.
         if record.mode != self._mode:
             self._mode = record.mode
             yield "mode", cdr.pack_string(record.mode)
@@ -256,6 +271,7 @@ class SiteMessages:
         if new_shares != self._shares:
             self._shares = new_shares
             yield "dominance", self._pack_shares(*new_shares)
+
         yield from self._pack_arrays(record, is_wanted)
 
     def _pack_joint_reference(
@@ -263,7 +279,8 @@ class SiteMessages:
     ) -> NamedMessages:
         """Encodes the reference of the joints, and the pose of the end effector.
 
-        This applies if the sites share joint angles. The pose is computed from them.
+        This applies if the sites (arm controllers) share joint angles. The pose is computed
+        from them.
         """
         if is_wanted("reference"):
             data = self._pack_reference(stamp_ns, record.q_des, record.qd_des)
@@ -336,12 +353,13 @@ class SiteMessages:
         pose: Sequence[float],
         stamp_ns: int,
     ) -> bytes:
-        """Encodes a pose of the end effector.
+        """Encodes a pose of the end effector, as position and unit quaternion.
 
         Args:
-            topic: Name of the topic, for the continuity of its quaternions.
-            record: The record.
-            pose: The pose that the sites share. Empty if they share joint angles.
+            topic: Name of the topic. Successive quaternions of a topic do not jump.
+            record: The record (result of a control period).
+            pose: The pose that the sites (arm controllers) exchange. Empty if they exchange
+                joint angles.
             stamp_ns: Time of the message, in Unix time, in ns.
         """
         rotation_vector = self._compute_rotation_vector(record, pose)
@@ -352,9 +370,13 @@ class SiteMessages:
         return self._pack_vectors(stamp_ns, position, aligned_quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
-        """Returns the position of a pose, in m.
+        """Returns the position of the end effector, in m.
 
-        If the sites share joint angles, it is computed from the angles.
+        Args:
+            record: The record (result of a control period), whose joint angles are used if
+                there is no pose.
+            pose: The pose that the sites (arm controllers) exchange. Empty if they exchange
+                joint angles.
         """
         if pose:
             coordinates = pose[:POSITION]
@@ -383,7 +405,8 @@ class SiteMessages:
         and only the wanted ones are yielded.
 
         Args:
-            record: The record of one tick of the site.
+            record: The record (result of a control period) of one tick (control period) of the
+                site.
             is_wanted: Function that returns True if a program has subscribed to the topic with
                 a name.
 
@@ -412,7 +435,7 @@ class SiteMessages:
         """Encodes the poses of all links of the arm in a tick, for viewers that draw the arm.
 
         Args:
-            record: The record, which contains the joint positions.
+            record: The record (result of a control period), which contains the joint positions.
 
         Yields:
             The messages for the topic `/tf`.
@@ -462,7 +485,8 @@ def pack_session_diagnostics(
         session: Name of the session.
         epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
             virtual time.
-        records: Newest record of each site that has published any.
+        records: Newest record (result of a control period) of each site (arm controller) that
+            has published any.
 
     Returns:
         The message, with one status per site.

@@ -186,7 +186,8 @@ def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
     """Lists the names of an arm's joints, as ROS messages and the URDF for viewers state them.
 
     Joints keep the names of their URDF. If no arm of the scenario has a URDF, the joints have
-    the same names at all sites, therefore the name of the site is put in front: "m1_q1".
+    the same names at all sites (arm controllers), therefore the name of the site is put in
+    front: "m1_q1".
 
     Args:
         scenario: Scenario of the session.
@@ -202,7 +203,7 @@ def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
 
 
 class RobotModel:
-    """The arm of one site as a tree of rigid links, for viewers that draw it.
+    """The arm of one site (arm controller) as a tree of rigid links, for viewers that draw it.
 
     The model is built from the URDF of the arm, or from the built-in planar arm.
 
@@ -219,17 +220,19 @@ class RobotModel:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        spec = scenario.sites[site].arm
+        settings = scenario.sites[site].arm
         site_number = scenario.names.index(site)
         joint_names = name_ros_joints(scenario, site)
-        if spec.urdf:
-            arm_model = read_arm(spec, scenario.urdf)
+        if settings.urdf:
+            arm_model = read_arm(settings, scenario.urdf)
             base = arm_model.base
-            urdf = scenario.urdf[spec.urdf]
+            urdf = scenario.urdf[settings.urdf]
         else:
             base = "base"
             q1, q2 = joint_names
-            urdf = _PLANAR.format(q1=q1, q2=q2, l1_m=spec.l1_m, l2_m=spec.l2_m)
+            urdf = _PLANAR.format(q1=q1, q2=q2, l1_m=settings.l1_m, l2_m=settings.l2_m)
+
+        # The frames of the links, from the base to the last link.
         root = ElementTree.fromstring(urdf)
         base_frame = f"{site}/{base}"
         self.frames = [(WORLD, base_frame)]
@@ -244,15 +247,19 @@ class RobotModel:
             self._joints.append(joint_frame)
         self._packer = TransformPacker(self.frames)
 
-        base_rotation = _convert_rpy(spec.base_rpy_rad)
-        down_x, down_y, down_z = spec.down if spec.urdf else _PLANAR_DOWN
+        # The arm stands upright in `WORLD`: gravity, which may have any direction in the frame
+        # of the base, points to -z. The arms of the sites stand side by side along y.
+        base_rotation = _convert_rpy(settings.base_rpy_rad)
+        down_x, down_y, down_z = settings.down if settings.urdf else _PLANAR_DOWN
         down_of_base = (down_x, down_y, down_z)
         down = rotate_vector(base_rotation, down_of_base)
         upright = _rotate_upright(down)
         site_y = SPACING_M * site_number
         shared_origin = (0.0, site_y, 0.0)
         self.shared = (shared_origin, upright)
-        base_x, base_y, base_z = spec.base_xyz_m
+
+        # The pose of the base in `WORLD`, from its pose in the shared frame.
+        base_x, base_y, base_z = settings.base_xyz_m
         base_xyz_m = (base_x, base_y, base_z)
         x, y, z = rotate_vector(upright, base_xyz_m)
         base_origin = (x, y + site_y, z)
@@ -391,12 +398,13 @@ def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame
 def _describe_robot(root: Element, site: str, site_number: int) -> str:
     """Returns the URDF of a site's arm as a string for viewers.
 
-    The elements are changed: the site's name is put in front of the names of the links, and
-    links get plain shapes if the URDF contains none.
+    The site's name is put in front of the names of the links, so that several arms with the
+    same URDF can be shown together. Links get plain shapes if the URDF contains none, because
+    the arm would otherwise be invisible.
 
     Args:
-        root: The URDF.
-        site: Name of the site.
+        root: The URDF, which is changed.
+        site: Name of the site (arm controller).
         site_number: Index of the site, which determines the colour.
     """
     has_shapes = root.find("link/visual") is not None
@@ -406,19 +414,23 @@ def _describe_robot(root: Element, site: str, site_number: int) -> str:
     for link in root.findall("link"):
         name = link.get("name", "")
         links[name] = link
+
     for joint in root.findall("joint"):
         parent_name = _get_link(joint, "parent")
         parent = links.get(parent_name)
         if parent is not None and not has_shapes:
             origin = joint.find("origin")
             joint_origin_m = _parse_vector(origin, "xyz", _NO_VECTOR)
-            _add_shape(parent, joint_origin_m, colour, site)
+            _add_shape(
+                parent, joint_origin_m, colour, site
+            )  # from the joint before to this one
         for end in ("parent", "child"):
             element = joint.find(end)
             if element is None:
                 continue
             link_name = element.get("link", "")
             element.set("link", f"{site}/{link_name}")
+
     for name, link in links.items():
         link.set("name", f"{site}/{name}")
     return ElementTree.tostring(root, encoding="unicode")
@@ -433,16 +445,18 @@ def _add_shape(link: Element, end_m: Vector, colour: str, site: str) -> None:
         link: The link's element in the URDF.
         end_m: The point in the frame of the link, in m.
         colour: Red, green, blue and opacity, from 0 to 1.
-        site: Name of the site, which makes the name of the material unique.
+        site: Name of the site (arm controller), which makes the name of the material unique.
     """
     x, y, z = end_m
     length_m = math.hypot(x, y, z)
     centre_text = f"{x / 2.0:.9g} {y / 2.0:.9g} {z / 2.0:.9g}"
+
     # The axis of a cylinder is z in a URDF. It is tilted from z, and then turned about z.
     horizontal_m = math.hypot(x, y)
     tilt = math.atan2(horizontal_m, z)
     azimuth = math.atan2(y, x)
     rpy_text = f"0 {tilt:.9g} {azimuth:.9g}"
+
     visual = SubElement(link, "visual")
     SubElement(visual, "origin", xyz=centre_text, rpy=rpy_text)
     geometry = SubElement(visual, "geometry")

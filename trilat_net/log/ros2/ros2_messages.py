@@ -172,7 +172,7 @@ class _ArrayChannel:
     Args:
         content: Description of the numbers.
         unit: Unit of the numbers.
-        axes: Names of the entries along each axis of the array.
+        entry_names: For each axis of the array, the names of the entries along it.
 
     Attributes:
         channel: Description of the channel, with its metadata.
@@ -180,19 +180,19 @@ class _ArrayChannel:
         pack: Function that encodes an array, from its numbers row by row.
     """
 
-    def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
-        names = [" ".join(axis) for axis in axes]
+    def __init__(self, content: str, unit: str, *entry_names: Sequence[str]) -> None:
+        joined_names = [" ".join(axis_entries) for axis_entries in entry_names]
         metadata = {
             "content": content,
             "unit": unit,
-            "names": "; ".join(names),
+            "names": "; ".join(joined_names),
         }
         self.channel = Ros2Channel(cdr.FLOAT64_ARRAY, metadata)
         # The first label also names the content, and the last label the unit.
-        labels = [*names]
+        labels = [*joined_names]
         labels[0] = f"{content}: {labels[0]}"
         labels[-1] += f" ({unit})"
-        lengths = [len(axis) for axis in axes]
+        lengths = [len(axis_entries) for axis_entries in entry_names]
         self.size = math.prod(lengths)
         dimensions = zip(labels, lengths, strict=True)
         self.pack = cdr.make_float_array_packer(*dimensions)
@@ -215,8 +215,8 @@ class Ros2SiteChannels:
     Attributes:
         joints: Names of the joints, from the URDF or numbered for a planar arm.
         arrays: The array channels, by the last part of their topic.
-        record_arrays: Names of the arrays that are computed from records. The others are
-            computed from statistics.
+        record_arrays: Names of the arrays that are computed from records (results of control
+            periods). The others are computed from statistics.
         error_row: Slice of the error e = q - q_des, Eq. (9), in the numbers of a record from
             `stack_signals`.
         slow_row: Slice of the numbers that follow the error: the exogenous torque, the
@@ -228,17 +228,20 @@ class Ros2SiteChannels:
         arm = scenario.arms[site]
         self._arm = arm
         self._peers = scenario.peers(site)
-        n = arm.counts.joints
-        shared = arm.counts.shared
+        joint_count = arm.counts.joints
+        shared_count = arm.counts.shared
         # A row begins with q, q_des, qd and tau, n numbers each. The errors follow.
-        error_start = 4 * n
-        error_end = error_start + shared
+        error_start = 4 * joint_count
+        error_end = error_start + shared_count
         self.error_row = slice(error_start, error_end)
         self.slow_row = slice(error_end, None)
+
         self.robot: RobotModel | None = None
         if arm.chain is not None:
             self.robot = RobotModel(scenario, site)
         self.joints = name_ros_joints(scenario, site)
+
+        # The arrays of `_slow_names` are encoded from consecutive numbers of a record.
         sent_arrays = _make_sent_arrays(scenario, site)
         self._slow_names = ("tau_x", "theta_hat", *sent_arrays, "mode")
         self.record_arrays = ("error", *self._slow_names)
@@ -341,7 +344,7 @@ class Ros2SiteChannels:
 
         Args:
             row: Values of these quantities: the slice `slow_row` of the numbers that
-                `stack_signals` returns for a record.
+                `stack_signals` returns for a record (result of a control period).
 
         Yields:
             The name of each array, and the encoded message.
@@ -376,9 +379,11 @@ class Ros2SiteChannels:
             ages_ms.append(_convert_to_ms(age_us))
         age_array = self.arrays["link_age"]
         yield "link_age", age_array.pack(*ages_ms)
+
         # Virtual time has no measured delays and no clock offsets.
         if not stats.delay_us:
             return
+
         delays_ms: list[float] = []
         offsets_ms: list[float] = []
         for peer in peers:
@@ -389,6 +394,7 @@ class Ros2SiteChannels:
             offset_us = stats.offset_us.get(peer, math.nan)
             bound_us = stats.bound_us.get(peer, math.nan)
             offsets_ms += [offset_us / 1e3, bound_us / 1e3]
+
         delay_array = self.arrays["link_delay"]
         yield "link_delay", delay_array.pack(*delays_ms)
         offset_array = self.arrays["link_offset"]
@@ -407,7 +413,11 @@ def _make_labels(names: Iterable[str]) -> list[str]:
 
 
 def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
-    """Returns an array for each vector that a site's law sends, in the record's order."""
+    """Returns an array channel for each vector that a site's control law sends.
+
+    They have the order of the vectors in a record (result of a control period). A vector for a
+    single receiver (peer) has the name of the receiver in its topic.
+    """
     arrays: ArrayChannels = {}
     peers = scenario.peers(site)
     channel = scenario.channel(site)
@@ -522,7 +532,7 @@ def _transpose(rows: Iterable[SignalRow]) -> list[SignalRow]:
 def _compute_errors(
     actual: Sequence[SignalRow], desired: Sequence[SignalRow]
 ) -> list[list[float]]:
-    """Returns the differences between actual and desired curves."""
+    """Returns the differences between actual and desired values, curve by curve."""
     errors: list[list[float]] = []
     for actual_curve, desired_curve in zip(actual, desired, strict=True):
         pairs = zip(actual_curve, desired_curve, strict=True)
@@ -532,10 +542,9 @@ def _compute_errors(
 
 
 def _list_modes(records: Sequence[Record]) -> list[float]:
-    """Returns the mode of each record as a number, or a single number if all are equal.
+    """Returns the operating mode of each record as a number, or one number if all are equal.
 
-    The extremes of a bucket of equal modes are thus one point, which saves most of the
-    messages.
+    Equal modes have equal extremes, for which a single number suffices.
     """
     modes = [record.mode for record in records]
     first_mode = modes[0]

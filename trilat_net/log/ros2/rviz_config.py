@@ -47,6 +47,8 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
         raise UsageError(
             "there is no arm that RViz could show: no topic has the description of a robot"
         )
+
+    # The camera looks at the middle of the row of arms, from a distance that shows all of them.
     middle_y = SPACING_M * (arm_count - 1) / 2.0
     distance = 3.0 + 2.0 * arm_count
     return _fill_template(

@@ -84,7 +84,8 @@ class TopicTable(NamedTuple):
 
     Attributes:
         names: Name of each topic in ROS 2, by its name in trilat-net.
-        of_site: Names that differ at a site, by name of the site and by the name in trilat-net.
+        of_site: Names that differ at a site (arm controller), by name of the site and by the
+            name in trilat-net.
         robots: Settings of the real robots, by name of the site.
     """
 
@@ -99,7 +100,7 @@ class TopicTable(NamedTuple):
 
         Args:
             session: Name of the session.
-            site: Name of the site.
+            site: Name of the site (arm controller).
             topic: Name of the topic in trilat-net.
         """
         common_name = self.names.get(topic, topic)
@@ -116,9 +117,9 @@ class TopicTable(NamedTuple):
         The names follow a built-in convention, or come from a TOML file. The conventions are
         "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit).
         The file states only the names that differ from "crisp". For example, the line
-        `joint_states = "arm/joint_states"` applies to all sites. A table `[sites.s]` applies
-        only to the site `s`. It may also contain the settings of a real robot, which are the
-        fields of `RobotTable`.
+        `joint_states = "arm/joint_states"` applies to all sites (arm controllers). A table
+        `[sites.s]` applies only to the site `s`. It may also contain the settings of a real
+        robot, which are the fields of `RobotTable`.
 
         Args:
             source: "crisp", "crtk" or the path of a file.
@@ -160,7 +161,7 @@ def _list_names(naming: str) -> dict[str, str]:
 
 
 def _read_names_file(source: str) -> TopicTable:
-    """Reads a names file: the changed names, and the robots by site.
+    """Reads a names file: the changed names, and the robots by site (arm controller).
 
     Raises:
         UsageError: The file cannot be read, or is not valid TOML.

@@ -91,8 +91,8 @@ class _BucketOutput:
     def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
         """Writes all rows of curve values of a time interval at once.
 
-        This is used for an interval whose records arrived late. Otherwise `add` spreads the
-        rows over time.
+        This is used for an interval whose records (results of control periods) arrived late.
+        Otherwise `add` spreads the rows over time.
 
         Args:
             rows: The rows with their times.
@@ -103,10 +103,11 @@ class _BucketOutput:
 
 
 class _SiteBuckets:
-    """The buckets of one site.
+    """The buckets of one site (arm controller).
 
-    A fast bucket contains records, and becomes two messages with the joints. A slow bucket
-    contains the rows of several fast buckets, and becomes two messages with the other curves.
+    A fast bucket contains records (results of control periods), and becomes two messages with
+    the joints. A slow bucket contains the rows of several fast buckets, and becomes two
+    messages with the other curves.
 
     Args:
         scenario: Scenario of the session.
@@ -200,6 +201,7 @@ class _SiteBuckets:
         positions_and_references = row[: 2 * n]
         velocity = row[2 * n : 3 * n]
         effort = row[3 * n : 4 * n]
+        # The joints that stand for the references have neither velocity nor effort.
         joint_states = self._joint_state_packer.pack(
             stamp_ns,
             position=positions_and_references,
@@ -207,10 +209,12 @@ class _SiteBuckets:
             effort=[*effort, *self._not_measured],
         )
         self._write_message("joint_states", joint_states, stamp_ns, log_ns)
+
         site_channels = self._site_channels
         errors = row[site_channels.error_row]
         error_array = site_channels.arrays["error"]
         self._write_message("error", error_array.pack(*errors), stamp_ns, log_ns)
+
         robot = site_channels.robot
         if robot is None:
             return
@@ -238,11 +242,11 @@ class _SiteBuckets:
     def add_record(self, record: Record, log_ns: int) -> None:
         """Adds a record of the site, and writes the messages that are complete now.
 
-        Records are collected in buckets, intervals of equal length. A bucket becomes two
-        messages with the minimum and the maximum of each curve. To space the messages evenly,
-        a bucket has two halves: when the first record of another bucket arrives, the first
-        message of the previous bucket is written. When a record of the second half arrives, the
-        second message of that previous bucket is written.
+        Records (results of control periods) are collected in buckets, intervals of equal
+        length. A bucket becomes two messages with the minimum and the maximum of each curve. To
+        space the messages evenly, a bucket has two halves: when the first record of another
+        bucket arrives, the first message of the previous bucket is written. When a record of
+        the second half arrives, the second message of that previous bucket is written.
 
         Args:
             record: The record.
@@ -268,8 +272,8 @@ class _SiteBuckets:
     def _add_late_record(self, record: Record, log_ns: int) -> None:
         """Keeps a record whose bucket was written already, because the record arrived late.
 
-        Late records of one bucket are collected, and written as soon as a late record of
-        another bucket arrives.
+        Late records (results of control periods) of one bucket are collected, and written as
+        soon as a late record of another bucket arrives.
         """
         bucket = record.tick // self._bucket_ticks
         if self._late_records:
@@ -281,7 +285,8 @@ class _SiteBuckets:
     def add_statistics(self, stats: LinkStats, log_ns: int) -> None:
         """Writes statistics about the connections of the site as messages for viewers.
 
-        The statistics are not reduced, because a site publishes them only ten times a second.
+        The statistics are not reduced, because a site (arm controller) publishes them only ten
+        times a second.
 
         Args:
             stats: The statistics.
@@ -296,11 +301,12 @@ class _SiteBuckets:
 
         The method is called at the end of the log.
 
-        The records of a site are collected in time intervals of equal length, the fast buckets.
-        The extremes of `_slow_ratio` successive fast buckets are collected in a slow bucket.
-        Each bucket becomes two messages: the first one is written when the bucket is closed,
-        and the second one half a bucket later. It is kept until then by an object of its own,
-        one for fast and one for slow buckets.
+        The records (results of control periods) of a site (arm controller) are collected in
+        time intervals of equal length, the fast buckets. The extremes of `_slow_ratio`
+        successive fast buckets are collected in a slow bucket. Each bucket becomes two
+        messages: the first one is written when the bucket is closed, and the second one half a
+        bucket later. It is kept until then by an object of its own, one for fast and one for
+        slow buckets.
 
         Args:
             log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
@@ -318,7 +324,8 @@ class _SiteBuckets:
         """Reduces the records of the open bucket to two messages, and opens another bucket.
 
         The first message is written now, and the second one half a bucket later
-        (`_BucketOutput`). Records of older buckets that arrived late are written before.
+        (`_BucketOutput`). Records (results of control periods) of older buckets that arrived
+        late are written before.
 
         The slow curves, such as the estimate, are reduced a second time: a slow bucket consists
         of `_slow_ratio` fast buckets, and contains their extremes. It also becomes two
@@ -354,7 +361,11 @@ class _SiteBuckets:
         self._first_tick = self._bucket_ticks * next_bucket
 
     def _flush_late_records(self, log_ns: int) -> None:
-        """Writes the extremes of the records that arrived late, on all channels."""
+        """Writes the records that arrived after their time interval (bucket) was written.
+
+        As for other intervals, the minimum and the maximum of each curve are written, here on
+        the fast and on the slow channels at once.
+        """
         if self._late_records:
             rows = self._decimate(self._late_records)
             slow_rows = self._select_slow_columns(rows)
@@ -363,7 +374,11 @@ class _SiteBuckets:
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
-        """Returns the values of the slow curves in each row."""
+        """Returns the values of the curves that are written less often than the joints.
+
+        Args:
+            rows: Values of all curves at some times.
+        """
         slow_row = self._site_channels.slow_row
         return [(stamp_ns, row[slow_row]) for stamp_ns, row in rows]
 
@@ -375,7 +390,8 @@ class _SiteBuckets:
         extremes of different curves occur at different times. Therefore no exact time exists.
 
         Args:
-            records: The records of the bucket, at least one. They are sorted by time in place.
+            records: The records (results of control periods) of the bucket, at least one. They
+                are sorted by time in place.
 
         Returns:
             Two rows with their times, or one row for a single record.
@@ -432,7 +448,7 @@ class VizChannels:
         session: Name of the session.
         epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
         views_hz: Rate of the messages with the joints, in Hz. `FULL_RATE_HZ` writes a message
-            for every record.
+            for every record (result of a control period).
         put: Function that writes a message into the log.
 
     Attributes:
@@ -451,6 +467,8 @@ class VizChannels:
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
+
+        # Channels and receivers of the whole session, for the events.
         self.channels: dict[str, Ros2Channel] = {}
         for name, channel in ros2_messages.SESSION_CHANNELS.items():
             self.channels[f"{VIZ_ROOT}{name}"] = channel
@@ -458,6 +476,8 @@ class VizChannels:
         for member in (*scenario.names, topics.RECORDER):
             event_key = topics.key(session, member, topics.EVENT)
             self.receivers[event_key] = self._add_event
+
+        # Those of each site, for its records and statistics.
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
             buckets = _SiteBuckets(
@@ -475,7 +495,11 @@ class VizChannels:
             self.receivers[link_key] = buckets.add_statistics
 
     def _add_event(self, event: Event, log_ns: int) -> None:
-        """Writes an event. One from before the start of the session gets its arrival time."""
+        """Writes an event of the session for viewers, as text and as a line for the ROS log.
+
+        An event from before the start of the session has no time of its own. Its arrival time
+        is used instead.
+        """
         stamp_ns = log_ns
         if event.t_ns >= 0:
             stamp_ns = max(0, self._epoch_unix_ns + event.t_ns)

@@ -380,15 +380,16 @@ def _choose_plugin_site(log: Log, settings: _Settings) -> str:
     program = settings.program if settings.program != NO_PROGRAM else ""
     site = settings.site or program or users[-1]
     if site not in users:
-        possible_users = " or ".join(users)
-        raise UsageError(f"the plugin can hold the arm of {possible_users}, not of {site!r}")
+        user_names = " or ".join(users)
+        raise UsageError(f"the plugin can hold the arm of {user_names}, not of {site!r}")
     return site
 
 
 def _find_attempts(log: Log) -> list[_Attempt]:
-    """Finds the episodes that `session.episode` has marked in a log.
+    """Finds the episodes that the user has marked in a log while the session was running.
 
-    An episode ends where its end is marked, or where the next episode begins.
+    `session.episode` writes a mark at the begin and at the end of an episode. An episode
+    without a mark at its end lasts until the next one begins.
 
     Args:
         log: Log of the run.
@@ -396,23 +397,24 @@ def _find_attempts(log: Log) -> list[_Attempt]:
     Returns:
         The episodes in their order in time. Empty if there are none.
     """
-    marks = []
+    episode_marks = []
     for event in log.events:
         match = _EPISODE_MARK.fullmatch(event.text)
         if event.kind == "mark" and match:
-            marks.append((event.t_ns, match[1], match[2]))
-    marks.sort(key=lambda mark: mark[0])  # stable: keeps the order of marks in one tick
+            episode_marks.append((event.t_ns, match[1], match[2]))
+    episode_marks.sort(key=lambda mark: mark[0])  # stable: keeps the order of marks in one tick
 
     attempts = list[_Attempt]()
-    for t_ns, name, change in marks:
-        last = attempts[-1] if attempts else None
-        is_open = last is not None and last.end_ns is None
-        if change == "begins":
-            if last is not None and is_open:
-                attempts[-1] = last._replace(end_ns=t_ns)
+    for t_ns, name, phase in episode_marks:
+        last_attempt = attempts[-1] if attempts else None
+        is_open = last_attempt is not None and last_attempt.end_ns is None
+        if phase == "begins":
+            if last_attempt is not None and is_open:
+                attempts[-1] = last_attempt._replace(end_ns=t_ns)
             attempts.append(_Attempt(name, begin_ns=t_ns))
-        elif last is not None and is_open and last.name == name:
-            attempts[-1] = last._replace(end_ns=t_ns, succeeded=_OUTCOMES.get(change))
+        # The mark ends the open episode. Marks of other episodes have no effect.
+        elif last_attempt is not None and is_open and last_attempt.name == name:
+            attempts[-1] = last_attempt._replace(end_ns=t_ns, succeeded=_OUTCOMES.get(phase))
     return attempts
 
 
@@ -438,7 +440,11 @@ def _write_json(folder: Path, files: dict[str, Any]) -> None:
 
 
 def _describe_session(log: Log, frames: _Frames, program: str) -> dict[str, Any]:
-    """Returns the session of a log, its scenario, episodes, and the omitted frames."""
+    """Returns the facts about a log that the manifest of a dataset states.
+
+    They are the session and its scenario, the program that moved an arm, the marked episodes
+    with their outcomes, and the numbers of frames that were left out.
+    """
     outcomes = {True: "succeeded", False: "failed", None: "not stated"}
     episodes = []
     for attempt in frames.attempts:
@@ -456,7 +462,10 @@ def _describe_session(log: Log, frames: _Frames, program: str) -> dict[str, Any]
 
 
 def _number_frames(dataset: Columns, fps: int) -> list[int]:
-    """Adds the time and the numbers of all frames to a dataset.
+    """Adds the time and the index of each frame, which LeRobot requires, to a dataset.
+
+    The time and the frame index start at 0 in each episode. The last frame of an episode is
+    marked as done.
 
     Args:
         dataset: Columns of all frames, to which columns are added.
@@ -467,13 +476,17 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
     """
     episode = dataset["episode_index"]
     index = np.arange(len(episode))
+
+    # An episode begins where the number of the episode changes.
     episode_steps = np.diff(episode, prepend=-1)
     starts = np.flatnonzero(episode_steps)
     is_last = np.diff(episode, append=episode[-1] + 1) != 0
     dataset["next.done"] = is_last
+
     frame_index = index - starts[episode]
     times_s = frame_index / fps
     dataset["timestamp"] = times_s.astype(np.float32)
+
     dataset["frame_index"] = frame_index
     dataset["index"] = index
     return [int(start) for start in starts]
@@ -651,10 +664,12 @@ def _read_columns(
 def _read_sample_ages(
     log: Log, rows: dict[str, Ints], slave: str, users: Sequence[str]
 ) -> list[_Feature]:
-    """Returns the ages of the samples with which the slave and its users follow each other.
+    """Returns the ages of the messages with which the slave and its users follow each other.
 
-    The feature `age_s` belongs to the links from the users to the slave, and `age_s.USER` to
-    the link from the slave to a user. Sites without such a link have no such feature.
+    The age of a message (sample) is the delay that a control loop experiences. A trained
+    program may need it to judge how old its view of the other arm is. The feature `age_s` has
+    the ages at the slave, one per user. The feature `age_s.USER` has the age of the slave's
+    message at a user. Sites that do not follow each other have no such feature.
 
     Args:
         log: Log of the run that is exported.
@@ -663,10 +678,11 @@ def _read_sample_ages(
         users: Names of the sites of the users.
     """
     features = []
-    sources = [user for user in users if user in log[slave].used]
-    if sources:
-        ages = [_read_ages(log, slave, user)[rows[slave]] for user in sources]
-        features.append(_Feature("age_s", np.stack(ages, axis=1), sources))
+    followed_users = [user for user in users if user in log[slave].used]
+    if followed_users:
+        ages_of_users = [_read_ages(log, slave, user)[rows[slave]] for user in followed_users]
+        features.append(_Feature("age_s", np.stack(ages_of_users, axis=1), followed_users))
+
     for user in users:
         if slave in log[user].used:
             user_ages = _read_ages(log, user, slave)[rows[user]]
@@ -686,13 +702,16 @@ def _read_ages(log: Log, receiver: str, sender: str) -> Array:
         sender: Name of its peer that sends them.
     """
     records = log[receiver]
-    ages_s = records.age_s(sender, log[sender].rate_hz)
-    ages: Array = np.where(np.isnan(ages_s), records.t_ns / NS_PER_S, ages_s)
-    return ages
+    ages_or_nan_s = records.age_s(sender, log[sender].rate_hz)
+    elapsed_s = records.t_ns / NS_PER_S
+    ages_s: Array = np.where(np.isnan(ages_or_nan_s), elapsed_s, ages_or_nan_s)
+    return ages_s
 
 
 def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:
     """Returns the reference q_des that the slave follows, and the names of its n numbers.
+
+    A learning program takes it as the action of the demonstrator.
 
     Args:
         log: Log of the run that is exported.
@@ -789,11 +808,14 @@ def _write_tables(
     parquet = import_extra(*_EXTRA)
     frames = {}
     for key, column in dataset.items():
+        # A vector with one number is stored as a plain number.
         size = column[0].size
         numbers = column.ravel()
         if size > 1:
             numbers = pa.FixedSizeListArray.from_arrays(numbers, size)
         frames[key] = numbers
+
+    # LeRobot needs a row with statistics per episode, and a table with the texts of the tasks.
     frame_count = len(dataset["index"])
     episodes = []
     for first, end in pairwise([*starts, frame_count]):
@@ -801,6 +823,7 @@ def _write_tables(
         episodes.append(episode)
     task_columns = {"task_index": np.arange(len(tasks)), "task": tasks}
     task_table = pa.table(task_columns)
+
     tables = {
         f"data/{_FILE}": pa.table(frames),
         f"meta/episodes/{_FILE}": pa.Table.from_pylist(episodes),
@@ -812,6 +835,7 @@ def _write_tables(
         # The file is opened by Python and not by pyarrow, so that a full disk raises OSError.
         with path.open("wb") as stream:
             parquet.write_table(table, stream)
+
     statistics = {key: _compute_statistics(column) for key, column in dataset.items()}
     return {"meta/stats.json": statistics}
 
@@ -819,7 +843,10 @@ def _write_tables(
 def _describe_dataset(
     fps: int, names: Names, columns: Columns, episodes: int, tasks: int
 ) -> dict[str, Any]:
-    """Returns the contents of the file meta/info.json, in which LeRobot looks up the features.
+    """Returns the contents of the file meta/info.json, which describes a data set in LeRobot.
+
+    LeRobot is a library for learning from demonstrations of robots. It reads there how many
+    episodes there are, where they are stored, and which numbers (features) each frame contains.
 
     Args:
         fps: Number of frames per second.
@@ -835,6 +862,7 @@ def _describe_dataset(
             "shape": [column[0].size],
             "names": names.get(key),
         }
+
     return {
         "codebase_version": "v3.0",
         "robot_type": "trilat",
@@ -875,6 +903,7 @@ def _describe_episode(
         "meta/episodes/chunk_index": 0,
         "meta/episodes/file_index": 0,
     }
+
     for key, column in dataset.items():
         statistics = _compute_statistics(column[first:end])
         for name, numbers in statistics.items():
@@ -885,24 +914,27 @@ def _describe_episode(
 def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
     """Computes the statistics of a feature with which LeRobot normalises it.
 
+    LeRobot is a library for learning from demonstrations. Features of different size are
+    normalised before they are learned.
+
     Args:
         column: Feature in F frames, shape (F, n) or (F,).
 
     Returns:
         Each statistic by name, with n numbers.
     """
-    rows = column.reshape(len(column), -1).astype(np.float64)
+    frame_rows = column.reshape(len(column), -1).astype(np.float64)
     statistics = {
-        "min": np.min(rows, axis=0).tolist(),
-        "max": np.max(rows, axis=0).tolist(),
-        "mean": np.mean(rows, axis=0).tolist(),
-        "std": np.std(rows, axis=0).tolist(),
+        "min": np.min(frame_rows, axis=0).tolist(),
+        "max": np.max(frame_rows, axis=0).tolist(),
+        "mean": np.mean(frame_rows, axis=0).tolist(),
+        "std": np.std(frame_rows, axis=0).tolist(),
     }
-    for share in _QUANTILES:
-        quantiles = np.quantile(rows, share, axis=0)
-        percent = 100 * share
+    for quantile in _QUANTILES:
+        quantiles = np.quantile(frame_rows, quantile, axis=0)
+        percent = 100 * quantile
         statistics[f"q{percent:02.0f}"] = quantiles.tolist()
-    statistics["count"] = [len(rows)]
+    statistics["count"] = [len(frame_rows)]
     return statistics
 
 

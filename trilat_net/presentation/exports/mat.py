@@ -89,16 +89,19 @@ def _build_struct(table: Table) -> dict[str, Any]:
 def _convert_column(column: Column, table: Table) -> Any:
     """Converts the values of a column to a type that is convenient in MATLAB.
 
-    Texts become rows of characters in the tables of sites, and cells in the table of events.
-    The table of events has no `kind`. Integers become doubles if all of them are exact as
-    doubles. Time stamps in ns stay integers.
+    Texts become rows of characters, and in the table of events cells. Integers become doubles,
+    with which MATLAB computes, if all of them are exact as doubles. Time stamps in ns stay
+    integers, because most of them are too large for doubles.
     """
     if column.is_text:
-        return read_texts(column) if table.kind else column.values.reshape(-1, 1)
+        is_event_table = not table.kind
+        return column.values.reshape(-1, 1) if is_event_table else read_texts(column)
+
     values = column.numbers()
     is_stamp = column.unit == "ns" and not column.name.startswith("drift")
     if is_stamp or values.dtype != np.int64:
         return values
+
     is_exact = bool((np.abs(values) <= _MAX_EXACT_INTEGER).all())
     return values.astype(np.float64) if is_exact else values
 

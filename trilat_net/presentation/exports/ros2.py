@@ -176,20 +176,22 @@ class _SiteBag:
         return topic_messages
 
     def iterate_records(self) -> Iterator[TimedMessages]:
-        """Yields the ROS messages that describe the motion of the site.
+        """Yields the ROS messages about the motion of a site's arm, such as its joint states.
 
-        The messages are in the order of their arrival. The first ones also contain the
-        description of the robot.
+        The messages are in the order in which the records arrived in the log, as a bag needs.
+        The first ones also contain the description of the robot.
         """
         records = self._log[self._site]
         dominance = trace_dominance(self._log, self._site, records.t_s)
-        shares = dominance.alpha.tolist()
+        dominance_factors = dominance.alpha.tolist()
         log_ns = records.log_time_ns.tolist()
         publish_ns = records.publish_time_ns.tolist()
-        order = np.argsort(records.log_time_ns, kind="stable")
-        for count, row in enumerate(order.tolist(), 1):
+        # The stable sort keeps the order of records that arrived at the same time.
+        rows_by_arrival = np.argsort(records.log_time_ns, kind="stable")
+
+        for count, row in enumerate(rows_by_arrival.tolist(), 1):
             record = records.states[row]
-            packed = self._messages.pack_record(record, shares[row])
+            packed = self._messages.pack_record(record, dominance_factors[row])
             messages = self._name_messages(packed)
             if count == 1:
                 topic = self._find_topic("robot_description")
@@ -197,6 +199,7 @@ class _SiteBag:
                 messages.insert(0, description)
             for data in self._messages.pack_frames(record):
                 messages.append((FRAMES_TOPIC, data))
+
             yield log_ns[row], publish_ns[row], messages
             is_last = count == len(records)
             if is_last or count % _RECORDS_PER_REPORT == 0:
@@ -240,29 +243,33 @@ def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
 
 
 def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields a message per second about the newest records of all sites.
+    """Yields a ROS message per second about the state of all sites, for monitoring tools.
 
-    The times of a message are the latest times of these records, and never earlier than those
-    of the previous message.
+    Each message is composed from the newest record of every site. Its times are the latest
+    times of these records, and never earlier than those of the previous message, because a bag
+    must be sorted by time.
     """
-    parts = [log[site] for site in log.sites if len(log[site])]
-    end_times_ns = [int(part.t_ns.max()) for part in parts]
+    site_logs = [log[site] for site in log.sites if len(log[site])]
+    end_times_ns = [int(site_log.t_ns.max()) for site_log in site_logs]
     end_ns = max(end_times_ns, default=-1)
     log_ns = 0
     publish_ns = 0
-    for second in range(end_ns // NS_PER_S + 1):
-        t_ns = second * NS_PER_S
+
+    for second_number in range(end_ns // NS_PER_S + 1):
+        t_ns = second_number * NS_PER_S
         records = []
-        for part in parts:
-            next_row = int(np.searchsorted(part.t_ns, t_ns, side="right"))
+        for site_log in site_logs:
+            # Row of the newest record at or before this second.
+            next_row = int(np.searchsorted(site_log.t_ns, t_ns, side="right"))
             row = next_row - 1
             if row < 0:
                 continue
-            records.append(part.record(row))
-            record_log_ns = int(part.log_time_ns[row])
+            records.append(site_log.record(row))
+            record_log_ns = int(site_log.log_time_ns[row])
             log_ns = max(log_ns, record_log_ns)
-            record_publish_ns = int(part.publish_time_ns[row])
+            record_publish_ns = int(site_log.publish_time_ns[row])
             publish_ns = max(publish_ns, record_publish_ns)
+
         if records:
             epoch_unix_ns = _find_epoch_ns(log)
             data = pack_session_diagnostics(session, epoch_unix_ns, records)

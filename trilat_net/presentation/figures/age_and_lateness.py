@@ -67,28 +67,31 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         form: Width, type sizes and resolution of the figure.
     """
     ages_ms = _read_ages_ms(log)
-    stated = {
-        link: trace_stated_delay(log, models) for link, models in _list_link_models(log).items()
-    }
+    stated_delays = {}
+    for link, models in _list_link_models(log).items():
+        stated_delays[link] = trace_stated_delay(log, models)
+
     has_bands = False
     with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
         grid, panels = _add_link_panels(plot.figure, log)
         for (peer, site), axes in panels.items():
             age_ms = ages_ms[peer, site]
-            line = style.site_line(log, peer, 1.4)
+            line_style = style.site_line(log, peer, 1.4)
             plot.mark(axes, [site], f"{peer}->{site}")
+
             if is_unsteady(age_ms):
                 has_bands = True
-                style.plot_spread(axes, log[site].t_s, age_ms, **line)
+                style.plot_spread(axes, log[site].t_s, age_ms, **line_style)
             else:
-                plot.trace(axes, site, age_ms, **line)
-            axes.plot(*stated[f"{peer}->{site}"], **style.LIMIT_LINE)
+                plot.trace(axes, site, age_ms, **line_style)
+
+            axes.plot(*stated_delays[f"{peer}->{site}"], **style.LIMIT_LINE)
             if not np.any(np.isfinite(age_ms)):
                 style.annotate_empty_panel(axes, "no sample in use")
         for axes in grid[:, 0]:
             axes.set_ylabel("age (ms)")
 
-        stated_ms = np.concatenate([delay_ms for _, delay_ms in stated.values()])
+        stated_ms = np.concatenate([delay_ms for _, delay_ms in stated_delays.values()])
         _scale_age_axis(grid[0, 0], np.concatenate([*ages_ms.values(), stated_ms]))
         entries = _list_sender_entries(log)
         if np.any(np.isfinite(stated_ms)):
@@ -112,13 +115,16 @@ def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
 def _add_link_panels(
     figure: Figure, log: Log
 ) -> tuple[style.AxesGrid, dict[tuple[str, str], Axes]]:
-    """Adds a panel per link to a figure, with a row per receiver.
+    """Adds a grid of panels to a figure: a row per receiving site, with a panel per sender.
+
+    All panels share their axes, so that the delays of links can be compared.
 
     Returns:
         The grid of panels, and the panels by sender and receiver.
     """
-    count = len(log.sites)
-    grid = style.add_panels(figure, count, count - 1, sharex=True, sharey=True)
+    site_count = len(log.sites)
+    sender_count = site_count - 1  # a site does not send to itself
+    grid = style.add_panels(figure, site_count, sender_count, sharex=True, sharey=True)
     panels = {}
     for site, row in zip(log.sites, grid, strict=True):
         for peer, axes in zip(log[site].peers, row, strict=True):
@@ -138,7 +144,8 @@ def has_varying_delay(log: Log) -> bool:
     Returns:
         True if at least one link has more than one constant delay.
     """
-    return not all(map(has_one_constant_delay, _list_link_models(log).values()))
+    link_models = _list_link_models(log).values()
+    return not all(has_one_constant_delay(models) for models in link_models)
 
 
 @draws(
@@ -173,12 +180,14 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
         for axes in grid[-1]:
             axes.set_xlabel("delay or age (ms)")
 
-        first = grid[0, 0]
-        first.set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
+        first_panel = grid[0, 0]
+        first_panel.set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
         is_logarithmic = x_ms[0] > 0.0
         if is_logarithmic:
-            first.set_xscale("log")
-            style.set_plain_log_axis(first.xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0))
+            first_panel.set_xscale("log")
+            labelled_digits = (1.0,) if form.narrow else (1.0, 2.0, 5.0)
+            style.set_plain_log_axis(first_panel.xaxis, labelled_digits)
+
         entries = [(f"age, {text}", line) for text, line in _list_sender_entries(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
@@ -202,16 +211,21 @@ def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
     Returns:
         The delays, in ms, shape (P,). The first one is 0 unless the axis is logarithmic.
     """
-    parts: list[Array] = [np.zeros(0)]
+    value_arrays: list[Array] = [np.zeros(0)]
     for link in links:
-        parts += [link.delay_ms, link.age_ms]
-    values = np.concatenate(parts)
-    known = values[np.isfinite(values)]
-    end_ms = 1.05 * max(float(known.max(initial=0.0)), 1.0)
-    if not needs_log_axis(known):
+        value_arrays += [link.delay_ms, link.age_ms]
+    values_ms = np.concatenate(value_arrays)
+    known_ms = values_ms[np.isfinite(values_ms)]
+
+    longest_ms = float(known_ms.max(initial=0.0))
+    end_ms = 1.05 * max(longest_ms, 1.0)
+    if not needs_log_axis(known_ms):
         return np.linspace(0.0, end_ms, _POINTS)
-    shortest_ms = float(np.percentile(known, 1.0))
-    return np.geomspace(max(0.5 * shortest_ms, 0.1), end_ms, _POINTS)
+
+    # A logarithmic axis has no 0. It begins below nearly all values.
+    short_ms = float(np.percentile(known_ms, 1.0))
+    start_ms = max(0.5 * short_ms, 0.1)
+    return np.geomspace(start_ms, end_ms, _POINTS)
 
 
 def compute_cumulative_percent(values: Array, limits: Array) -> Array:
@@ -235,11 +249,12 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
 def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
     """Returns the mean delay that the scenario states for a link, as the points of a line.
 
-    The figure draws it dashed beside the measured ages, which should agree with it.
+    Figures draw this line dashed beside the measured delays, which should agree with it.
 
     Args:
         log: Log of the run.
-        models: Models of the link in order of time, at least one.
+        models: Delay models of the link in order of time, at least one. A model applies until
+            the next one replaces it.
 
     Returns:
         Times in s, and mean delays in ms, each of shape (3 M,) for M models. Each model has a
@@ -248,6 +263,7 @@ def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Arra
     starts_s = [model.from_s for model in models]
     last_s = max(recorded_end_s(log), starts_s[-1])
     ends_s = [*starts_s[1:], last_s]
+
     times_s: list[float] = []
     means_ms: list[float] = []
     for model, end_s in zip(models, ends_s, strict=True):
@@ -265,10 +281,11 @@ def needs_log_axis(ages_ms: Array) -> bool:
     Args:
         ages_ms: Ages, shape (K,). NaN values are ignored.
     """
-    known = ages_ms[np.isfinite(ages_ms)]
-    if not len(known):
+    known_ms = ages_ms[np.isfinite(ages_ms)]
+    if not len(known_ms):
         return False
-    return bool(known.max() > _RARE_RATIO * np.percentile(known, 95.0))
+    usual_ms = np.percentile(known_ms, 95.0)
+    return bool(known_ms.max() > _RARE_RATIO * usual_ms)
 
 
 def is_unsteady(ages_ms: Array) -> bool:
@@ -277,11 +294,9 @@ def is_unsteady(ages_ms: Array) -> bool:
     The figure then draws the spread of the ages as a band.
 
     Args:
-        ages_ms: Ages over time, shape (K,), in ms.
-
-    Returns:
-        True if the ages fall often, which happens whenever a newer sample is used.
+        ages_ms: Ages of the message in use over time, shape (K,), in ms.
     """
+    # The age falls whenever a newer message comes into use.
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
     return len(falls) > style.SPREAD_BUCKETS
 
@@ -306,9 +321,10 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Explains why a log has no figures of lateness and computing times of the control loop.
+    """Returns the reason why a log has no figures about the timing of the control loops.
 
-    Only live sites measure how late a tick began and how long it took.
+    Only sites in real time measure how late a tick (control period) began, and how long it
+    took.
 
     Args:
         log: Log of the run.
@@ -316,13 +332,16 @@ def explain_missing_loop_times(log: Log) -> str:
     Returns:
         The reason. Empty if at least one site has such times.
     """
-    if any(np.any(log[site].late_us) or np.any(log[site].busy_us) for site in log.sites):
-        return ""
+    for site in log.sites:
+        records = log[site]
+        has_times = np.any(records.late_us) or np.any(records.busy_us)
+        if has_times:
+            return ""
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
 def choose_bin_edges_us(log: Log) -> Array:
-    """Chooses the bins of the histograms of lateness and computing times.
+    """Chooses the bins of the histograms of the lateness and computing time of control loops.
 
     The bins have equal widths on a logarithmic axis, from 1 us to above the longest time of the
     log.
@@ -337,9 +356,11 @@ def choose_bin_edges_us(log: Log) -> Array:
     for site in log.sites:
         for times_us in (log[site].late_us, log[site].busy_us):
             largest_us = max(largest_us, int(times_us.max(initial=0)))
+
     decades = np.log10(max(largest_us, 10) * 1.1)
-    count = int(np.ceil(decades * _BINS_PER_DECADE))
-    return np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
+    bin_count = int(np.ceil(decades * _BINS_PER_DECADE))
+    exponents = np.arange(bin_count + 1) / _BINS_PER_DECADE
+    return np.power(10.0, exponents)
 
 
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
@@ -381,14 +402,18 @@ def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     row_in = 1.3 if form.narrow else 1.05
     with style.styled_figure(form, 0.6 + row_in * len(log.sites)) as figure:
         grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
-        for site, (late, busy) in zip(log.sites, grid, strict=True):
+        for site, (late_axes, busy_axes) in zip(log.sites, grid, strict=True):
             records = log[site]
-            for axes, times_us in ((late, records.late_us), (busy, records.busy_us)):
-                colour = style.site_colour(log, site)
+            colour = style.site_colour(log, site)
+            period_us = 1e6 / log.scenario.sites[site].rate_hz
+
+            for axes, times_us in ((late_axes, records.late_us), (busy_axes, records.busy_us)):
                 _draw_histogram(axes, times_us, edges_us, colour)
-                axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
+                axes.axvline(period_us, **style.LIMIT_LINE)
                 _title_histogram(axes, site, times_us, form)
-            late.set_ylabel("ticks (count)")
+            late_axes.set_ylabel("ticks (count)")
+
+        # Counts are drawn on a logarithmic axis. It begins just below a single tick.
         grid[0, 0].set_ylim(bottom=0.7)
         for axes, label in zip(grid[-1], labels, strict=True):
             axes.set_xlabel(f"{label} (µs)")

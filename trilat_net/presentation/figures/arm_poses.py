@@ -133,14 +133,19 @@ def trace_bodies_m(
     body_count = poses.shape[1] // 7
     for size, pose in zip(sizes_m, np.split(poses, body_count, axis=1), strict=True):
         position = pose[:, np.newaxis, :3]
-        w = pose[:, np.newaxis, 3:4]
-        v = pose[:, np.newaxis, 4:]
+        quaternion_w = pose[:, np.newaxis, 3:4]
+        quaternion_v = pose[:, np.newaxis, 4:]
         box = _BOX_PATH * np.asarray(size)
         corners = np.broadcast_to(box, (len(pose), *box.shape))
+
         # Rotation of a point p by the quaternion (w, v): p + 2 v x (v x p + w p).
-        rotated = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
+        inner = np.cross(quaternion_v, corners) + quaternion_w * corners
+        rotated = corners + 2.0 * np.cross(quaternion_v, inner)
         edges = rotated + position
-        paths.append(edges[..., :2] if arm.chain is None else project_arm_m(arm, edges))
+        if arm.chain is None:
+            paths.append(edges[..., :2])  # a planar arm is drawn in its x-y plane
+        else:
+            paths.append(project_arm_m(arm, edges))
     return paths
 
 
@@ -161,7 +166,10 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     """
     if arm.chain is None:
         return points
-    x, y, z = np.moveaxis(points @ upright_axes(arm.chain).T, -1, 0)
+
+    upright_points = points @ upright_axes(arm.chain).T
+    x, y, z = np.moveaxis(upright_points, -1, 0)
+    # Rotate about the vertical axis by the azimuth, then tilt by the elevation of the viewer.
     across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
     towards = x * np.cos(_AZIMUTH) + y * np.sin(_AZIMUTH)
     height = np.zeros_like(z) if onto_floor else z
@@ -186,16 +194,20 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     grid_s = np.linspace(0.0, end_s, 1001)
     moved_rad = np.zeros_like(grid_s)
     for site in log.sites:
-        part = log[site]
-        if len(part):
-            angles = site_signals.joint_angles(part)
-            steps = np.abs(np.diff(angles, axis=0, prepend=part.q[:1])).sum(axis=1)
-            moved_rad += np.interp(grid_s, part.t_s, np.cumsum(steps))
+        records = log[site]
+        if len(records):
+            angles = site_signals.joint_angles(records)
+            joint_steps = np.abs(np.diff(angles, axis=0, prepend=records.q[:1]))
+            path_rad = np.cumsum(joint_steps.sum(axis=1))
+            moved_rad += np.interp(grid_s, records.t_s, path_rad)
 
     progress = grid_s / end_s
     if moved_rad[-1] > 0.0:
         progress += moved_rad / moved_rad[-1]
-    chosen_s = np.interp(np.linspace(0.0, progress[-1], count), progress, grid_s)
+
+    # Interpolating the times over the progress inverts it.
+    chosen_progress = np.linspace(0.0, progress[-1], count)
+    chosen_s = np.interp(chosen_progress, progress, grid_s)
 
     # The times are rounded to two or three digits, for short titles.
     step_s = 10.0 ** np.floor(np.log10(end_s / 50.0))
@@ -208,7 +220,9 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
-    """Returns the pose of a site in its last record until a time, for drawing.
+    """Returns the pose of a site's arm at a time, with the path of its end effector until then.
+
+    The pose is that of the newest record at or before the time.
 
     Args:
         log: Log of the run.
@@ -216,19 +230,21 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
         t_s: The time, in s.
 
     Returns:
-        The pose. None if the site has no record until then.
+        The points to draw, in m. None if the site has no record until then.
     """
-    part = log[site]
+    records = log[site]
     arm = log.scenario.arms[site]
-    last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
+    until_s = t_s + 1e-9  # tolerates rounding errors of the time
+    last = int(np.searchsorted(records.t_s, until_s, side="right")) - 1
     if last < 0:
         return None
 
-    # The path of the end effector until then. Its last point belongs to the last record.
+    # Points of the path of the end effector. The last of them belongs to the last record.
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
-    positions = joint_positions_m(arm, part.q[rows])
+    positions = joint_positions_m(arm, records.q[rows])
     actual = project_arm_m(arm, positions)
-    reference = reference_angles(part)[last : last + 1]
+
+    reference = reference_angles(records)[last : last + 1]
     desired = project_arm_m(arm, joint_positions_m(arm, reference)[0])
 
     shadow: Array = np.zeros((0, 2))
@@ -238,7 +254,7 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
     bodies: list[Array] = []
     sizes_m = log.scenario.bodies_m(site).values()
     if sizes_m:
-        paths = trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])
+        paths = trace_bodies_m(arm, sizes_m, records.bodies[last : last + 1])
         bodies = [path[0] for path in paths]
     return _ArmPose(
         actual=actual[-1], desired=desired, path=actual[:, -1], shadow=shadow, bodies=bodies
@@ -246,10 +262,11 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
 
 
 def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
-    """Returns a box around poses and the base, with a margin.
+    """Returns a box around poses of arms and their base: the limits of the axes of a picture.
 
-    Before the margin is added, the box is made at least 70 % as wide as it is high, and at
-    least 70 % as high as it is wide, so that pictures are never narrow strips.
+    The box has a margin. Before the margin is added, the box is made at least 70 % as wide as
+    it is high, and at least 70 % as high as it is wide, so that pictures are never narrow
+    strips.
 
     Args:
         poses: The poses. None entries are ignored.
@@ -257,17 +274,19 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
     Returns:
         Left, right, bottom and top of the box, in m.
     """
-    parts = [pose.list_points() for pose in poses if pose is not None]
+    points_of_poses = [pose.list_points() for pose in poses if pose is not None]
     base = np.zeros((1, 2))
-    points = np.concatenate([*parts, base])
+    points = np.concatenate([*points_of_poses, base])
     low = points.min(axis=0)
     high = points.max(axis=0)
     centre = (low + high) / 2.0
-    extent = max(float((high - low).max()), 0.1)
-    half = np.maximum((high - low) / 2.0, 0.35 * extent) + 0.08 * extent
+    size = high - low
+    longer_side_m = max(float(size.max()), 0.1)
+    margin_m = 0.08 * longer_side_m
+    half_size = np.maximum(size / 2.0, 0.35 * longer_side_m) + margin_m
 
-    left, bottom = (centre - half).tolist()
-    right, top = (centre + half).tolist()
+    left, bottom = (centre - half_size).tolist()
+    right, top = (centre + half_size).tolist()
     return left, right, bottom, top
 
 
@@ -275,29 +294,39 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the poses of all arms at a few times, with a row per site and a column per time.
 
+    A reader sees at one glance how the arms moved, and how closely they followed each other.
+
     Args:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    times_s = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
-    poses = {site: [find_pose(log, site, t_s) for t_s in times_s] for site in log.sites}
+    instants = _NARROW_INSTANTS if form.narrow else INSTANTS
+    times_s = choose_instants_s(log, instants)
+    poses = {}
+    for site in log.sites:
+        poses[site] = [find_pose(log, site, t_s) for t_s in times_s]
     all_poses = [pose for row in poses.values() for pose in row]
-    left, right, bottom, top = compute_pose_box_m(all_poses)
+    left_m, right_m, bottom_m, top_m = compute_pose_box_m(all_poses)
     is_planar = all(arm.chain is None for arm in log.scenario.arms.values())
+    horizontal_name = "x" if is_planar else "across"
+    vertical_name = "y" if is_planar else "up"
 
-    width_in = (form.width_in - 0.6) / len(times_s)
-    row_in = width_in * (top - bottom) / (right - left) + 0.08
+    # The height of a row follows from the width of a column, because both axes have one scale.
+    axis_labels_in = 0.6
+    column_in = (form.width_in - axis_labels_in) / len(times_s)
+    row_in = column_in * (top_m - bottom_m) / (right_m - left_m) + 0.08
     with style.styled_figure(form, 0.75 + len(log.sites) * row_in) as figure:
         grid = style.add_panels(figure, len(log.sites), len(times_s), sharex=True, sharey=True)
         for site, row in zip(log.sites, grid, strict=True):
             for axes, pose in zip(row, poses[site], strict=True):
                 _draw_pose(axes, pose, style.site_colour(log, site))
-            row[0].set_ylabel(f"{site}: y (m)" if is_planar else f"{site}: up (m)")
+            row[0].set_ylabel(f"{site}: {vertical_name} (m)")
+
         for axes, t_s in zip(grid[0], times_s, strict=True):
             axes.set_title(f"t = {t_s:.4g} s")
         for axes in grid[-1]:
-            axes.set_xlabel("x (m)" if is_planar else "across (m)")
-        grid[0, 0].set(xlim=(left, right), ylim=(bottom, top))
+            axes.set_xlabel(f"{horizontal_name} (m)")
+        grid[0, 0].set(xlim=(left_m, right_m), ylim=(bottom_m, top_m))
 
         entries: list[tuple[str, dict[str, Any]]] = []
         for site in log.sites:
@@ -316,10 +345,12 @@ def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
     if pose is None:
         style.annotate_empty_panel(axes, "no record")
         return
+
     if len(pose.shadow):
         axes.plot(*pose.shadow.T, **_SHADOW)
     for path in pose.bodies:
         axes.plot(*path.T, color=style.REFERENCE, linewidth=0.8)
+
     axes.plot(*pose.path.T, color=colour, linewidth=0.6, alpha=0.55)
     axes.plot(*pose.desired.T, **_DESIRED)
     axes.plot(
@@ -329,13 +360,14 @@ def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
         solid_capstyle="round",
         solid_joinstyle="round",
     )
+
     joints = pose.actual[1:]
     axes.plot(*joints.T, linestyle="none", marker="o", markersize=2.6, color=colour)
     axes.plot(0.0, 0.0, **_BASE)
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
-    """Draws the poses of all arms at a few times, as pictures in HTML.
+    """Draws the poses of all arms at a few times, as vector pictures for the report's web page.
 
     There is a row per site and a column per time. Sites without records are left out.
 
@@ -349,6 +381,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
     """
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
+
     times_s = choose_instants_s(log)
     rows = []
     for index, site in enumerate(log.sites):
@@ -361,6 +394,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
             label = f"{site} at {t_s:.4g} s"
             pictures.append(_measure_picture(scaled, index, bounds, label))
         rows.append({"site": site, "pictures": pictures})
+
     return render_macro(
         "arms.html",
         "strip",
@@ -373,7 +407,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
 def _measure_picture(
     pose: _ArmPose | None, index: int, bounds: PictureBox, label: str
 ) -> dict[str, Any]:
-    """Returns the lines and points of a picture of a pose, as values for its template.
+    """Returns the values that the SVG template of a pose needs: lines, joints and view box.
 
     Args:
         pose: The pose in units of the picture. None for a picture without an arm.
@@ -395,7 +429,9 @@ def _measure_picture(
             (f"arm site-{index}", pose.actual),
         ]
         lines += [("body", path) for path in pose.bodies]
+        # The y axis of SVG points downwards.
         joints = [(f"{x:.3f}", f"{-y:.3f}") for x, y in pose.actual[1:]]
+
     return {
         "box": f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}",
         "left": f"{left:.3f}",

@@ -92,25 +92,26 @@ def draw_functional(
     height_in = 7.2 if form.narrow else 6.4
     with style.time_figure(log, form, height_in) as plot:
         panels = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)
-        total, parts, work, residual = panels[:, 0]
-        _draw_total(total, log, certificate, balance)
-        _draw_parts(parts, balance, form)
-        _draw_work(work, balance, form)
-        _draw_residual(residual, balance, form)
-        for axes in (total, parts, work, residual):
+        total_panel, parts_panel, work_panel, residual_panel = panels[:, 0]
+        _draw_total(total_panel, log, certificate, balance)
+        _draw_parts(parts_panel, balance, form)
+        _draw_work(work_panel, balance, form)
+        _draw_residual(residual_panel, balance, form)
+        for axes in (total_panel, parts_panel, work_panel, residual_panel):
             # The lower panels have a legend where the numbers of the changes would be.
-            plot.mark(axes, log.sites, numbered=axes is total)
+            plot.mark(axes, log.sites, numbered=axes is total_panel)
             for from_s, to_s in find_unjudged_spans(balance):
                 axes.axvspan(from_s, to_s, **_UNJUDGED)
+
         rise = certificate.verdict.rise
         if rise is not None:
-            total.axvspan(rise.from_s, rise.at_s, **_RISE)
-            total.axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
+            total_panel.axvspan(rise.from_s, rise.at_s, **_RISE)
+            total_panel.axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
 
         entries = [*style.site_legend_entries(log, log.sites), ("V", _TOTAL)]
         if certificate.paper_balance is not None:
             entries.append(("V with the paper's ones", _PAPER_TOTAL))
-        plot.finish([residual], entries)
+        plot.finish([residual_panel], entries)
     return plot.figure
 
 
@@ -132,12 +133,12 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energies that the control laws keep account of and record, in J over time.
+    """Draws energies that the control laws keep account of, in J over time.
 
-    Some laws ensure stability by not returning more energy than they received. There is a panel
-    for each kind that the laws declare: the energy in the lines between sites; the part of this
-    energy that is known to the receivers; stored energy; and energy that the arms gave to the
-    laws or that the laws dissipated. A line between sites has the colour of its receiver.
+    Some control laws ensure stability by never returning more energy than they received, and
+    record this account. The figure has a panel for each kind of energy: in transit between
+    sites, known to the receivers, stored, and exchanged with the arms. A curve of energy in
+    transit has the colour of the receiving site.
 
     Args:
         log: Log of the run.
@@ -149,22 +150,24 @@ def draw_observed_energy(
     panel_in = 1.6 if form.narrow else 1.4
     height_in = panel_in * len(panel_kinds) + 0.8
     with style.time_figure(log, form, height_in) as plot:
-        rows = style.add_panels(plot.figure, len(panel_kinds), 1, sharex=True)[:, 0]
-        panels = dict(zip(panel_kinds, rows, strict=True))
+        panel_axes = style.add_panels(plot.figure, len(panel_kinds), 1, sharex=True)[:, 0]
+        panels = dict(zip(panel_kinds, panel_axes, strict=True))
         for curve in observed.curves:
             panel_kind = curve.kind
-            line = style.site_line(log, curve.site)
-            if curve.kind == "taken":
+            line_style = style.site_line(log, curve.site)
+            if curve.kind == "taken":  # drawn dashed beside the given energy, for comparison
                 panel_kind = "given"
-                line["linestyle"] = _DISSIPATED["linestyle"]
+                line_style["linestyle"] = _DISSIPATED["linestyle"]
             axes = panels[panel_kind]
             ticks = np.arange(len(curve.t_s))
-            style.plot_decimated(axes, ticks, curve.t_s, curve.energy_j, **line)
+            style.plot_decimated(axes, ticks, curve.t_s, curve.energy_j, **line_style)
+
         for kind, axes in panels.items():
             axes.set_ylabel(_OBSERVED_PANELS[kind])
-            plot.mark(axes, log.sites, numbered=axes is rows[0])
+            plot.mark(axes, log.sites, numbered=axes is panel_axes[0])
+
         entries = style.site_legend_entries(log, log.sites)
-        plot.finish([rows[-1]], [*entries, ("taken by the law", _DISSIPATED)])
+        plot.finish([panel_axes[-1]], [*entries, ("taken by the law", _DISSIPATED)])
     return plot.figure
 
 
@@ -227,7 +230,11 @@ def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyB
 
 
 def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the parts of V: kinetic, parameter error, position error, and under way."""
+    """Draws the parts of the energy function V over time, in J.
+
+    V is the function that a stability proof needs. Its parts are the kinetic energy, the errors
+    of parameters and positions, and the energy of messages that are under way.
+    """
     for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
         _draw_line(
             balance,
@@ -242,13 +249,17 @@ def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the dissipated energy by kind, and the work of every source.
+    """Draws where the energy of a run went (dissipation) and where it came from (work), in J.
 
-    The work of all links is drawn as one line. Sources whose work is negligible are left out.
+    The work of all links between sites is drawn as one line. Sources with negligible work are
+    left out.
     """
-    for (name, values), dashes in zip(balance.dissipation.items(), style.DASHES, strict=False):
+    dissipations = balance.dissipation.items()
+    for (name, values), line_pattern in zip(dissipations, style.DASHES, strict=False):
         label = _DISSIPATION_LABELS.get(name, f"taken: {name}")
-        _draw_line(balance, axes, values, label=label, color=style.REFERENCE, linestyle=dashes)
+        _draw_line(
+            balance, axes, values, label=label, color=style.REFERENCE, linestyle=line_pattern
+        )
 
     link_works = [work for name, work in balance.work.items() if "->" in name]
     other_works = {name: work for name, work in balance.work.items() if "->" not in name}
@@ -259,9 +270,9 @@ def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
         **other_works,
         "sampling": balance.sampling,
     }
-    least = 1e-4 * balance.scale
+    smallest_drawn_j = 1e-4 * balance.scale
     for (name, values), colour in zip(works.items(), 2 * _WORK_COLOURS, strict=False):
-        if np.abs(values).max() > least:
+        if np.abs(values).max() > smallest_drawn_j:
             _draw_line(balance, axes, values, label=f"given: {name}", color=colour)
     _add_panel_legend(axes, form)
     axes.set_ylabel("taken and given (J)")

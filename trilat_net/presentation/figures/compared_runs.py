@@ -63,7 +63,9 @@ COMPARED_SIGNALS = {
 def draw_compared_runs(
     logs: Mapping[str, Log], name: str, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws a signal of several runs over time, with a panel per site and joint.
+    """Draws a signal, such as the joint angles, of several runs over one another.
+
+    There is a panel per site (arm) and joint. The dashes of a line distinguish the runs.
 
     Args:
         logs: Logs of the runs, by their names in the legend.
@@ -71,8 +73,8 @@ def draw_compared_runs(
         form: Width, type sizes and resolution of the figure.
 
     Raises:
-        UsageError: There are too many runs for the patterns of dashes, or the runs have no
-            site in common.
+        UsageError: There are too many runs for the patterns of dashes, or the runs have no site
+            in common.
     """
     if len(logs) > len(style.DASHES):
         raise UsageError(
@@ -125,18 +127,22 @@ def draw_compared_runs(
 
 
 def _style_run(number: int, form: FigureSize) -> style.LineOptions:
-    """Returns the options of the lines of a run, without their colour.
+    """Returns the options of the lines of a run: dashes, width and opacity, without the colour.
 
-    The first run is solid, wide and pale, so that dashed lines on it stay visible.
+    The first run is solid, wide and pale, so that dashed lines on top of it stay visible.
 
     Args:
         number: Number of the run, from 0.
         form: Size of the figure.
     """
-    line = {"linestyle": style.DASHES[number], "linewidth": 0.8 if form.narrow else 1.0}
+    width_pt = 0.8 if form.narrow else 1.0
     if number == 0:
-        line |= {"linewidth": 1.6 if form.narrow else 2.0, "alpha": _FIRST_ALPHA}
-    return line
+        return {
+            "linestyle": style.DASHES[0],
+            "linewidth": 2.0 * width_pt,
+            "alpha": _FIRST_ALPHA,
+        }
+    return {"linestyle": style.DASHES[number], "linewidth": width_pt}
 
 
 def list_common_sites(logs: Mapping[str, Log]) -> list[str]:
@@ -150,9 +156,9 @@ def list_common_sites(logs: Mapping[str, Log]) -> list[str]:
 
 
 def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
-    """Returns the text of each run in a legend: its name, and its differing settings.
+    """Returns the text of each run in a legend: its name, and the settings in which it differs.
 
-    An example is "slow: control.Kd = 3, every link 800 ms".
+    An example is "slow: control.Kd = 3, every link 800 ms". Long texts are broken into lines.
 
     Args:
         logs: Logs of the runs, by their names.
@@ -161,7 +167,7 @@ def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
     scenarios = [log.scenario for log in logs.values()]
     differences = compare_scenarios(scenarios) if len(scenarios) > 1 else []
     first_scenario = scenarios[0]
-    letters = round(_LETTERS_PER_IN * form.width_in)
+    letters_per_line = round(_LETTERS_PER_IN * form.width_in)
     labels = {}
     for number, name in enumerate(logs):
         settings = []
@@ -170,12 +176,15 @@ def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
             if difference.concerns_link:
                 settings.append(f"{difference} {value}")
             elif len(difference.owners) == len(first_scenario.sites):
+                # All sites have the same value, so that their names can be left out.
                 settings.append(f"{difference.key} = {value}")
             else:
                 settings.append(f"{difference} = {value}")
         if len(differences) > _MOST_SETTINGS:
-            more = len(differences) - _MOST_SETTINGS
-            settings.append(f"and {count_nouns(more, 'more setting')}")
+            unlisted_count = len(differences) - _MOST_SETTINGS
+            settings.append(f"and {count_nouns(unlisted_count, 'more setting')}")
+
         text = f"{name}: {', '.join(settings)}" if settings else name
-        labels[name] = style.typeset("\n".join(textwrap.wrap(text, letters)))
+        lines = textwrap.wrap(text, letters_per_line)
+        labels[name] = style.typeset("\n".join(lines))
     return labels

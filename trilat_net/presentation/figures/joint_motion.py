@@ -108,21 +108,22 @@ def _explain_absent_displacement(log: Log) -> str:
 def draw_operator_displacement(
     log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
 ) -> Figure:
-    """Draws how far the operators moved every arm, in rad.
+    """Draws how far the operators, people or programs that move the arms, displaced every arm.
 
-    The displacement is the difference between the log and the same run without operators.
+    The displacement, in rad, is the difference between the recorded run and a simulation of the
+    same run without operators.
 
     Args:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
         twin: The run without operators. None to simulate it.
     """
-    other = simulate_without_operators(log) if twin is None else twin
+    run_without_operators = simulate_without_operators(log) if twin is None else twin
     return _draw_joints(
         log=log,
         form=form,
         sites=log.sites,
-        signal=partial(site_signals.operator_displacement, log, other),
+        signal=partial(site_signals.operator_displacement, log, run_without_operators),
         label="moved by operators (rad)",
     )
 
@@ -138,21 +139,21 @@ def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    limits = list[Array]()
+    reached_limits = list[Array]()
     for site in log.sites:
         torques = site_signals.controller_torques(log[site])
-        largest = np.abs(torques).max(axis=0, initial=0.0)
-        limit_nm = log.scenario.sites[site].limits.tau_limit_nm
-        limit = np.broadcast_to(limit_nm, largest.shape)
-        if (largest >= limit).any():
-            limits.append(limit)
+        largest = np.abs(torques).max(axis=0, initial=0.0)  # of each joint
+        site_limits_nm = log.scenario.sites[site].limits.tau_limit_nm
+        joint_limits_nm = np.broadcast_to(site_limits_nm, largest.shape)
+        if (largest >= joint_limits_nm).any():
+            reached_limits.append(joint_limits_nm)
     return _draw_joints(
         log=log,
         form=form,
         sites=log.sites,
         signal=style.site_records(log, site_signals.controller_torques),
         label="control torque (N m)",
-        limits=limits,
+        limits=reached_limits,
     )
 
 
@@ -166,6 +167,8 @@ def _draw_joints(
 ) -> Figure:
     """Draws a signal over time, with a panel per joint and a line per site.
 
+    The functions that draw angles, torques and errors use it, so that these figures look alike.
+
     Args:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
@@ -174,22 +177,25 @@ def _draw_joints(
         label: Label of the value axis.
         limits: Limits of the signal, shape (n,) each. They are drawn with both signs.
     """
-    count = len(style.name_joints(log))
-    rows = len(style.arrange_joints(count, form.narrow))
-    with style.time_figure(log, form, 2.2 + _ROW_IN * (rows - 1)) as plot:
-        panels = style.add_joint_panels(plot.figure, count, form)
+    joint_count = len(style.name_joints(log))
+    row_count = len(style.arrange_joints(joint_count, form.narrow))
+    with style.time_figure(log, form, 2.2 + _ROW_IN * (row_count - 1)) as plot:
+        panels = style.add_joint_panels(plot.figure, joint_count, form)
         style.title_joints(log, panels.joints)
         plot.joint_row(panels.joints, sites, signal)
         for joint, axes in enumerate(panels.joints):
-            joint_limits = {float(limit[joint]) for limit in limits if joint < len(limit)}
-            for value in sorted(joint_limits):
+            # Equal limits of several sites are drawn once. Arms may have fewer joints.
+            values_of_joint = {float(limit[joint]) for limit in limits if joint < len(limit)}
+            for value in sorted(values_of_joint):
                 axes.axhline(value, **style.LIMIT_LINE)
                 axes.axhline(-value, **style.LIMIT_LINE)
-        first = panels.joints[0]
-        if rows == 1:
-            first.set_ylabel(label)
+
+        first_panel = panels.joints[0]
+        if row_count == 1:
+            first_panel.set_ylabel(label)
         else:
-            plot.figure.supylabel(label, fontsize=first.yaxis.label.get_fontsize())
+            plot.figure.supylabel(label, fontsize=first_panel.yaxis.label.get_fontsize())
+
         entries = style.site_legend_entries(log, sites)
         if limits:
             entries.append(("limit", style.LIMIT_LINE))
@@ -206,7 +212,7 @@ def add_joint_rows(
     sharey: str,
     titles: Sequence[str] = (),
 ) -> tuple[list[list[Axes]], list[Axes]]:
-    """Adds a panel per quantity and joint to a figure.
+    """Adds a grid of panels to a figure: one panel per quantity and joint.
 
     Arms with two joints have a column per joint and a row per quantity. Arms with more joints
     have a row per joint and a column per quantity, because a row of many joints would not fit.
@@ -238,14 +244,15 @@ def add_joint_rows(
         style.label_row(row[0], title, form)
     for axes, head in zip(grid[0], heads, strict=True):
         axes.set_title(head)
+    # The caller gets the panels by quantity and joint, in either arrangement.
     return [list(column) for column in grid.T], list(grid[-1])
 
 
 @draws("operation", "torque on the arms above their angles", explain_absent_operator)
 def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws what the operators did and how the arms moved.
+    """Draws the torques of the operators on the arms, in N m, and the joint angles, in rad.
 
-    The torques of the operators on the arms, in N m, are above the joint angles, in rad, or
+    An operator is the person or program that moves an arm. The torques are above the angles, or
     beside them if the arms have more than two joints.
 
     Args:
@@ -260,9 +267,10 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         (torques, angles), lowest = add_joint_rows(
             figure=plot.figure, log=log, form=form, heads=heads, labels=heads, sharey="none"
         )
-        if len(torques) == 2:
+        if len(torques) == 2:  # the two torques are side by side, and share one value axis
             torques[1].sharey(torques[0])
             torques[1].tick_params(labelleft=False)
+
         operated_sites = plot_signals.sites_with_operator(log)
         torque_signal = style.site_records(log, site_signals.external_torques)
         angle_signal = style.site_records(log, site_signals.joint_angles)
@@ -273,25 +281,28 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def choose_height_in(log: Log, two_joints_in: float) -> float:
-    """Returns the height of a figure that has a row per joint if there are more than two.
+    """Returns the height of a figure with panels per joint, in inches.
+
+    More than two joints have a row each, see `add_joint_rows`.
 
     Args:
         log: Log of the run.
         two_joints_in: Height of the figure of arms with two joints, in inches.
-
-    Returns:
-        The height, in inches.
     """
-    count = len(style.name_joints(log))
-    return two_joints_in if count == 2 else 0.8 + 0.9 * count
+    joint_count = len(style.name_joints(log))
+    if joint_count == 2:
+        return two_joints_in
+    legend_and_axis_in = 0.8
+    row_in = 0.9
+    return legend_and_axis_in + row_in * joint_count
 
 
 @draws("positions", "actual and desired angles (Fig. 4 of the paper)", in_report=True)
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the desired and the actual joint angles over time, as Fig. 4 of the paper.
 
-    The desired angles of a site are the average of its peers, weighted with the dominance
-    factors. The angles are in rad.
+    A site is an arm with its controller. Its desired angles are the average of the angles of
+    the other sites, weighted with the dominance factors. The angles are in rad.
 
     Args:
         log: Log of the run.
@@ -308,13 +319,14 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         for site, row in zip(log.sites, grid, strict=True):
             actual = site_signals.joint_angles(log[site])
             desired = plot_signals.reference_angles(log[site])
-            joints = actual.shape[1]
-            for joint, axes in enumerate(row[:joints]):
+            joint_count = actual.shape[1]
+            for joint, axes in enumerate(row[:joint_count]):
                 plot.trace(axes, site, actual[:, joint], 1.6)
                 plot.trace(axes, site, desired[:, joint], **style.LIMIT_LINE)
                 plot.mark(axes, [site])
                 if not len(log[site]):
                     style.annotate_empty_panel(axes, f"no records of {site}")
+
         entries = []
         for site in log.sites:
             label = f"{style.site_title(log, site)}, actual"
@@ -342,11 +354,11 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """
     titles = style.name_shared(log)
     unit = plot_signals.shared_unit(log)
-    rows = len(style.arrange_joints(len(titles), form.narrow))
-    with style.time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
+    row_count = len(style.arrange_joints(len(titles), form.narrow))
+    with style.time_figure(log, form, 3.6 + _ROW_IN * (row_count - 1)) as plot:
         panels = style.add_joint_panels(plot.figure, len(titles), form, below="all")
-        settling = panels.below
-        assert settling is not None
+        settling_panel = panels.below
+        assert settling_panel is not None
         style.title_joints(log, panels.joints, titles)
         error_signal = style.site_records(log, site_signals.joint_errors)
         plot.joint_row(panels.joints, log.sites, error_signal)
@@ -354,23 +366,23 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         for axes in first_in_rows:
             axes.set_ylabel(f"tracking error ({unit})")
 
-        low = SETTLED_ERROR_RAD
-        high = SETTLED_ERROR_RAD
+        lowest_drawn = SETTLED_ERROR_RAD
+        highest_drawn = SETTLED_ERROR_RAD
         for site in log.sites:
             remaining = style.positive(site_signals.largest_remaining_error(log[site]))
-            plot.trace(settling, site, remaining)
-            low = np.nanmin(remaining, initial=low)
-            high = np.nanmax(remaining, initial=high)
-        settling.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
-        settling.set(
+            plot.trace(settling_panel, site, remaining)
+            lowest_drawn = np.nanmin(remaining, initial=lowest_drawn)
+            highest_drawn = np.nanmax(remaining, initial=highest_drawn)
+        settling_panel.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
+        settling_panel.set(
             yscale="log",
-            ylim=(0.5 * low, 2.0 * high),
+            ylim=(0.5 * lowest_drawn, 2.0 * highest_drawn),
             ylabel=f"largest error\nstill to come ({unit})",
         )
-        plot.mark(settling, log.sites)
+        plot.mark(settling_panel, log.sites)
         entries = style.site_legend_entries(log, log.sites)
         entries.append((f"settling limit: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE))
-        plot.finish([*panels.lowest, settling], entries)
+        plot.finish([*panels.lowest, settling_panel], entries)
     return plot.figure
 
 
@@ -388,37 +400,40 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     entries = []
     with style.time_figure(log, form, 2.4) as plot:
         axes = style.add_panels(plot.figure, 1, 1)[0, 0]
-        low = SETTLED_ERROR_RAD
-        high = SETTLED_ERROR_RAD
+        lowest_drawn = SETTLED_ERROR_RAD
+        highest_drawn = SETTLED_ERROR_RAD
         for site in log.sites:
             errors = site_signals.largest_magnitude(site_signals.joint_errors(log[site]))
-            drawn = style.positive(errors)
-            plot.trace(axes, site, drawn)
+            drawn_errors = style.positive(errors)
+            plot.trace(axes, site, drawn_errors)
             if errors.any():
                 # The 2nd percentile excludes the dips at zero crossings, which would stretch
                 # the logarithmic axis.
-                site_low, site_high = np.nanpercentile(drawn, (2.0, 100.0)).tolist()
-                low = min(low, site_low)
-                high = max(high, site_high)
+                site_lowest, site_highest = np.nanpercentile(
+                    drawn_errors, (2.0, 100.0)
+                ).tolist()
+                lowest_drawn = min(lowest_drawn, site_lowest)
+                highest_drawn = max(highest_drawn, site_highest)
 
-            line = style.site_line(log, site)
+            line_style = style.site_line(log, site)
             settled_s = site_signals.settling_time_s(log[site])
             if settled_s is None:
-                entries.append((f"{site}: no settling time", line))
+                entries.append((f"{site}: no settling time", line_style))
             else:
                 axes.plot(
                     settled_s,
                     SETTLED_ERROR_RAD,
                     marker="v",
                     markersize=6.0,
-                    color=line["color"],
+                    color=line_style["color"],
                     clip_on=False,
                 )
-                entries.append((f"{site}: settling time {settled_s:.1f} s", line))
+                entries.append((f"{site}: settling time {settled_s:.1f} s", line_style))
+
         axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         axes.set(
             yscale="log",
-            ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high),
+            ylim=(max(0.5 * lowest_drawn, _LEAST_RAD), 2.0 * highest_drawn),
             ylabel=f"largest error ({unit})",
         )
         plot.mark(axes, log.sites)
@@ -456,7 +471,8 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
     arm = log.scenario.arms[log.sites[0]]
     if arm.chain is not None:
         return _draw_link_estimates(log, form)
-    # a panel per parameter, numbered from 1
+
+    # Each text is a row of panels. A digit is the number of a parameter and its panel.
     mosaic = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
     with style.time_figure(log, form, 4.4 if form.narrow else 3.6) as plot:
         panels = plot.figure.subplot_mosaic([[*row] for row in mosaic])
@@ -558,11 +574,11 @@ def _draw_estimate(
 
 @draws("phase", "errors against their rates")
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the phase portrait of the tracking errors, with a panel per joint.
+    """Draws the tracking errors of each joint against their rates of change (phase portrait).
 
-    The vertical axis has the velocity error qd - qd_des, and the horizontal axis the error q -
-    q_des, where q is the angle of the joint, qd its velocity, and "des" stands for desired. A
-    ring marks the start of a site, and a disc its end.
+    Each joint has a panel. The horizontal axis has the error q - q_des, the actual minus the
+    desired joint angle. The vertical axis has the velocity error qd - qd_des. A stable motion
+    spirals to the origin. A ring marks the start of a site's motion, and a disc its end.
 
     Args:
         log: Log of the run.
@@ -570,7 +586,9 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """
     titles = style.name_shared(log)
     unit = plot_signals.shared_unit(log)
-    rate_unit = f"{unit.replace(',', '/s,')}/s"
+    rate_unit = f"{unit.replace(',', '/s,')}/s"  # "m, rad" becomes "m/s, rad/s"
+
+    # Square panels: the height of a row follows from the width of a column.
     mosaic = style.arrange_joints(len(titles), form.narrow)
     columns = len(mosaic[0])
     row_in = 0.72 * form.width_in / columns
@@ -580,19 +598,22 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             records = log[site]
             if not len(records):
                 continue
-            line = style.site_line(log, site, _LOOP_PT)
+
+            line_style = style.site_line(log, site, _LOOP_PT)
             errors = site_signals.joint_errors(records)
             rates = plot_signals.joint_error_rates(records)
-            joints = errors.shape[1]
-            for joint, axes in enumerate(panels[:joints]):
+            joint_count = errors.shape[1]
+            for joint, axes in enumerate(panels[:joint_count]):
                 path = np.stack([errors[:, joint], rates[:, joint]], axis=1)
-                _draw_path(axes, path, line)
+                _draw_path(axes, path, line_style)
+
         style.title_joints(log, panels, titles)
         for axes in panels:
             axes.set_xlabel(f"error ({unit})")
             if form.narrow:
                 axes.locator_params(axis="x", nbins=3)
-        for axes in panels[::columns]:
+
+        for axes in panels[::columns]:  # the first panel of each row
             axes.set_ylabel(f"its rate ({rate_unit})")
         style.add_legend(figure, style.site_legend_entries(log, log.sites))
     return figure
@@ -610,11 +631,11 @@ def _has_only_chains(log: Log) -> bool:
     in_report=True,
 )
 def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the paths of the end effectors of arms in space in three planes, in m.
+    """Draws the paths of the end effectors of arms in space, projected onto three planes, in m.
 
-    The planes are those of the frame that all sites share. If the sites exchange poses of their
-    end effectors (task space), the paths are scaled to the task. A ring marks the start of a
-    site, and a disc its end.
+    All sites share the coordinate frame. If the sites exchange poses of their end effectors
+    (task space), each path is scaled to the common task. A ring marks the start of a path, and
+    a disc its end.
 
     Args:
         log: Log of the run.
@@ -630,19 +651,22 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 continue
             arm_rows = build_arm_rows(log.scenario, site)
             end_effector = arm_rows.place_end_effector(records.q, records.qd)
-            positions = end_effector.position * log.scenario.sites[site].task.scale
+            task_scale = log.scenario.sites[site].task.scale
+            positions = end_effector.position * task_scale
+
             for axes, plane in zip(panels, _PLANES, strict=True):
                 _draw_path(axes, positions[:, plane], style.site_line(log, site))
-        for axes, (across, up) in zip(panels, _PLANES, strict=True):
+
+        for axes, (across, upwards) in zip(panels, _PLANES, strict=True):
             axes.set_aspect("equal", adjustable="datalim")
-            axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)")
+            axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[upwards]} (m)")
             axes.locator_params(nbins=4)
         style.add_legend(figure, style.site_legend_entries(log, log.sites))
     return figure
 
 
 def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
-    """Draws a path with a ring at its start and a disc at its end.
+    """Draws the path of a point in a plane, with a ring at its start and a disc at its end.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -660,8 +684,8 @@ def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
 def thin_path(path: Array) -> Array:
     """Returns points of a path at about equal distances along it, including both ends.
 
-    The path is thinned by its length and not by time, so that its fast parts keep as many
-    points as its slow ones.
+    Figures need far fewer points than a log has records. The path is thinned by its length and
+    not by time, so that its fast parts keep as many points as its slow ones.
 
     Args:
         path: Points of the path, shape (K, 2), K > 0. Each axis is scaled to its own extent.
@@ -670,12 +694,15 @@ def thin_path(path: Array) -> Array:
         Some of the points, shape (P, 2).
     """
     extent = np.ptp(path, axis=0)
-    scaled = path / np.where(extent > 0.0, extent, 1.0)
-    steps = np.diff(scaled, axis=0, prepend=scaled[:1])
+    scaled_path = path / np.where(extent > 0.0, extent, 1.0)
+    steps = np.diff(scaled_path, axis=0, prepend=scaled_path[:1])
     length = np.cumsum(np.hypot(*steps.T))
-    _, first_in_step = np.unique(np.floor(length / _PATH_STEP), return_index=True)
-    rows = np.union1d(first_in_step, [0, len(path) - 1])
-    thinned: Array = path[rows]
+
+    # The first point of each step of length `_PATH_STEP` remains.
+    step_numbers = np.floor(length / _PATH_STEP)
+    _, first_in_step = np.unique(step_numbers, return_index=True)
+    remaining = np.union1d(first_in_step, [0, len(path) - 1])
+    thinned: Array = path[remaining]
     return thinned
 
 
@@ -697,35 +724,39 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
     unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the dominance factors that change during the run, and the motion of all arms.
+    """Draws how the authority over the arms changes during a run, and how the arms move.
 
-    The dominance factor of a peer is the weight with which a site follows this peer. The motion
-    of an arm is its displacement from the start of the run, in rad.
+    The upper panels have the dominance factors: the weights with which a site follows each of
+    the other sites. The lower panels have the displacements of the joints from the start, in
+    rad. A reader sees whether the arms move smoothly while the authority passes from one
+    operator to another.
 
     Args:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    owners = list_sites_with_changing_dominance(log)
+    changing_sites = list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
-    rows = len(owners) + len(titles)
+    row_count = len(changing_sites) + len(titles)
     has_low_rows = len(titles) > 2
     row_in = 0.8 if has_low_rows else 1.05
-    with style.time_figure(log, form, 0.8 + row_in * rows) as plot:
-        panels = style.add_panels(plot.figure, rows, 1, sharex=True)[:, 0]
-        share_panels = panels[: len(owners)]
-        joint_panels = panels[len(owners) :]
-        for site, axes in zip(owners, share_panels, strict=True):
-            alpha = trace_dominance(log, site, log[site].t_s).alpha
-            for peer, share in zip(log.scenario.peers(site), alpha.T, strict=True):
-                plot.trace(axes, site, share, **style.site_line(log, peer))
+    with style.time_figure(log, form, 0.8 + row_in * row_count) as plot:
+        panels = style.add_panels(plot.figure, row_count, 1, sharex=True)[:, 0]
+        share_panels = panels[: len(changing_sites)]
+        joint_panels = panels[len(changing_sites) :]
+        for site, axes in zip(changing_sites, share_panels, strict=True):
+            factors = trace_dominance(log, site, log[site].t_s).alpha
+            for peer, factor in zip(log.scenario.peers(site), factors.T, strict=True):
+                plot.trace(axes, site, factor, **style.site_line(log, peer))
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
             plot.mark(axes, [site])
+
         for site in log.sites:
-            start = np.array(log.scenario.sites[site].q0_rad)
-            moved = site_signals.joint_angles(log[site]) - start
-            for axes, values in zip(joint_panels, moved.T, strict=False):
+            start_angles = np.array(log.scenario.sites[site].q0_rad)
+            displacements = site_signals.joint_angles(log[site]) - start_angles
+            for axes, values in zip(joint_panels, displacements.T, strict=False):
                 plot.trace(axes, site, values)
+
         for title, axes in zip(titles, joint_panels, strict=True):
             if has_low_rows:
                 style.label_row(axes, title, form)
@@ -754,10 +785,10 @@ def _list_sites_with_walls(log: Log) -> list[str]:
     unless(_list_sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the contact of the arms with walls over time.
+    """Draws the force and the depth of the contact between the arms and the virtual walls.
 
-    The panels have the normal force of every wall, in N, and the depth of the end effector in
-    it, in mm.
+    The panels have the normal force of every wall, in N, and the depth to which the end
+    effector has entered the wall, in mm.
 
     Args:
         log: Log of the run.
@@ -770,12 +801,13 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             records = log[site]
             arm_rows = build_arm_rows(log.scenario, site)
             end_effector = arm_rows.place_end_effector(records.q, records.qd)
-            for number, wall in enumerate(list_walls(log.scenario.sites[site])):
-                dashes = style.DASHES[number % len(style.DASHES)]
-                force = wall_force(wall, records.t_s, end_effector)
+            for wall_number, wall in enumerate(list_walls(log.scenario.sites[site])):
+                dashes = style.DASHES[wall_number % len(style.DASHES)]
+                force_n = wall_force(wall, records.t_s, end_effector)
                 depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
-                plot.trace(force_panel, site, force, 1.1, linestyle=dashes)
+                plot.trace(force_panel, site, force_n, 1.1, linestyle=dashes)
                 plot.trace(depth_panel, site, depth_mm, 1.1, linestyle=dashes)
+
         force_panel.set_ylabel("force of wall (N)")
         depth_panel.set_ylabel("depth in it (mm)")
         for axes in (force_panel, depth_panel):

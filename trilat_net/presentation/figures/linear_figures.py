@@ -103,15 +103,20 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the figure of impedances."""
+    """Returns the texts and line styles for the legend of the figure of impedances.
+
+    An operator at one site feels an impedance that depends on the other site, which is free to
+    move or clamped.
+    """
     operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
     entries: list[tuple[str, dict[str, Any]]] = [
         (f"felt at {site}", {"color": _site_colour(ports, site)}) for site in operator_sites
     ]
+
     other_site = ports.transparency[0].other_site
-    clamped = {"color": style.REFERENCE, "linestyle": _CLAMPED}
+    clamped_line = {"color": style.REFERENCE, "linestyle": _CLAMPED}
     entries.append((f"{other_site} free", {"color": style.REFERENCE}))
-    entries.append((f"{other_site} clamped", clamped))
+    entries.append((f"{other_site} clamped", clamped_line))
     entries.append(("band of the ratio", {**_BAND, "alpha": 0.4, "linewidth": 6.0}))
     return entries
 
@@ -130,25 +135,25 @@ def _plot_impedance(
         magnitude: Panel of the magnitude.
         phase: Panel of the phase.
     """
-    for index, response in enumerate(responses):
-        hz = _convert_to_hz(response.w_rad_s)
+    for number, response in enumerate(responses):
+        frequency_hz = _convert_to_hz(response.w_rad_s)
         width = 1.1
         if len(responses) > 1:
             # Later lines are thinner, so that lines that coincide all stay visible.
-            width = 2.0 - 1.2 * index / (len(responses) - 1)
+            width = 2.0 - 1.2 * number / (len(responses) - 1)
         for impedance, dashes in ((response.free, "-"), (response.clamped, _CLAMPED)):
-            line: dict[str, Any] = {
+            line_style: dict[str, Any] = {
                 "color": _site_colour(ports, response.operator_site),
                 "linestyle": dashes,
                 "linewidth": width,
             }
-            magnitude.loglog(hz, np.abs(impedance), **line)
+            magnitude.loglog(frequency_hz, np.abs(impedance), **line_style)
             # The phase is continuous, and starts between -180 and 180 degrees.
             angle_rad = np.unwrap(np.angle(impedance))
-            phase.semilogx(hz, np.rad2deg(angle_rad), **line)
+            phase.semilogx(frequency_hz, np.rad2deg(angle_rad), **line_style)
     for axes in (magnitude, phase):
         axes.axvspan(*responses[0].band_hz, **_BAND)
-        axes.set_xlim(hz[0], hz[-1])
+        axes.set_xlim(frequency_hz[0], frequency_hz[-1])
 
 
 def _describe_ratios(responses: Sequence[Transparency]) -> str:
@@ -189,6 +194,7 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
         return style.empty_figure(
             "The loop without operators is unstable: it cannot be passive.", size
         )
+
     with style.styled_figure(size, 3.9) as figure:
         above, below = style.add_panels(figure, 2, 1, sharex=True)[:, 0]
         _plot_eigenvalues(ports, above)
@@ -236,14 +242,19 @@ def _shade_failures(axes: Axes, minima: Minima) -> None:
 
 
 def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws the smallest eigenvalues of Y + Y^H over their bound, per joint and in all."""
+    """Draws the smallest eigenvalue of Y + Y^H over frequency, per joint and for all joints.
+
+    Y is the admittance matrix of the places at which operators hold the arms. Eigenvalues below
+    0 mean that the arms could supply energy to an operator. They are divided by their bound 2
+    |Y|.
+    """
     curves = [(passivity, _style_joint(joint)) for joint, passivity in ports.joints.items()]
     if ports.proof is not None:
         curves.append((ports.proof, _PROOF))
     curves.append((ports.velocity, _ALL))
-    for passivity, line in curves:
+    for passivity, line_style in curves:
         relative = passivity.minima.values / (2.0 * passivity.size)
-        _plot_over_hz(axes, passivity.minima, relative, **line)
+        _plot_over_hz(axes, passivity.minima, relative, **line_style)
     _shade_failures(axes, ports.velocity.minima)
     axes.axhline(0.0, **style.LIMIT_LINE)
     axes.set(ylim=(-1.08, 1.08), ylabel=r"$\lambda_{\min}(Y+Y^{\mathrm{H}})\,/\,2\|Y\|$")
@@ -273,10 +284,11 @@ _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder":
 
 
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
-    """Draws the characteristic roots of the linearised loop in the complex plane.
+    """Draws the characteristic roots of the linearised control loop in the complex plane.
 
-    The roots of the continuous and of the sampled loop have different marks. The half-plane of
-    unstable roots, whose motions grow, is shaded.
+    A root with a positive real part belongs to a motion that grows: the loop is unstable. This
+    half of the plane is shaded. The roots of the loop in continuous time and of the loop as it
+    is executed in ticks (control periods) have different marks.
 
     Args:
         analysis: The linear analysis.
@@ -298,8 +310,9 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
                 colour=SITE_COLOURS[1],
                 label="as computed",
             )
-        zeros = analysis.decisive.zeros
-        if zeros:
+        # Some roots are 0 in every such loop, for example because all arms may move together.
+        zero_count = analysis.decisive.zeros
+        if zero_count:
             axes.plot(
                 [0.0],
                 [0.0],
@@ -307,7 +320,7 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
                 markersize=9.0,
                 fillstyle="none",
                 color=style.FAINT,
-                label=f"zero by structure ({zeros})",
+                label=f"zero by structure ({zero_count})",
             )
 
         # The unstable half is visible even if all roots are stable.
@@ -321,7 +334,10 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
 
 
 def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
-    """Draws the roots of a spectrum and their complex conjugates.
+    """Draws characteristic roots of a linear system in the complex plane.
+
+    The system is unstable if any root has a positive real part. The spectrum lists only one
+    root of each complex pair, and its conjugate is drawn too.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -332,10 +348,10 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
     """
     roots = [root.s for root in spectrum.roots]
     conjugates = [root.conjugate() for root in roots if root.imag]
-    points = np.array([*roots, *conjugates])
+    all_roots = np.array([*roots, *conjugates])
     axes.plot(
-        points.real,
-        points.imag,
+        all_roots.real,
+        all_roots.imag,
         mark,
         markersize=4.5,
         fillstyle="none",
@@ -351,10 +367,11 @@ _TRANSPORT_STEP = 0.22
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
-    """Draws the measured one-way delays of a network, in ms, for several loads.
+    """Draws the measured one-way delays of messages in a network, in ms, for several loads.
 
-    A load is a size of messages in bytes, and a number of messages per second. The load that
-    the benchmarked experiment needs is shaded.
+    A load (case) is a size of messages in bytes, and a number of messages per second. The load
+    that the benchmarked experiment needs is shaded. Transports are the protocols that were
+    measured.
 
     Args:
         facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.
@@ -363,23 +380,25 @@ def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
     needs = facts["needs"]
     cases = list(dict.fromkeys((row["bytes"], row["rate_hz"]) for row in rows))
     transports = list(dict.fromkeys(row["transport"] for row in rows))
-    middle = (len(transports) - 1) / 2
+    middle_transport = (len(transports) - 1) / 2
+
     with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         for row in rows:
             transport = transports.index(row["transport"])
             case = cases.index((row["bytes"], row["rate_hz"]))
-            x = case + _TRANSPORT_STEP * (transport - middle)
+            # The transports of a case stand side by side around the middle of the case.
+            x = case + _TRANSPORT_STEP * (transport - middle_transport)
             _plot_case(axes, x, row, transport)
         _plot_bounds(axes, facts)
         axes.set_yscale("log")
 
         labels = [f"{size} B\n{rate:g} Hz" for size, rate in cases]
-        needed = cases.index((needs["sample_bytes"], needs["rate_hz"]))
-        labels[needed] += f"\n{facts['scenario']}"
+        needed_case = cases.index((needs["sample_bytes"], needs["rate_hz"]))
+        labels[needed_case] += f"\n{facts['scenario']}"
         axes.axvspan(
-            needed - 0.45,
-            needed + 0.45,
+            needed_case - 0.45,
+            needed_case + 0.45,
             color=style.FAINT,
             alpha=0.15,
             linewidth=0.0,
@@ -426,7 +445,7 @@ def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> 
         transport: Number of the transport, on which its colour and its mark depend.
     """
     times_us = row["one_way_us"]
-    if times_us is not None:
+    if times_us is not None:  # None if all messages were lost
         p50_ms = times_us["p50"] / 1e3
         p99_ms = times_us["p99"] / 1e3
         largest_ms = times_us["max"] / 1e3
@@ -458,6 +477,7 @@ def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
         ("one period", 1e3 / needs["rate_hz"], "center"),
         ("held by links", needs["held_ms"], "top"),
     ]
+
     for interval in stable_ms:
         low_ms, high_ms = interval
         has_age = any(low_ms <= age_ms <= high_ms for age_ms in ages_ms)
@@ -498,34 +518,47 @@ def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
     Args:
         facts: Results of the search for gains, from `ArmGains.to_dict`.
     """
-    edge = facts["edge"]
+    stability_edge = facts["edge"]
     margin = facts["margin"]
     curve = np.array(facts["curve"])
     delay_ms = 1e3 * curve[:, 0]
-    k = curve[:, 1]
-    used_k = edge["used_per_s2"] / margin
-    marks = [(used_k, "D", f"the gains, margin {margin:g}")]
+    largest_k_per_s2 = curve[:, 1]
+    used_k_per_s2 = stability_edge["used_per_s2"] / margin
+    # Each mark is a stiffness over inertia, a marker of Matplotlib, and a text.
+    marks = [(used_k_per_s2, "D", f"the gains, margin {margin:g}")]
     for run in facts["runs"]:
         if run["share"]:
             mark, label = _RUN_MARKS[run["stable"]]
-            marks.append((run["share"] * edge["k_per_s2"], mark, label))
+            marks.append((run["share"] * stability_edge["k_per_s2"], mark, label))
 
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
         axes.loglog(
-            delay_ms, k, color=SITE_COLOURS[0], linewidth=1.4, label="edge, constant delay"
+            delay_ms,
+            largest_k_per_s2,
+            color=SITE_COLOURS[0],
+            linewidth=1.4,
+            label="edge, constant delay",
         )
-        axes.fill_between(delay_ms, k, 10.0 * k.max(), **_UNSTABLE)
-        for marked_k, mark, label in marks:
+
+        # The region above the edge is unstable.
+        axes.fill_between(
+            delay_ms, largest_k_per_s2, 10.0 * largest_k_per_s2.max(), **_UNSTABLE
+        )
+
+        for marked_k_per_s2, mark, label in marks:
             axes.plot(
                 facts["age_ms"],
-                marked_k,
+                marked_k_per_s2,
                 mark,
                 color=SITE_COLOURS[1],
                 markersize=4.5,
                 label=label,
             )
-        axes.set(xlim=(delay_ms[0], delay_ms[-1]), ylim=(0.3 * k.min(), 3.0 * k.max()))
+        axes.set(
+            xlim=(delay_ms[0], delay_ms[-1]),
+            ylim=(0.3 * largest_k_per_s2.min(), 3.0 * largest_k_per_s2.max()),
+        )
         axes.set(xlabel="delay of each link (ms)", ylabel=r"K / inertia (1/s$^2$)")
         figure.legend(loc="outside upper center", ncols=2, handlelength=1.2, columnspacing=1.0)
     return figure

@@ -107,6 +107,7 @@ def write_figures(
     drawings: dict[str, Callable[[], Figure]] = {}
     for name in unique_names or list_drawable_figures(log):
         drawings[name] = partial(_find_figure(log, name).draw, log, form)
+
     return _write(
         drawings=drawings,
         folder=folder,
@@ -132,12 +133,14 @@ def write_overlay(
 ) -> list[Path]:
     """Writes figures that compare several runs, as overlay.pdf and overlay_positions.pdf.
 
+    The figure "overlay" has the largest values of each run. The other figures have a panel per
+    arm and joint.
+
     Args:
         logs: The logs, by their names in the legend.
         folder: Folder of the files. It is created if it does not exist.
         names: Names of the figures: overlay, positions, tracking_errors or control_torques.
-            Empty for all of them; if there are too many runs, or no common site, for overlay
-            alone.
+            Empty for all of them, or for overlay alone if the others cannot show the runs.
         width_in: Width of the figures, 3.5 or 7 in.
         formats: Formats of the files, of `FIGURE_FORMATS`.
         force: True to overwrite existing files.
@@ -150,19 +153,24 @@ def write_overlay(
             different units, the logs cannot be drawn in a figure, or a file exists.
     """
     form = FigureSize.for_print(width_in)
-    known = (OVERLAY, *COMPARED_SIGNALS)
+    known_names = (OVERLAY, *COMPARED_SIGNALS)
     for name in names:
-        if name not in known:
-            raise UsageError(f"figures of several logs are {', '.join(known)}, not {name!r}")
+        if name not in known_names:
+            raise UsageError(
+                f"figures of several logs are {', '.join(known_names)}, not {name!r}"
+            )
     if not names:
-        has_panels = len(logs) <= len(DASHES) and list_common_sites(logs)
-        names = known if has_panels else (OVERLAY,)
+        # Figures with panels distinguish the runs by their dashes, and need common sites.
+        can_draw_panels = len(logs) <= len(DASHES) and list_common_sites(logs)
+        names = known_names if can_draw_panels else (OVERLAY,)
+
     drawings: dict[str, Callable[[], Figure]] = {}
     for name in dict.fromkeys(names):
         if name == OVERLAY:
             drawings[OVERLAY] = partial(draw_overlay, logs, form)
         else:
             drawings[f"{OVERLAY}_{name}"] = partial(draw_compared_runs, logs, name, form)
+
     return _write(drawings, folder, form, formats, force=force)
 
 
@@ -176,13 +184,13 @@ def write_report_figures(
     """Writes the figures of a run's report as PNG files.
 
     Figures for which the log has nothing to show are left out. Earlier files in the folder are
-    replaced. An operator is a person or program that moves an arm.
+    replaced.
 
     Args:
         log: Log of the run.
         folder: Folder of the files. It is created if it does not exist.
-        twin: Log of the same run, repeated without operators. None to leave out the figure that
-            shows how far operators moved the arms.
+        twin: Log of the same run, repeated without operators, the people or programs that move
+            the arms. None to leave out the figure that shows how far operators moved the arms.
         progress: Function that is called with the number of drawn figures and of all figures.
         pushed: How small pushes grow in repetitions of the run. None to compute this here.
 
@@ -235,25 +243,27 @@ def _write(
     Raises:
         UsageError: A format does not exist, or a file exists.
     """
-    kinds = list(dict.fromkeys(formats))
-    for kind in kinds:
-        if kind not in FIGURE_FORMATS:
-            known = ", ".join(FIGURE_FORMATS)
-            raise UsageError(f"a figure can be written as {known}, not as {kind!r}")
+    unique_formats = list(dict.fromkeys(formats))
+    for file_format in unique_formats:
+        if file_format not in FIGURE_FORMATS:
+            known_formats = ", ".join(FIGURE_FORMATS)
+            raise UsageError(
+                f"a figure can be written as {known_formats}, not as {file_format!r}"
+            )
     for name in drawings:
-        for kind in kinds:
-            refuse_existing(folder / f"{name}.{kind}", force=force)
+        for file_format in unique_formats:
+            refuse_existing(folder / f"{name}.{file_format}", force=force)
 
     paths = []
     for drawn_count, (name, draw) in enumerate(drawings.items()):
         if progress is not None:
             progress(drawn_count, len(drawings))
-        drawn = draw()
+        figure_of_log = draw()
         make_folder(folder)
-        for kind in kinds:
-            path = folder / f"{name}.{kind}"
+        for file_format in unique_formats:
+            path = folder / f"{name}.{file_format}"
             paths.append(path)
-            write_figure(drawn, path, form.dpi)
+            write_figure(figure_of_log, path, form.dpi)
     return paths
 
 
@@ -265,12 +275,14 @@ def _find_figure(log: Log, name: str) -> FigureEntry:
     """
     if name == OVERLAY:
         raise UsageError("overlay shows several runs in one figure: add --with FILE")
+
     if name not in FIGURES:
         hint = suggest_nearest(name, list(FIGURES))
         if not hint:
             hint = f"; the figures are {', '.join(FIGURES)}"
         raise UsageError(f"there is no figure {name!r}{hint}")
     entry = FIGURES[name]
+
     reason = entry.absent(log)
     if reason:
         raise UsageError(f"{name}: nothing to show: {reason}")

@@ -110,11 +110,12 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.time_figure(log, form, height_in) as plot:
         panels = _add_panels(plot.figure, log, form)
         for panel, axes in zip(_PANELS, panels, strict=True):
-            columns = {site: panel.compute(log, site) for site in log.sites}
-            _scale_axis(axes, panel, list(columns.values()))
-            for site, values in columns.items():
+            values_by_site = {site: panel.compute(log, site) for site in log.sites}
+            _scale_axis(axes, panel, list(values_by_site.values()))
+            for site, values in values_by_site.items():
                 plot.trace(axes, site, _select_drawable(panel, values))
             plot.mark(axes, log.sites)
+
         plot.finish(
             _list_lowest(panels, form),
             style.site_legend_entries(log, log.sites),
@@ -156,22 +157,25 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
             "only runs with errors in the same unit can be drawn over one another; "
             f"these have errors in {' and '.join(sorted(units))}"
         )
+
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.styled_figure(form, height_in) as figure:
         first_log = next(iter(logs.values()))
         panels = _add_panels(figure, first_log, form)
-        lines = {name: _style_run(number) for number, name in enumerate(logs)}
+        line_styles = {name: _style_run(number) for number, name in enumerate(logs)}
         end_s = max(recorded_end_s(log) for log in logs.values())
         for panel, axes in zip(_PANELS, panels, strict=True):
             envelopes = {name: _compute_envelope(panel, log) for name, log in logs.items()}
             _scale_axis(axes, panel, [values for _, values in envelopes.values()])
             for name, (t_s, values) in envelopes.items():
-                axes.plot(t_s, _select_drawable(panel, values), **lines[name])
+                axes.plot(t_s, _select_drawable(panel, values), **line_styles[name])
             axes.set_xlim(0.0, end_s)
+
         for axes in _list_lowest(panels, form):
             axes.set_xlabel("time (s)")
         labels = label_runs(logs, form)
-        style.add_legend(figure, [(labels[name], line) for name, line in lines.items()])
+        entries = [(labels[name], line_style) for name, line_style in line_styles.items()]
+        style.add_legend(figure, entries)
     return figure
 
 
@@ -206,21 +210,23 @@ def _style_run(number: int) -> dict[str, Any]:
 
 
 def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
-    """Returns the largest value of all sites of a run in equal spans of time.
+    """Returns the largest value of all sites of a run over time, as one curve to compare runs.
+
+    Time is divided into equal spans, and the curve has a point per span.
 
     Returns:
         Middles of the spans in s, and largest values, each of shape (S,). The value of a span
         without records is NaN.
     """
-    # At least two records of every site per span, on average.
+    # Spans are long enough that each has at least two records of every site on average.
     record_counts = [len(log[site]) for site in log.sites]
     span_count = max(1, min(_MAX_SPANS, min(record_counts) // 2))
     edges_s = np.linspace(0.0, recorded_end_s(log), span_count + 1)
     largest = np.full(span_count, np.nan)
     for site in log.sites:
         last_edges = np.searchsorted(edges_s, log[site].t_s, side="right") - 1
-        spans = np.clip(last_edges, 0, span_count - 1)
-        np.fmax.at(largest, spans, panel.compute(log, site))
+        span_indices = np.clip(last_edges, 0, span_count - 1)
+        np.fmax.at(largest, span_indices, panel.compute(log, site))
     middles_s = 0.5 * (edges_s[1:] + edges_s[:-1])
     return middles_s, largest
 
@@ -238,11 +244,12 @@ def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
         panel: Quantity of the panel.
         columns: Values of each line. NaN values are ignored.
     """
-    known = np.concatenate([values[np.isfinite(values)] for values in columns])
-    largest = float(known.max(initial=0.0))
+    known_values = np.concatenate([values[np.isfinite(values)] for values in columns])
+    largest = float(known_values.max(initial=0.0))
     if not panel.log_scale:
-        axes.set_ylim(0.0, 1.08 * largest if largest > 0.0 else 1.0)
+        top = 1.08 * largest if largest > 0.0 else 1.0
+        axes.set_ylim(0.0, top)
     elif largest > 0.0:
-        smallest = float(known[known > 0.0].min())
-        low = max(smallest, largest * 10.0**-_DECADES)
-        axes.set(yscale="log", ylim=(0.7 * low, 1.5 * largest))
+        smallest = float(known_values[known_values > 0.0].min())
+        lowest = max(smallest, largest * 10.0**-_DECADES)
+        axes.set(yscale="log", ylim=(0.7 * lowest, 1.5 * largest))

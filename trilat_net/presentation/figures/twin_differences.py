@@ -67,11 +67,11 @@ _NOTE: dict[str, Any] = {
 
 
 class _DifferenceLine(NamedTuple):
-    """A line of the upper panel, which shows how the difference between two runs develops.
+    """A line that shows the difference between a run and its repetition with a small push.
 
     Attributes:
         label: Text of the line in the legend.
-        path: Difference between a twin and its run.
+        path: Difference between the repetition (twin) and the run over time.
         joints: Indices of the joints that the drawn amplitude covers.
         options: Colour, width and dashes of the line.
     """
@@ -179,18 +179,17 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Returns the line style of each joint.
-
-    The colour is that of the joint's site. The dash pattern is chosen by the joint's number.
+    """Returns the line style of each joint: the colour of its arm and dashes for its number.
 
     Args:
-        log: Log with the sites.
+        log: Log with the arms.
         joints: Names of joints such as "m1 joint 2".
     """
     styles = {}
     for name in joints:
-        site, _, number = name.partition(" joint ")
-        dashes = style.DASHES[(int(number) - 1) % len(style.DASHES)]
+        site, _, joint_number = name.partition(" joint ")
+        pattern = (int(joint_number) - 1) % len(style.DASHES)
+        dashes = style.DASHES[pattern]
         styles[name] = {**style.site_line(log, site), "linestyle": dashes}
     return styles
 
@@ -198,7 +197,9 @@ def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
 def _draw_differences(
     axes: Axes, pushed: PushedTwins, lines: Sequence[_DifferenceLine], rated: PushGrowth
 ) -> None:
-    """Draws the lines of all differences, and the growth rate of one push beside its lines.
+    """Draws the differences between a run and its pushed repetitions (twins) over time.
+
+    The growth rate of one push is drawn beside the lines of this push.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -228,11 +229,12 @@ def _draw_differences(
 
 
 def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Array, Array]:
-    """Computes the points of a line, each as the largest difference around its time.
+    """Computes the points of a line that shows the difference between a run and its twin.
 
-    The difference between a twin and its run is known in intervals of 50 ms. A difference that
-    has decayed to rounding errors is pushed again. The intervals from one push to the next are
-    called a leg. The line is interrupted between two legs.
+    A twin is a repetition of the run that received a small push. The difference is known in
+    intervals of 50 ms, and a point has the largest difference of several intervals. A
+    difference that has decayed to rounding errors is pushed again. The line is interrupted
+    between the parts (legs) from one push to the next.
 
     The computation uses logarithms, because the difference of a run in which disturbances grow
     exponentially may exceed the range of floating-point numbers.
@@ -243,8 +245,8 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
         step: Number of intervals that a point covers.
 
     Returns:
-        Times in s and amplitudes in rad/s, each of shape (K,). Each leg ends with a point of
-        the amplitude NaN, at which the line is interrupted. So is it where the difference is 0.
+        Times in s and amplitudes in rad/s, each of shape (K,). The line is interrupted where an
+        amplitude is NaN: at the end of each leg, and where the difference is 0.
     """
     path = line.path
     log_amplitude = measure_amplitude(path, line.joints)
@@ -253,7 +255,7 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
     t_s = np.zeros(0)
     log_peaks = np.zeros(0)
     for leg_start, leg_end in pairwise([*path.pushed, end]):
-        # Groups of `step` intervals, each with its first and its middle interval.
+        # Each point of the line covers `step` intervals, and is drawn in the middle of them.
         starts = np.arange(leg_start, leg_end, step)
         middles = np.minimum(starts + step // 2, leg_end - 1)
         group_peaks = np.maximum.reduceat(log_amplitude[:leg_end], starts)
@@ -287,15 +289,15 @@ def _draw_rate(
         # The rate of a twin that ended early was fitted to the second half of its time.
         from_s = 0.5 * (pushed.at_s + rated.ended_s)
         to_s = rated.ended_s
-    rows = (t_s >= from_s) & (t_s <= to_s) & (values > 0.0)
-    if not rows.any():
+    is_drawn = (t_s >= from_s) & (t_s <= to_s) & (values > 0.0)
+    if not is_drawn.any():
         return
 
-    line_t_s = t_s[rows]
+    line_t_s = t_s[is_drawn]
     # The lowest line with this slope that stays 15 % above all values.
-    heights = np.log(1.15 * values[rows]) - rated.rate_per_s * line_t_s
-    level = float(np.max(heights))
-    line = np.exp(np.minimum(level + rated.rate_per_s * line_t_s, MOST_LOG))
+    log_offsets = np.log(1.15 * values[is_drawn]) - rated.rate_per_s * line_t_s
+    log_offset = float(np.max(log_offsets))
+    line = np.exp(np.minimum(log_offset + rated.rate_per_s * line_t_s, MOST_LOG))
     options = {**style.LIMIT_LINE, "linewidth": 1.0, "zorder": 4.0}
     axes.plot(line_t_s, line, **options)
 

@@ -23,15 +23,19 @@ def open_device(text: str) -> Device:
         UsageError: There is no such device.
     """
     name, _, address = text.partition("=")
-    known = sorted(module_info.name for module_info in iter_modules(__path__))
-    if name not in known:
+    device_names = sorted(module_info.name for module_info in iter_modules(__path__))
+    if name not in device_names:
         raise UsageError(
-            f"--device must be one of {', '.join(known)}, "
+            f"--device must be one of {', '.join(device_names)}, "
             f"optionally followed by =ADDRESS, not {text!r}"
         )
     module = import_module(f"{__name__}.{name}")
+
+    # The class of the file spacemouse.py is SpaceMouse: equal except for capitals and "_".
     class_name = name.replace("_", "")
     members = vars(module).items()
-    device_class = next(member for key, member in members if key.lower() == class_name)
+    device_class = next(
+        member for member_name, member in members if member_name.lower() == class_name
+    )
     device: Device = device_class(address) if address else device_class()
     return device

@@ -96,11 +96,11 @@ class SpaceMouse:
         elapsed_s = (now_ns - self._read_ns) * 1e-9
         self._read_ns = now_ns
         x, y, z = self._position_m
-        vx, vy, vz = self._velocity_m_s
+        x_velocity, y_velocity, z_velocity = self._velocity_m_s
         self._position_m = (
-            x + elapsed_s * vx,
-            y + elapsed_s * vy,
-            z + elapsed_s * vz,
+            x + elapsed_s * x_velocity,
+            y + elapsed_s * y_velocity,
+            z + elapsed_s * z_velocity,
         )
 
         buttons = {"a": bool(self._button_bits & 1), "b": bool(self._button_bits & 2)}

@@ -101,6 +101,9 @@ def is_completed(row: Row) -> bool:
 def find_median(times_s: Sequence[float]) -> float:
     """Computes the median of completion times, in s.
 
+    Trials that reached the time limit count as longer than all others, because their times are
+    not known.
+
     Args:
         times_s: Times, in s. They are infinite for trials that were not completed.
 
@@ -108,11 +111,12 @@ def find_median(times_s: Sequence[float]) -> float:
         The median. It is infinite (not reached) if half of the trials or more were not
         completed.
     """
-    ordered = sorted(times_s)
-    count = len(ordered)
-    lower = ordered[(count - 1) // 2]
-    upper = ordered[count // 2]
-    return (lower + upper) / 2.0
+    sorted_s = sorted(times_s)
+    count = len(sorted_s)
+    # An odd number of times has a single middle, and both indices are equal.
+    lower_middle_s = sorted_s[(count - 1) // 2]
+    upper_middle_s = sorted_s[count // 2]
+    return (lower_middle_s + upper_middle_s) / 2.0
 
 
 def find_unit_medians(
@@ -132,15 +136,19 @@ def find_unit_medians(
     """
     times_s: dict[str, dict[str, list[float]]] = {}
     for row in rows:
-        value = row.get(COMPLETION)
-        if value in (None, ""):
+        recorded_time = row.get(COMPLETION)
+        if recorded_time in (None, ""):
             continue
-        time_s = read_number(value, COMPLETION, row) if is_completed(row) else math.inf
+        time_s = math.inf
+        if is_completed(row):
+            time_s = read_number(recorded_time, COMPLETION, row)
         times_by_unit = times_s.setdefault(str(row["condition"]), {})
         times_by_unit.setdefault(str(row[unit]), []).append(time_s)
+
     medians: dict[str, dict[str, float]] = {}
     for condition, times_by_unit in times_s.items():
-        medians[condition] = {name: find_median(times) for name, times in times_by_unit.items()}
+        unit_medians = {name: find_median(times) for name, times in times_by_unit.items()}
+        medians[condition] = unit_medians
     return medians
 
 
@@ -166,13 +174,16 @@ def summarise_times(
     for condition, medians_by_unit in find_unit_medians(rows, unit).items():
         medians = list(medians_by_unit.values())
         trials = [row for row in rows if str(row["condition"]) == condition]
-        failed = [row for row in trials if not is_completed(row)]
-        ended_s = [read_number(row[COMPLETION], COMPLETION, row) for row in failed]
+        failed_trials = [row for row in trials if not is_completed(row)]
+        end_times_s = [read_number(row[COMPLETION], COMPLETION, row) for row in failed_trials]
+
+        # Rounding may make a time that reached the limit slightly shorter.
+        timed_out_count = sum(time_s >= limit_s - 1e-6 for time_s in end_times_s)
         summary = CompletionTime(
             condition=condition,
             trials=len(trials),
-            censored=len(failed),
-            timed_out=sum(time_s >= limit_s - 1e-6 for time_s in ended_s),
+            censored=len(failed_trials),
+            timed_out=timed_out_count,
             number=len(medians),
             median=_replace_infinity(find_median(medians)),
             interval=find_median_interval(medians),
@@ -195,29 +206,30 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
         Lower and upper end, in s. The upper end is None if it was not reached. The whole
         interval is None if there is no such rank, which holds for fewer than six times.
     """
-    ordered = sorted(times_s)
-    tail = (1.0 - CONFIDENCE) / 2.0
-    binomial = import_scipy_stats().binom(len(ordered), 0.5)
-    candidates = range(1, len(ordered) // 2 + 1)
-    ranks = [rank for rank in candidates if float(binomial.cdf(rank - 1)) <= tail]
+    sorted_s = sorted(times_s)
+    tail_probability = (1.0 - CONFIDENCE) / 2.0
+    binomial = import_scipy_stats().binom(len(sorted_s), 0.5)
+    candidates = range(1, len(sorted_s) // 2 + 1)
+    ranks = [rank for rank in candidates if float(binomial.cdf(rank - 1)) <= tail_probability]
     if not ranks:
         return None
-    rank = ranks[-1]
-    low = ordered[rank - 1]
-    high = ordered[-rank]
-    if math.isinf(low):
+
+    largest_rank = ranks[-1]
+    low_s = sorted_s[largest_rank - 1]
+    high_s = sorted_s[-largest_rank]
+    if math.isinf(low_s):
         return None
-    return low, _replace_infinity(high)
+    return low_s, _replace_infinity(high_s)
 
 
 def compare_times(
     rows: Sequence[Row], *, unit: str = "participant"
 ) -> list[CompletionComparison]:
-    """Compares the completion times of each pair of conditions, within participants or pairs.
+    """Compares the completion times of each pair of conditions by sign tests.
 
-    Each unit (a participant or a pair) counts for the condition under which its median is
-    longer. A median that was not reached is longer than any that was reached. Two medians that
-    were not reached are a tie.
+    The comparison is made within each unit (a participant, or a pair of participants). A unit
+    counts for the condition under which its median is longer. A median that was not reached is
+    longer than any that was reached. Two medians that were not reached are a tie.
 
     Args:
         rows: Trials, as for `find_unit_medians`.
@@ -229,13 +241,15 @@ def compare_times(
     medians = find_unit_medians(rows, unit)
     comparisons = []
     for first, second in combinations(medians, 2):
-        units = [name for name in medians[first] if name in medians[second]]
-        pairs = [(medians[first][name], medians[second][name]) for name in units]
-        comparisons.append(_compare(first, second, pairs))
-    corrected = correct_holm([comparison.p for comparison in comparisons])
+        common_units = [name for name in medians[first] if name in medians[second]]
+        median_pairs = [(medians[first][name], medians[second][name]) for name in common_units]
+        comparisons.append(_compare(first, second, median_pairs))
+
+    # Many comparisons find a difference by chance. Holm's method corrects the p values.
+    corrected_p = correct_holm([comparison.p for comparison in comparisons])
     return [
         comparison._replace(p_holm=p)
-        for comparison, p in zip(comparisons, corrected, strict=True)
+        for comparison, p in zip(comparisons, corrected_p, strict=True)
     ]
 
 
@@ -253,7 +267,7 @@ def _compare(
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
     untied = longer + shorter
     p = None
-    if untied > 1:
+    if untied > 1:  # a single unit cannot show a difference
         p = float(import_scipy_stats().binomtest(longer, untied).pvalue)
     return CompletionComparison(
         first=first,
@@ -287,6 +301,7 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
         shortest_second_s = second_s if math.isfinite(second_s) else 0.0
         lower_bounds.append(shortest_second_s - first_s)
         upper_bounds.append(second_s - shortest_first_s)
+
     low = float(np.median(lower_bounds))
     high = float(np.median(upper_bounds))
     return low if low == high else None

@@ -47,10 +47,10 @@ _LIMIT: Look = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
-    """Draws one measure of an experiment under each of its conditions.
+    """Draws one measure of an experiment, such as the completion time, under each condition.
 
-    The figure shows the mean of each participant or pair, and the mean over them with its 95 %
-    interval.
+    The figure shows the mean of each participant (or pair of participants), and the mean over
+    them with its 95 % interval.
 
     Args:
         rows: A row per trial, as for `statistics`.
@@ -59,15 +59,15 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
     """
     all_means = average_trials(rows, measure, unit)
     means = {condition: by_unit for condition, by_unit in all_means.items() if by_unit}
-    interval_look = {**_MEAN, "marker": "_", "zorder": 3}
+    interval_style = {**_MEAN, "marker": "_", "zorder": 3}
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, measure)
         for columns, values in _list_unit_lines(means):
             axes.plot(columns, values, **_USER)
         summaries = summarise_conditions(rows, measure, unit=unit)
-        for column, mean in enumerate(summaries):
-            _plot_interval(axes, column, mean, interval_look)
-            axes.plot([column], [mean.mean], zorder=3, **_MEAN)
+        for column, summary in enumerate(summaries):
+            _plot_interval(axes, column, summary, interval_style)
+            axes.plot([column], [summary.mean], zorder=3, **_MEAN)
         _label_conditions(axes, means)
         legend = [
             (f"a {unit}", _USER),
@@ -89,7 +89,7 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
         unit: "participant" or "pair", for which medians are computed first.
     """
     medians = find_unit_medians(rows, unit)
-    interval_look = {**_MEAN, "marker": "_"}
+    interval_style = {**_MEAN, "marker": "_"}
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
         axes.axhline(limit_s, **_LIMIT)
@@ -101,7 +101,8 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
             if low_s is not None:
                 # An interval without an upper end is drawn up to the limit.
                 end_s = limit_s if high_s is None else high_s
-                axes.plot([column, column], [low_s, end_s], **interval_look)
+                axes.plot([column, column], [low_s, end_s], **interval_style)
+
             median_s = summary.median
             beyond_limit: list[float] = []
             if median_s is None:
@@ -109,6 +110,7 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
                 beyond_limit.append(column)
             axes.plot([column], [median_s], zorder=3, **_MEAN)
             _mark_beyond_limit(axes, beyond_limit, limit_s, _MEAN)
+
         _label_conditions(axes, medians)
         legend = [
             (f"a {unit}'s median", _USER),
@@ -134,12 +136,12 @@ def _list_unit_lines(
     all_units = chain.from_iterable(values.values())
     for unit in dict.fromkeys(all_units):
         columns: list[int] = []
-        unit_values: list[float] = []
+        values_of_unit: list[float] = []
         for column, values_by_unit in enumerate(values.values()):
             if unit in values_by_unit:
                 columns.append(column)
-                unit_values.append(values_by_unit[unit])
-        yield columns, unit_values
+                values_of_unit.append(values_by_unit[unit])
+        yield columns, values_of_unit
 
 
 def _label_conditions(axes: Axes, values: Mapping[str, Mapping[str, float]]) -> None:
@@ -176,10 +178,11 @@ def _plot_times(
     """
     limited_s = [min(time_s, limit_s) for time_s in times_s]
     axes.plot(positions, limited_s, **look)
+
     beyond_limit: list[float] = []
     for position, time_s in zip(positions, times_s, strict=True):
-        is_beyond = math.isinf(time_s)
-        if is_beyond:
+        is_beyond_limit = math.isinf(time_s)
+        if is_beyond_limit:
             beyond_limit.append(position)
     _mark_beyond_limit(axes, beyond_limit, limit_s, look)
 
@@ -228,21 +231,21 @@ def draw_learning(
         return _draw_learning_times(rows, limit_s, unit)
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, measure)
-        looks = _assign_looks(rows)
-        for condition, look in looks.items():
+        styles_by_condition = _assign_looks(rows)
+        for condition, look in styles_by_condition.items():
             summaries: dict[Any, ConditionMean] = {}
             for trial, trial_rows in _group_by_trial(rows, condition).items():
                 # The rows of one condition have one mean, or none without data.
                 for summary in summarise_conditions(trial_rows, measure, unit=unit):
                     summaries[trial] = summary
-            interval_look = {**look, "marker": "", "alpha": 0.5}
+            interval_style = {**look, "marker": "", "alpha": 0.5}
             for trial, summary in summaries.items():
-                _plot_interval(axes, trial, summary, interval_look)
+                _plot_interval(axes, trial, summary, interval_style)
             trials = list(summaries)
             means = [summary.mean for summary in summaries.values()]
             axes.plot(trials, means, **look)
         _label_trials(axes)
-        style.add_legend(figure, list(looks.items()))
+        style.add_legend(figure, list(styles_by_condition.items()))
     return figure
 
 
@@ -276,10 +279,10 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 
 
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
-    """Draws the median completion time over the trials of a block.
+    """Draws how the median completion time changes over the trials of a block.
 
-    The task has a time limit, and some trials were not completed. Trials whose median was not
-    reached have an open marker on the line of the limit.
+    The task has a time limit, and some trials were not completed, so that means do not exist. A
+    median beyond the limit has an open marker on the line of the limit.
 
     Args:
         rows: Rows of the trials.
@@ -289,8 +292,8 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
         axes.axhline(limit_s, **_LIMIT)
-        looks = _assign_looks(rows)
-        for condition, look in looks.items():
+        styles_by_condition = _assign_looks(rows)
+        for condition, look in styles_by_condition.items():
             trials: list[Any] = []
             medians_s: list[float] = []
             for trial, trial_rows in _group_by_trial(rows, condition).items():
@@ -301,7 +304,7 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
                 medians_s.append(median_s)
             _plot_times(axes, trials, medians_s, limit_s, look)
         _label_trials(axes)
-        legend = [*looks.items(), ("time limit; open: not reached", _LIMIT)]
+        legend = [*styles_by_condition.items(), ("time limit; open: not reached", _LIMIT)]
         style.add_legend(figure, legend)
     return figure
 

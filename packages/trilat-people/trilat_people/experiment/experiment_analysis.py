@@ -99,10 +99,10 @@ class _MissingAnswers(NamedTuple):
 
 
 def _format_fact(value: Any, name: str = "") -> str:
-    """Returns a fact of a study as text, with all digits of its numbers.
+    """Returns a fact of a study as text, for example "delay 50 ms" for {"delay_ms": 50}.
 
-    A number gets the unit at the end of its name: {"delay_ms": 50} becomes "delay 50 ms".
-    Several entries or items are joined by commas, and conditions by semicolons.
+    A number gets the unit at the end of its name, and has all digits. Several entries or items
+    are joined by commas, and conditions by semicolons.
 
     Args:
         value: The fact: a number, a text, a mapping or a sequence.
@@ -110,14 +110,16 @@ def _format_fact(value: Any, name: str = "") -> str:
     """
     if isinstance(value, str):
         return value
+
     if isinstance(value, Mapping):
-        items: list[str] = []
-        for key, item in value.items():
+        entry_texts: list[str] = []
+        for key, entry in value.items():
             quantity, _ = split_unit(key)
-            items.append(f"{quantity} {_format_fact(item, key)}".strip())
-        return "; ".join(items) if name == "conditions" else ", ".join(items)
+            entry_texts.append(f"{quantity} {_format_fact(entry, key)}".strip())
+        return "; ".join(entry_texts) if name == "conditions" else ", ".join(entry_texts)
     if isinstance(value, Sequence):
-        return ", ".join(_format_fact(item, name) for item in value)
+        return ", ".join(_format_fact(entry, name) for entry in value)
+
     number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
     _, unit = split_unit(name)
     return f"{number} {unit}".strip()
@@ -168,6 +170,8 @@ class ExperimentAnalysis(Result):
         protocol = experiment.plan.protocol
         self.unit = experiment.unit
         self._check_excluded()
+
+        # The trials that count: not for practice, and not of excluded participants.
         counted = [row for row in experiment.to_rows() if self._is_counted(row)]
         self.learning_rows = self._sort_by_condition(counted)
         self.rows = [
@@ -178,21 +182,29 @@ class ExperimentAnalysis(Result):
                 f"{experiment.folder}: there are no trials to analyse yet; practice trials, "
                 "catch trials and trials of excluded participants do not count"
             )
+
+        # Values that the analysis derives from the trials, one row for each participant.
         self.throughput_rows = list(self._find_throughput())
         self.gain_rows = list(self._find_gains())
         self.threshold_rows = self._sort_by_condition(list(self._find_thresholds()))
         scores = self._sort_by_condition(experiment.list_scores())
         self._scores = [row for row in scores if row[self.unit] not in exclude]
+
+        # Completion times, of which some trials reached the time limit.
         self.times: list[CompletionTime] = []
         self.time_comparisons: list[CompletionComparison] = []
         if protocol.task.has_limit:
             self._summarise_times()
+
+        # Each measure is compared between the conditions.
         forms = [form.name for form in protocol.questionnaires if form.after == "block"]
         self.absent = self._find_absent(forms)
         self.means: dict[str, list[ConditionMean]] = {}
         self.comparisons: dict[str, list[Comparison]] = {}
         for measure in (*MEASURES, *forms, *self._list_unit_measures()):
             self._compare_measure(measure)
+
+        # Further results.
         self.missing_answers = list(self._count_missing_answers())
         self.models = list(self.fit_models())
         self.study = self._collect_study()
@@ -201,16 +213,19 @@ class ExperimentAnalysis(Result):
     def _check_excluded(self) -> None:
         """Checks that the participants or pairs that the user excludes exist.
 
+        A misspelled name would otherwise exclude nobody, without an error.
+
         Raises:
             UsageError: An excluded name is not in the plan. The error lists the names that are.
         """
         groups = self._experiment.plan.protocol.groups
         names = {"-".join(group) for group in groups}
-        unknown = sorted(self._exclude.keys() - names)
-        if unknown:
-            valid = ", ".join(sorted(names))
+        unknown_names = sorted(self._exclude.keys() - names)
+        if unknown_names:
+            valid_names = ", ".join(sorted(names))
             raise UsageError(
-                f"there is no {self.unit} {', '.join(unknown)}; the {self.unit}s are {valid}"
+                f"there is no {self.unit} {', '.join(unknown_names)}; "
+                f"the {self.unit}s are {valid_names}"
             )
 
     def _is_counted(self, row: Mapping[str, Any]) -> bool:
@@ -222,9 +237,8 @@ class ExperimentAnalysis(Result):
         Args:
             row: Row of the trial, as in trials.csv.
         """
-        if row[self.unit] in self._exclude:
-            return False
-        return not (row["practice"] or row["catch"])
+        is_excluded = row[self.unit] in self._exclude
+        return not (is_excluded or row["practice"] or row["catch"])
 
     def _sort_by_condition(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Returns rows in the order in which the protocol lists the conditions.
@@ -257,7 +271,8 @@ class ExperimentAnalysis(Result):
         if measure == COMPLETION and self._has_censored_times():
             return
         rows = self.of(measure)
-        if any(row.get(measure) not in (None, "") for row in rows):
+        has_numbers = any(row.get(measure) not in (None, "") for row in rows)
+        if has_numbers:
             self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
             self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
 
@@ -299,18 +314,18 @@ class ExperimentAnalysis(Result):
             The reason by the name of the measure, for example {"tlx": "nobody has answered
             it"}.
         """
-        absent = {}
+        reasons = {}
         for name in forms:
             scores = [row.get(name) for row in self.of(name)]
             if not scores:
-                absent[name] = "nobody has answered it"
+                reasons[name] = "nobody has answered it"
             elif all(score is None for score in scores):
-                absent[name] = "every questionnaire lacks an answer"
+                reasons[name] = "every questionnaire lacks an answer"
         if self._is_reaching and not self.throughput_rows:
-            absent["throughput_bits_s"] = (
+            reasons["throughput_bits_s"] = (
                 f"no {self.unit} has enough completed trials under a condition"
             )
-        return absent
+        return reasons
 
     def _count_missing_answers(self) -> Iterator[_MissingAnswers]:
         """Counts the missing answers of each questionnaire, separately for each condition.
@@ -330,7 +345,8 @@ class ExperimentAnalysis(Result):
         answer_groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for row in self._experiment.list_answers():  # one row for each item
             name = row["questionnaire"]
-            if name in when_answered and row[self.unit] not in self._exclude:
+            is_excluded = row[self.unit] in self._exclude
+            if name in when_answered and not is_excluded:
                 is_per_block = when_answered[name] == "block"
                 condition = row["condition"] if is_per_block else ""
                 answer_groups.setdefault((name, condition), []).append(row)
@@ -386,18 +402,20 @@ class ExperimentAnalysis(Result):
         """
         if not self._is_reaching:
             return
-        groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        trials_by_group: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for row in self.rows:
-            groups.setdefault((row[self.unit], row["condition"]), []).append(row)
-        for (unit, condition), rows in groups.items():
-            completed = [row for row in rows if row["succeeded"]]
-            if len(completed) < 2:
+            group = (row[self.unit], row["condition"])
+            trials_by_group.setdefault(group, []).append(row)
+
+        for (unit, condition), trials in trials_by_group.items():
+            completed_trials = [row for row in trials if row["succeeded"]]
+            if len(completed_trials) < 2:
                 continue
             throughput = measure_throughput(
-                starts=_list_points(completed, "start"),
-                targets=_list_points(completed, "target"),
-                ends=_list_points(completed, "end"),
-                times_s=[row["completion_s"] for row in completed],
+                starts=_list_points(completed_trials, "start"),
+                targets=_list_points(completed_trials, "target"),
+                ends=_list_points(completed_trials, "end"),
+                times_s=[row["completion_s"] for row in completed_trials],
             )
             if throughput is not None:
                 yield {
@@ -407,22 +425,23 @@ class ExperimentAnalysis(Result):
                 }
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
-        """Yields the gain of each unit and condition by a training.
+        """Yields how much each participant (or pair) improved by a training, by condition.
 
         A gain is the mean before the training minus the mean right after it (transfer), or
         minus the mean in the later test (retention).
         """
         measure = self._experiment.plan.protocol.task.learning_measure
-        means: dict[str, dict[str, dict[str, float]]] = {}
+        means_by_phase: dict[str, dict[str, dict[str, float]]] = {}
         for phase in ("before", "after", "retention"):
             rows = [row for row in self.learning_rows if row.get("phase") == phase]
             if rows:
-                means[phase] = self._average_learning(rows, measure)
-        means_before = means.pop("before", {})
+                means_by_phase[phase] = self._average_learning(rows, measure)
+
+        means_before = means_by_phase.pop("before", {})
         for condition, means_by_unit in means_before.items():
             for unit, mean_before in means_by_unit.items():
                 gains: dict[str, float] = {}
-                for phase, phase_means in means.items():
+                for phase, phase_means in means_by_phase.items():
                     later_mean = phase_means.get(condition, {}).get(unit)
                     if later_mean:
                         gains[f"gain_{phase}_{measure}"] = mean_before - later_mean
@@ -452,19 +471,19 @@ class ExperimentAnalysis(Result):
         """
         if not self._is_censored(measure):
             return average_trials(rows, measure, self.unit)
-        reached: dict[str, dict[str, float]] = {}
+        reached_medians: dict[str, dict[str, float]] = {}
         for condition, medians in find_unit_medians(rows, self.unit).items():
-            reached[condition] = {
+            reached_medians[condition] = {
                 unit: median for unit, median in medians.items() if math.isfinite(median)
             }
-        return reached
+        return reached_medians
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
         """Yields the perception threshold of each participant under each condition.
 
-        The threshold is the difference at which a share of the answers is right that the
-        staircase determines. Blocks with too few reversals of the staircase have no threshold,
-        and protocols without a staircase have none at all.
+        A staircase procedure changes a difference until the participant just perceives it.
+        Blocks with too few reversals of the staircase have no threshold, and protocols without
+        a staircase have none at all.
 
         Yields:
             Rows with the name, the condition, and the threshold under the name of its measure.
@@ -502,14 +521,17 @@ class ExperimentAnalysis(Result):
         scenario = next(iter(plan.scenarios.values()))
         unit_count = len({row[self.unit] for row in self.rows})
         participant_count = unit_count * len(protocol.users)
+
         conditions: dict[str, dict[str, float]] = {}
         for name in protocol.conditions:
             delays_ms = [row["delay_ms"] for row in self.rows if row["condition"] == name]
             if delays_ms:
                 conditions[name] = {"delay_ms": round(float(np.mean(delays_ms)), 1)}
+
         site = scenario.sites[protocol.users[0]]
         control = msgspec.to_builtins(site.control)
         law = control.pop("law")
+
         facts: dict[str, Any] = {
             "participants": participant_count,
             "pairs": unit_count if self.unit == "pair" else None,
@@ -534,9 +556,10 @@ class ExperimentAnalysis(Result):
         return {name: value for name, value in facts.items() if value is not None}
 
     def _list_computed(self) -> list[str]:
-        """Lists the analyses that were computed.
+        """Returns the names of the statistical analyses that were computed, for the report.
 
-        Example: ["intervals of 95 %", "effect sizes"]. With one participant the list is empty.
+        An example is ["intervals of 95 %", "effect sizes"]. With one participant the list is
+        empty.
         """
         tests = list(chain.from_iterable(self.comparisons.values()))
         means = list(chain.from_iterable(self.means.values()))
@@ -570,6 +593,7 @@ class ExperimentAnalysis(Result):
         for name, text in self._encode_files().items():
             self.paths.append(folder / name)
             write_whole(self.paths[-1], text, force=True)
+
         figures = self._draw_figures()
         page = folder / "report.md"
         write_whole(page, self.compose_page(list(figures)), force=True)
@@ -594,6 +618,7 @@ class ExperimentAnalysis(Result):
             "missing_answers.csv": [answers._asdict() for answers in self.missing_answers],
         }
         tables |= {name: rows for name, rows in optional_tables.items() if rows}
+
         texts: dict[str, str] = {}
         for name, rows in tables.items():
             flat_rows = [dict(_flatten(row)) for row in rows]
@@ -604,16 +629,21 @@ class ExperimentAnalysis(Result):
     def _draw_figures(self) -> dict[str, Any]:
         """Draws a figure for each measure, and one that shows learning over the trials.
 
+        The figures are part of the page that reports the results.
+
         Returns:
             The figures by the names of their files without the ending. "learning" exists only
             if there is more than one trial in a block.
         """
-        figures = {
-            name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means
-        }
+        figures = {}
+        for name in self.means:
+            figures[name] = draw_conditions(self.of(name), name, unit=self.unit)
+
         if self.time_comparisons:
             figures[COMPLETION] = draw_times(self.rows, self._limit_s, unit=self.unit)
-        if len({row["trial"] for row in self.learning_rows}) > 1:
+
+        trial_numbers = {row["trial"] for row in self.learning_rows}
+        if len(trial_numbers) > 1:
             protocol = self._experiment.plan.protocol
             measure = "difference" if protocol.staircase else protocol.task.learning_measure
             limit_s = self._limit_s if self._is_censored(measure) else None
@@ -632,16 +662,16 @@ class ExperimentAnalysis(Result):
             The text of the page.
         """
         protocol = self._experiment.plan.protocol
-        parts = [f"# {protocol.title or protocol.name}"]
+        paragraphs = [f"# {protocol.title or protocol.name}"]
         for block in compose(self):
             if isinstance(block, TextTable):
                 text = block.markdown()
             else:
                 text = "\n".join(block.lines())
             if text.strip():
-                parts.append(text)
-        parts += [f"![{name}]({name}.png)" for name in figures]
-        return "\n\n".join(parts) + "\n"
+                paragraphs.append(text)
+        paragraphs += [f"![{name}]({name}.png)" for name in figures]
+        return "\n\n".join(paragraphs) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
         """Fits mixed models to the mean and the peak force of users who act in pairs.
@@ -654,8 +684,10 @@ class ExperimentAnalysis(Result):
             not installed.
         """
         pairs = {row[self.unit] for row in self.rows}
-        if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
+        has_pairs = self.unit == "pair" and len(pairs) >= 2
+        if not has_pairs or find_spec("statsmodels") is None:
             return
+
         for measure in ("force_mean", "force_peak"):
             # A trial of a pair becomes a row for each of the two users.
             rows: list[Row] = []
@@ -691,6 +723,7 @@ class ExperimentAnalysis(Result):
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
             model["effects"] = [effect._asdict() for effect in model["effects"]]
+
         return {
             "name": self._experiment.plan.protocol.name,
             "digest": self._experiment.plan.digest,
@@ -713,27 +746,33 @@ class ExperimentAnalysis(Result):
         there are no comparisons, and one table has all measures.
         """
         yield from self._write_time_blocks()
+
+        # One participant alone gives no comparison of means.
         units = {row[self.unit] for row in self.rows}
         if len(units) > 1:
             yield from self._write_measure_blocks()
         else:
             yield from self._write_single_unit_block(next(iter(units)))
         yield from self._write_model_blocks()
+
         for answers in self.missing_answers:
-            condition = f", {answers.condition}" if answers.condition else ""
-            unscored = ""
+            condition_text = f", {answers.condition}" if answers.condition else ""
+            unscored_text = ""
             if answers.missing:
-                unscored = (
+                unscored_text = (
                     f"; {answers.unscored} of {answers.forms} have no score for that reason"
                 )
+            asked_text = count_nouns(answers.asked, "answer is", "answers are")
             yield (
-                f"{answers.questionnaire}{condition}: {answers.missing} of "
-                f"{count_nouns(answers.asked, 'answer is', 'answers are')} missing{unscored}"
+                f"{answers.questionnaire}{condition_text}: {answers.missing} of "
+                f"{asked_text} missing{unscored_text}"
             )
+
         for measure, reason in self.absent.items():
             yield f"{measure}: no number, because {reason}"
         if self.missing_answers or self.absent:
             yield ""
+
         for name, fact in self.study.items():
             yield f"{name}: {_format_fact(fact, name)}"
 
@@ -745,24 +784,36 @@ class ExperimentAnalysis(Result):
         """
         if not self.times:
             return
+
         yield (
             f"{COMPLETION}, median over {self.unit}s of the median of each {self.unit}'s trials"
         )
         yield "a trial that was not completed counts as longer than all others"
-        rows = [
-            (
+
+        rows = []
+        for time in self.times:
+            median_text = NOT_REACHED if time.median is None else f"{time.median:.4g}"
+            row = (
                 time.condition,
                 str(time.trials),
                 str(time.timed_out),
                 str(time.censored - time.timed_out),
                 str(time.number),
-                NOT_REACHED if time.median is None else f"{time.median:.4g}",
+                median_text,
                 _format_interval(time.interval),
             )
-            for time in self.times
-        ]
-        heads = ("condition", "trials", "timed out", "failed sooner", "n", "median", "interval")
-        yield TextTable(heads, rows, align="lrrrrrl")
+            rows.append(row)
+
+        headers = (
+            "condition",
+            "trials",
+            "timed out",
+            "failed sooner",
+            "n",
+            "median",
+            "interval",
+        )
+        yield TextTable(headers, rows, align="lrrrrrl")
         yield ""
         if self.time_comparisons:
             comparison_rows = [
@@ -797,9 +848,10 @@ class ExperimentAnalysis(Result):
                 )
                 for mean in means
             ]
-            heads: tuple[str, ...] = ("condition", "n", "missing", "mean", "interval")
-            yield TextTable(heads, rows, align="lrrrl")
+            headers: tuple[str, ...] = ("condition", "n", "missing", "mean", "interval")
+            yield TextTable(headers, rows, align="lrrrl")
             yield ""
+
             comparison_rows = [
                 (
                     f"{test.second} - {test.first}",
@@ -812,8 +864,8 @@ class ExperimentAnalysis(Result):
                 for test in self.comparisons[measure]
             ]
             if comparison_rows:
-                heads = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
-                yield TextTable(heads, comparison_rows, align="lrlrrr")
+                headers = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
+                yield TextTable(headers, comparison_rows, align="lrlrrr")
                 yield ""
 
     def _write_model_blocks(self) -> Iterator[Block]:
@@ -852,9 +904,11 @@ class ExperimentAnalysis(Result):
         )
         rows = []
         for measure, means in self.means.items():
-            by_condition = {mean.condition: _describe_mean(mean) for mean in means}
-            rows.append((measure, *(by_condition.get(name, "-") for name in conditions)))
-        yield TextTable(("measure", *conditions), rows, align="l" + "r" * len(conditions))
+            mean_by_condition = {mean.condition: _describe_mean(mean) for mean in means}
+            cells = [mean_by_condition.get(name, "-") for name in conditions]
+            rows.append((measure, *cells))
+        alignment = "l" + "r" * len(conditions)
+        yield TextTable(("measure", *conditions), rows, align=alignment)
         yield ""
 
 
@@ -913,14 +967,16 @@ class PowerOfExperiment(Result):
     def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
         self.d_z = d_z
         self.participants = participants
-        self.least = {
-            wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)
-        }
+        self.least = {}
+        for desired_power in (0.8, 0.9, 0.95):
+            self.least[desired_power] = find_least_number(d_z, wanted=desired_power)
+
         self.power: float | None = None
         self.simulated: SimulatedPower | None = None
         if participants is not None:
             self.power = power(d_z, participants)
-            # The difference of two trials has sqrt(2) times the deviation of a trial: 1.
+            # The difference of two trials has sqrt(2) times the deviation of a trial. It must
+            # be 1, so that the mean difference equals d_z.
             means = {"first": 0.0, "second": d_z}
             deviation = 0.5**0.5
             (self.simulated,) = simulate_power(
@@ -934,9 +990,9 @@ class PowerOfExperiment(Result):
         power that the planned number of participants gives, both computed and simulated.
         """
         simulated = None if self.simulated is None else self.simulated._asdict()
-        least = [
-            {"power": wanted, "participants": number} for wanted, number in self.least.items()
-        ]
+        least = []
+        for desired_power, number in self.least.items():
+            least.append({"power": desired_power, "participants": number})
         return {
             "d_z": self.d_z,
             "least": least,
@@ -956,14 +1012,16 @@ class PowerOfExperiment(Result):
             "paired comparison of two conditions, two-sided, alpha 0.05, "
             f"effect d_z {self.d_z:g}"
         )
-        rows = [(f"{wanted:g}", str(number)) for wanted, number in self.least.items()]
+        rows = []
+        for desired_power, number in self.least.items():
+            rows.append((f"{desired_power:g}", str(number)))
         yield TextTable(("power", "participants"), rows, align="rr")
         if self.power is not None and self.simulated is not None:
             interval = _format_interval(self.simulated.interval)
-            simulated = f"{self.simulated.found:.3f} {interval} of 500 drawn experiments"
+            simulated_text = f"{self.simulated.found:.3f} {interval} of 500 drawn experiments"
             yield (
                 f"with {count_nouns(self.participants, 'participant')}: power "
-                f"{self.power:.3f}; found in {simulated}"
+                f"{self.power:.3f}; found in {simulated_text}"
             )
 
 

@@ -131,7 +131,8 @@ class Experiment(Result):
         """
         if people is not None:
             entries = self.read_entries().values()
-            if any(entry.people != people for entry in entries):
+            has_other_kind = any(entry.people != people for entry in entries)
+            if has_other_kind:
                 advice = "people: continue with"
                 if people:
                     advice = "synthetic participants: continue without"
@@ -204,26 +205,27 @@ class Experiment(Result):
             staircase: Settings of the test. It also contains the model of the participant's
                 perception, which sometimes errs.
         """
-        choices: dict[
-            int, float
-        ] = {}  # chosen trial, 1 or 2, by the number of the second trial
+        # Chosen trial, 1 or 2, by the number of the second trial.
+        choices: dict[int, float] = {}
         with self.open_notes() as notes:
             for step in self.plan.list_steps():
                 is_choice = step.form is not None and step.form.name == CHOICE
                 if not is_choice:
                     continue
+
                 second_trial = step.planned
                 were_right = self.plan.judge_choices(second_trial, choices)
                 # The last difference is that of this pair, whose choice is not made yet.
                 difference = staircase.list_differences(were_right)[-1]
                 comparison_trial = 2 if second_trial.phase == COMPARISON else 1
+
                 choice = staircase.draw_choice(difference, comparison_trial, second_trial.seed)
                 choices[second_trial.number] = choice
-                who = "-".join(second_trial.group)
+                participants = "-".join(second_trial.group)
                 note = Note(
-                    cell=f"{step.key} {who}",
+                    cell=f"{step.key} {participants}",
                     kind=step.kind,
-                    who=who,
+                    who=participants,
                     number=second_trial.number,
                     unix_s=0.0,
                     text=CHOICE,
@@ -265,14 +267,19 @@ class Experiment(Result):
             if plan.protocol.staircase is not None:
                 self._draw_choices(plan.protocol.staircase)
             choices = self.list_choices()
-            done = {entry.cell for entry in journal.done.values()}
+            finished_trials = {entry.cell for entry in journal.done.values()}
             tasks = []
             for trial in plan.trials:
-                if trial.number not in done:
+                if trial.number not in finished_trials:
                     text = plan.find_scenario(trial, choices).text
                     tasks.append((plan.protocol, text, trial, plan.digest, logs))
-            with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
-                journal.run_pending(pool, run_trial, tasks, len(done), len(plan.trials), show)
+
+            most_workers = len(tasks) or 1
+            with open_worker_pool(jobs, on, most=most_workers, hint=self._remedy) as pool:
+                journal.run_pending(
+                    pool, run_trial, tasks, len(finished_trials), len(plan.trials), show
+                )
+
         self.write_tables()
         return self
 
@@ -281,11 +288,11 @@ class Experiment(Result):
 
         A row contains the participants, the condition and the measures of the trial.
         """
-        done = self.read_entries()
+        finished_trials = self.read_entries()
         choices = self.list_choices()
         rows = []
         for planned in self.plan.trials:
-            entry = done.get(planned.number)
+            entry = finished_trials.get(planned.number)
             if entry is not None:
                 rows.append(self._describe_trial(planned, entry, choices))
         return rows
@@ -293,7 +300,7 @@ class Experiment(Result):
     def _describe_trial(
         self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
     ) -> dict[str, Any]:
-        """Returns the row of a finished trial in trials.csv.
+        """Returns the row of a finished trial in the table trials.csv, which is analysed later.
 
         Args:
             planned: The trial in the plan: number, participants, condition, block.
@@ -323,7 +330,10 @@ class Experiment(Result):
         }
 
     def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
-        """Returns the two columns that a trial of a staircase has in addition.
+        """Returns the two further columns of a trial in a perception test (staircase).
+
+        Such trials come in pairs that differ in one quantity, and the participant chooses the
+        trial in which the quantity was larger.
 
         Returns:
             "difference", between the two trials of the pair, and "right", 1 if the choice was
@@ -332,8 +342,9 @@ class Experiment(Result):
         """
         if planned.practice:
             return {"difference": None, "right": None}
-        difference, right = self.plan.find_pair(planned, choices)
-        return {"difference": difference, "right": None if right is None else int(right)}
+        difference, is_right = self.plan.find_pair(planned, choices)
+        right = None if is_right is None else int(is_right)
+        return {"difference": difference, "right": right}
 
     def list_answers(self) -> list[dict[str, Any]]:
         """Returns what people answered, with a row for each item of each questionnaire.
@@ -367,26 +378,27 @@ class Experiment(Result):
         return rows
 
     def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
-        """Yields the notes with answers to a questionnaire, each with its first columns.
+        """Yields the notes with answers to a questionnaire, each with columns that identify it.
 
         These columns say whose answers they are, in which block they were given, and which
-        condition the block had. Choices of a staircase are such notes, too.
+        condition the block had. Choices in a perception test are such notes, too.
         """
         conditions: dict[tuple[tuple[str, ...], int], str] = {}
         for trial in self.plan.trials:
-            if not trial.catch:
+            if not trial.catch:  # a catch trial has another condition than its block
                 conditions[trial.group, trial.block] = trial.condition
+
         for note in self.read_notes():
             if not note.answers:
                 continue
             planned = self.plan.trials[note.number - 1]
-            row = {
+            identifying_columns = {
                 self.unit: "-".join(planned.group),
                 "participant": note.who,
                 "condition": conditions[planned.group, planned.block],
                 "block": planned.block,
             }
-            yield row, note
+            yield identifying_columns, note
 
     def write_tables(self) -> Path:
         """Writes the results as CSV tables into the folder of the experiment.
@@ -398,16 +410,16 @@ class Experiment(Result):
         Returns:
             The path of trials.csv.
         """
-        events = [
-            {
+        events = []
+        for note in self.read_notes():
+            event = {
                 "unix_s": note.unix_s,
                 "event": note.kind,
                 "who": note.who,
                 "trial_number": note.number,
                 "text": note.text,
             }
-            for note in self.read_notes()
-        ]
+            events.append(event)
         tables = {
             TRIALS_FILE: self.to_rows(),
             "questionnaires.csv": self.list_answers(),
@@ -443,19 +455,21 @@ class Experiment(Result):
         not completed counts as longer than any other.
         """
         status = self.status()
-        rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
+        counted_rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
         total = count_nouns(status.total, "trial")
         yield f"{self.plan.protocol.name}: {status.done} of {total}, in {self.folder}"
-        table: list[tuple[str, ...]] = []
+
+        table_rows: list[tuple[str, ...]] = []
         for condition in self.plan.protocol.conditions:
-            trials = [row for row in rows if row["condition"] == condition]
+            trials = [row for row in counted_rows if row["condition"] == condition]
             if trials:
                 completed = sum(map(is_completed, trials))
                 counts = [str(len(trials)), str(completed), _describe_median(trials)]
                 means = [_describe_mean(trials, measure) for measure in _SHOWN_MEASURES]
-                table.append((condition, *counts, *means))
-        heads = ("condition", "trials", "completed", "completion_s, median", *_SHOWN_MEASURES)
-        yield TextTable(heads, table, align="l" + "r" * (len(heads) - 1))
+                table_rows.append((condition, *counts, *means))
+        headers = ("condition", "trials", "completed", "completion_s, median", *_SHOWN_MEASURES)
+        yield TextTable(headers, table_rows, align="l" + "r" * (len(headers) - 1))
+
         trial = status.next
         if trial is not None:
             yield f"next: trial {trial.number}, {', '.join(trial.group)}, {trial.condition}"
@@ -533,9 +547,9 @@ def check_experiment(file: str | Path) -> ExperimentPlan:
 
 
 def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
-    """Creates the folder of an experiment, by default runs/experiment-NAME-N.
+    """Creates the folder of a new experiment with people, by default runs/experiment-NAME-N.
 
-    The folder contains the protocol, and the plan with the scenarios as JSON.
+    The folder contains the protocol, and the plan of all trials with their scenarios as JSON.
 
     Args:
         file: File of the protocol.
@@ -545,11 +559,13 @@ def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experim
     default_name = f"experiment-{plan.protocol.name}"
     out_path = None if out is None else Path(out)
     folder = make_results_folder(out_path, default_name, force=None)
+
     write_whole(folder / PROTOCOL_FILE, Path(file).read_text(encoding="utf-8"))
+    trials = [{**trial._asdict(), "log": f"{LOGS}/{trial.file}"} for trial in plan.trials]
     facts = {
         "digest": plan.digest,
         "protocol": msgspec.to_builtins(plan.protocol),
-        "trials": [{**trial._asdict(), "log": f"{LOGS}/{trial.file}"} for trial in plan.trials],
+        "trials": trials,
         "scenarios": {name: scenario.text for name, scenario in plan.scenarios.items()},
     }
     write_whole(folder / PLAN_FILE, json.dumps(facts, indent=1) + "\n")
@@ -565,25 +581,27 @@ def open_experiment(folder: str | Path) -> Experiment:
     Raises:
         UsageError: The folder contains no experiment, or its plan was changed.
     """
-    path = Path(folder)
+    folder_path = Path(folder)
     try:
-        facts = json.loads((path / PLAN_FILE).read_text(encoding="utf-8"))
+        stored_plan = json.loads((folder_path / PLAN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise UsageError(
-            f"{path}: contains no experiment; "
+            f"{folder_path}: contains no experiment; "
             "start an experiment with `trilat experiment run FILE`"
         ) from None
+
+    # The trials are planned again, so that a changed protocol is detected by its digest.
     scenarios = {}
-    for name, text in facts["scenarios"].items():
-        scenarios[name] = parse_scenario(text, str(path))
-    protocol = read_protocol(path / PROTOCOL_FILE)
+    for name, text in stored_plan["scenarios"].items():
+        scenarios[name] = parse_scenario(text, str(folder_path))
+    protocol = read_protocol(folder_path / PROTOCOL_FILE)
     plan = plan_experiment(protocol, scenarios=scenarios)
-    if plan.digest != facts["digest"]:
+    if plan.digest != stored_plan["digest"]:
         raise UsageError(
-            f"{path}: the protocol was changed after the experiment began; "
+            f"{folder_path}: the protocol was changed after the experiment began; "
             "start another experiment"
         )
-    return Experiment(path, plan)
+    return Experiment(folder_path, plan)
 
 
 def run_experiment(
@@ -618,17 +636,14 @@ def run_experiment(
 
 
 def list_log_problems(experiment: Experiment) -> Iterator[str]:
-    """Finds finished trials whose log is missing or was changed since the trial.
+    """Yields a sentence for each finished trial whose log is missing or was changed.
 
     Args:
         experiment: The experiment in its folder.
-
-    Yields:
-        A sentence for each such trial.
     """
-    done = experiment.read_entries()
+    finished_trials = experiment.read_entries()
     for planned in experiment.plan.trials:
-        entry = done.get(planned.number)
+        entry = finished_trials.get(planned.number)
         path = experiment.folder / LOGS / planned.file
         if entry is None:
             continue

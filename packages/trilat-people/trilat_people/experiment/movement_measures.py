@@ -32,7 +32,7 @@ ONSET_SHARE = 0.05
 
 
 def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
-    """Returns samples as an array of finite numbers, shape (K,) or (K, D).
+    """Returns the samples of a movement as an array of finite numbers, shape (K,) or (K, D).
 
     Args:
         name: Name of the samples in error messages.
@@ -66,10 +66,12 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
         UsageError: The shapes differ, or a sample is not finite.
     """
     arrays = {name: _read(name, value, 2) for name, value in values.items()}
-    different_shapes = {array.shape for array in arrays.values()}
-    if len(different_shapes) > 1:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise UsageError(f"{shapes}: give the same number of samples and axes in each array")
+    distinct_shapes = {array.shape for array in arrays.values()}
+    if len(distinct_shapes) > 1:
+        shapes_text = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise UsageError(
+            f"{shapes_text}: give the same number of samples and axes in each array"
+        )
     return list(arrays.values())
 
 
@@ -123,6 +125,7 @@ def sparc(
     samples = _read("speed", speed, 1)
     if not samples.any():
         return None
+
     next_power = int(np.ceil(np.log2(samples.size)))
     padded_size = 1 << (next_power + padding)
     coefficients = np.fft.rfft(samples, padded_size)
@@ -130,16 +133,17 @@ def sparc(
     spacing_hz = rate_hz / padded_size
     frequency_hz = np.arange(magnitude.size) * spacing_hz
     relative_magnitude = magnitude / magnitude.max()
+
     is_motion = frequency_hz <= cutoff_hz
     spectrum = relative_magnitude[is_motion]
 
     # The spectrum is cut to the range in which it exceeds the threshold.
-    above = np.flatnonzero(spectrum >= threshold)
-    if above.size == 0 or above[0] == above[-1]:
+    above_threshold = np.flatnonzero(spectrum >= threshold)
+    if above_threshold.size == 0 or above_threshold[0] == above_threshold[-1]:
         return None
-    first = above[0]
-    last = above[-1]
-    curve = spectrum[first : last + 1]
+    first_index = above_threshold[0]
+    last_index = above_threshold[-1]
+    curve = spectrum[first_index : last_index + 1]
 
     # Length of the curve, whose frequency axis is scaled to run from 0 to 1.
     frequency_step = 1.0 / (curve.size - 1)
@@ -182,9 +186,9 @@ def movement_time_s(
     if not samples.any():
         return None
     onset_speed = share * samples.max()
-    moving = np.flatnonzero(samples >= onset_speed)
-    sample_count = moving[-1] - moving[0]
-    return float(sample_count) / rate_hz
+    moving_samples = np.flatnonzero(samples >= onset_speed)
+    interval_count = moving_samples[-1] - moving_samples[0]
+    return float(interval_count) / rate_hz
 
 
 def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
@@ -244,7 +248,10 @@ def measure_throughput(
     *,
     serial: bool = False,
 ) -> Throughput | None:
-    """Computes the throughput of a user's movements under one condition.
+    """Computes the throughput of aimed movements: their speed and accuracy in one number.
+
+    The throughput is log2(distance / width + 1) / time, in bit/s. The effective width is 4.133
+    standard deviations of the end points along the direction of the movement.
 
     Args:
         starts: Centres of the targets from which the movements start, in m, shape (K, D).
@@ -268,6 +275,7 @@ def measure_throughput(
     count = len(target_points)
     if times.size != count or not (times > 0.0).all():
         raise UsageError(f"times_s: give a time above 0 for each of {count} movements")
+
     axes = target_points - start_points
     lengths = np.linalg.norm(axes, axis=1)
     if not lengths.all():
@@ -275,6 +283,7 @@ def measure_throughput(
             "starts: a movement must not start at its own target; "
             "give the centre of the previous target"
         )
+
     # How far each end point is beyond its target, along the axis of the task.
     end_errors = end_points - target_points
     projections = (end_errors * axes).sum(axis=1)
@@ -282,6 +291,7 @@ def measure_throughput(
     distances = lengths + overshoots
     if serial:
         distances[1:] += overshoots[:-1]
+
     width = 0.0
     if overshoots.size > 1:
         deviation = float(np.std(overshoots, ddof=1))
@@ -362,7 +372,10 @@ class PairMeasures(NamedTuple):
 def measure_pair(
     first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_hz: float
 ) -> PairMeasures:
-    """Computes the forces and the work of two users on a shared object.
+    """Computes the forces and the work of two users who move a shared object together.
+
+    The sum of their forces moves the object. The internal force is the part by which they work
+    against each other, and which only squeezes the object.
 
     Args:
         first: Force of the first user on the object, in N, shape (K, D).
@@ -373,22 +386,26 @@ def measure_pair(
     first_force, second_force, velocities = _read_same_shape(
         first=first, second=second, velocity=velocity
     )
+
     internal = find_internal_force(first_force, second_force)
     useful = first_force + second_force
     first_size = np.abs(first_force).sum()
     second_size = np.abs(second_force).sum()
     total_size = first_size + second_size
+
     internal_share = None
     if total_size:
         # Both users' parts of the internal force have the same size.
         internal_size = 2.0 * np.abs(internal).sum()
         internal_share = float(internal_size / total_size)
+
     first_effort = float((first_force * first_force).sum())
     second_effort = float((second_force * second_force).sum())
     effort = first_effort + second_effort
     first_effort_share = None
     if effort:
         first_effort_share = first_effort / effort
+
     first_power = (first_force * velocities).sum(axis=1)
     second_power = (second_force * velocities).sum(axis=1)
     first_absorbed_power = np.maximum(-first_power, 0.0)
@@ -456,21 +473,23 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
     Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical
     and theoretical research", Advances in Psychology 52 (1988).
     """
-    ordered_ratings = _list_ratings(ratings)
-    ordered_weights = [weights.get(scale, -1) for scale in TLX_SCALES]
-    sums = np.cumsum(sorted(ordered_weights))
+    ratings_in_order = _list_ratings(ratings)
+    weights_in_order = [weights.get(scale, -1) for scale in TLX_SCALES]
+    cumulative_sums = np.cumsum(sorted(weights_in_order))
     # Any n scales are compared with each other n (n - 1) / 2 times, and each comparison adds 1.
     least_sums = [n * (n - 1) // 2 for n in range(1, 7)]
-    has_all = len(weights) == 6
-    is_whole = has_all and all(weight == int(weight) for weight in ordered_weights)
-    is_possible = sums[-1] == 15 and not (sums < least_sums).any()
-    if not is_whole or not is_possible:
+    has_all_scales = len(weights) == 6
+    are_whole_numbers = has_all_scales and all(
+        weight == int(weight) for weight in weights_in_order
+    )
+    are_possible = cumulative_sums[-1] == 15 and not (cumulative_sums < least_sums).any()
+    if not are_whole_numbers or not are_possible:
         scales = ", ".join(TLX_SCALES)
         raise UsageError(
             f"weights {dict(weights)}: for each of {scales}, give how often the scale was "
             "chosen (0 to 5) in the 15 pairwise comparisons"
         )
-    return float(np.dot(ordered_ratings, ordered_weights) / 15.0)
+    return float(np.dot(ratings_in_order, weights_in_order) / 15.0)
 
 
 def sus_score(answers: Sequence[int]) -> float:
@@ -491,6 +510,7 @@ def sus_score(answers: Sequence[int]) -> float:
                 f"answer {number} = {answer}: "
                 "an answer to a question of SUS must be 1, 2, 3, 4 or 5"
             )
+
     # Odd questions are worded positively, even questions negatively.
     positive_points = sum(answer - 1 for answer in answers[::2])
     negative_points = sum(5 - answer for answer in answers[1::2])

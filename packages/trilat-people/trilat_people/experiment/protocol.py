@@ -98,15 +98,15 @@ class _Training(Frozen, frozen=True):
         (guided)", and the numbers of trials before, after and for retention.
         """
         courses: list[str] = []
-        for condition, (first, last) in self.lead.items():
-            courses.append(f"{first:g} to {last:g} ({condition})")
-        retention = ""
+        for condition, (first_lead, last_lead) in self.lead.items():
+            courses.append(f"{first_lead:g} to {last_lead:g} ({condition})")
+        retention_text = ""
         if self.retention:
-            retention = f", and {self.retention} more after {self.rest_s:g} s"
+            retention_text = f", and {self.retention} more after {self.rest_s:g} s"
         return (
             f"In these the expert's part of the authority went from {', '.join(courses)}; "
             f"{count_nouns(self.before, 'trial')} before and "
-            f"{self.after} after them{retention} were made without it and are compared"
+            f"{self.after} after them{retention_text} were made without it and are compared"
         )
 
 
@@ -187,13 +187,15 @@ class Protocol(Frozen, frozen=True):
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
             for _ in range(self.trials // 2):
-                pair = random.permutation([STANDARD, COMPARISON]).tolist()
-                phases += [(phase, None) for phase in pair]
+                pair_phases = random.permutation([STANDARD, COMPARISON]).tolist()
+                phases += [(phase, None) for phase in pair_phases]
             return phases
+
         training = self.training
         if training is None:
             phases += [("", None)] * self.trials
             return phases
+
         first_lead, last_lead = training.lead[condition]
         phases += [("before", 0.0)] * training.before
         leads = np.linspace(first_lead, last_lead, self.trials).tolist()
@@ -228,10 +230,10 @@ class Protocol(Frozen, frozen=True):
             names = tuple(f"P{number:0{digits}d}" for number in numbers)
         else:
             names = participants
-        size = len(self.users)
+        group_size = len(self.users)
         groups: list[tuple[str, ...]] = []
-        for first in range(0, len(names), size):
-            group = names[first : first + size]
+        for first in range(0, len(names), group_size):
+            group = names[first : first + group_size]
             groups.append(group)
         return groups
 
@@ -417,10 +419,10 @@ class ExperimentPlan(Result):
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns what is known about the pair of trials to which a trial belongs.
+        """Returns the difference of a pair of trials in a perception test, and the answer.
 
-        A staircase presents pairs of trials that differ in one key, and the participant chooses
-        the trial in which the value was larger.
+        A staircase presents pairs of trials that differ in one key of the scenario, and the
+        participant chooses the trial in which the value was larger.
 
         Args:
             planned: A trial of the pair.
@@ -433,19 +435,19 @@ class ExperimentPlan(Result):
         staircase = self.protocol.staircase
         assert staircase is not None
         index_in_block = planned.trial - self.protocol.practice - 1
-        pair = index_in_block // 2
+        pair_index = index_in_block // 2
         judgements = self.judge_choices(planned, choices)
         differences = staircase.list_differences(judgements)
         is_right = None
-        if pair < len(judgements):
-            is_right = judgements[pair]
-        return differences[pair], is_right
+        if pair_index < len(judgements):
+            is_right = judgements[pair_index]
+        return differences[pair_index], is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
-        """Returns the scenario of a trial.
+        """Returns the scenario that is run in a trial.
 
-        It is the scenario of the trial's condition. In a staircase, a key of it is adapted to
-        the earlier choices of the participant.
+        It is the scenario of the trial's condition. In a perception test (staircase), a key of
+        the scenario is adapted to the earlier choices of the participant.
 
         Args:
             planned: The trial in the plan.
@@ -455,7 +457,8 @@ class ExperimentPlan(Result):
         staircase = self.protocol.staircase
         if staircase is None or planned.practice:
             return scenario
-        difference = 0.0
+
+        difference = 0.0  # in the standard trial of a pair
         if planned.phase == COMPARISON:
             difference, _ = self.find_pair(planned, choices)
         value = staircase.standard + difference
@@ -471,8 +474,10 @@ class ExperimentPlan(Result):
             planned: The trial in the plan.
         """
         training = self.protocol.training
+        # Numbers count from 1, so that the previous trial has the index `number` - 2.
         previous = self.trials[max(planned.number - 2, 0)]
         starts_retention = planned.phase == "retention" and previous.phase != "retention"
+
         if training is not None and starts_retention:
             return training.rest_s
         starts_later_block = planned.trial == 1 and planned.block > 1
@@ -506,19 +511,20 @@ class ExperimentPlan(Result):
         protocol = self.protocol
         facts = self.to_dict()
         unit = "pair" if len(protocol.users) > 1 else "participant"
-        units = count_nouns(facts["groups"], unit)
+        units_text = count_nouns(facts["groups"], unit)
         users = ", ".join(protocol.users)
         yield f"{protocol.name}: {protocol.title or protocol.task.description}"
-        yield f"{units} at {users}, {protocol.task.description}"
-        conditions = count_nouns(len(protocol.conditions), "condition")
+        yield f"{units_text} at {users}, {protocol.task.description}"
+
+        conditions_text = count_nouns(len(protocol.conditions), "condition")
         block_size = self.trials[-1].trial
-        counted = count_nouns(block_size - protocol.practice, "trial")
-        total = count_nouns(len(self.trials), "trial")
+        counted_text = count_nouns(block_size - protocol.practice, "trial")
+        total_text = count_nouns(len(self.trials), "trial")
         _, longest_foreperiod_s = protocol.foreperiod_s
         longest_s = longest_foreperiod_s + protocol.task.longest_s
         yield (
-            f"{conditions} of {protocol.practice} + {counted}: "
-            f"{total} of at most {longest_s:g} s; design {protocol.design}"
+            f"{conditions_text} of {protocol.practice} + {counted_text}: "
+            f"{total_text} of at most {longest_s:g} s; design {protocol.design}"
         )
         rows = [(name, ", ".join(order)) for name, order in facts["orders"].items()]
         yield TextTable(("", "order of conditions"), rows)
@@ -552,7 +558,10 @@ def plan_experiment(
     folder: Path | None = None,
     scenarios: Mapping[str, Scenario] | None = None,
 ) -> ExperimentPlan:
-    """Plans the trials of a protocol.
+    """Plans all trials of an experiment from its protocol, or refuses the protocol.
+
+    The protocol is the design of the experiment. With the same protocol, the plan is always the
+    same, so that it can be published before the experiment.
 
     Args:
         protocol: Design of the experiment: conditions, task and participants.
@@ -577,8 +586,11 @@ def plan_experiment(
                 condition_scenarios[name] = _check_scenario(scenario, protocol)
             except TrilatError as error:
                 problems.append(f"condition {name}: {error}")
+
     if problems:
         raise UsageError(f"{protocol.name}: " + "; ".join(problems))
+
+    # The digest proves later that a trial follows this plan.
     texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
     tables = msgspec.to_builtins(protocol)
     content = msgspec.json.encode([tables, texts], order="sorted")
@@ -659,11 +671,14 @@ def _find_table_problems(protocol: Protocol) -> Iterator[str]:
     if training is not None and training.lead.keys() != protocol.conditions.keys():
         conditions = ", ".join(protocol.conditions)
         yield f"training.lead: must have a pair of numbers for each of {conditions}"
+
     tables = [table for table in (training, catch, staircase) if table is not None]
     if len(tables) > 1:
         yield "catch trials, a training and a staircase exclude each other"
+
     if staircase is not None:
         yield from _find_staircase_problems(protocol, staircase)
+
     needs_pair = training is not None or protocol.task.needs_pair
     if needs_pair and len(protocol.users) != 2:
         yield "a training, a handover and a task with two targets need two users"
@@ -689,20 +704,22 @@ def _find_group_problems(protocol: Protocol) -> Iterator[str]:
     """
     users = protocol.users
     name_count = len(_list_pseudonyms(protocol))
-    if not 1 <= len(users) <= 2 or len(set(users)) < len(users):
+    has_repeated_user = len(set(users)) < len(users)
+    if not 1 <= len(users) <= 2 or has_repeated_user:
         yield f"users must be one or two sites, not {', '.join(users)}"
     elif name_count % len(users):
         participants = count_nouns(name_count, "participant")
         yield f"{participants} cannot form pairs: the number of participants must be even"
+
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
     group_count = len(protocol.groups)
     if protocol.design in ("williams", "latin") and group_count % len(orders):
-        units = "pairs" if len(users) == 2 else "participants"
-        conditions = count_nouns(len(protocol.conditions), "condition")
+        units_text = "pairs" if len(users) == 2 else "participants"
+        conditions_text = count_nouns(len(protocol.conditions), "condition")
         yield (
-            f"a {protocol.design} design of {conditions} has "
-            f"{count_nouns(len(orders), 'order')}: the number of {units} must be a multiple of "
-            f"{len(orders)}, not {group_count}"
+            f"a {protocol.design} design of {conditions_text} has "
+            f"{count_nouns(len(orders), 'order')}: the number of {units_text} must be "
+            f"a multiple of {len(orders)}, not {group_count}"
         )
 
 
@@ -732,6 +749,8 @@ def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterat
 def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
     """Returns the scenario of a condition if the experiment can be run with it.
 
+    For example, each user needs a site at which a person can move the arm.
+
     Raises:
         ScenarioError: A user's site is missing or cannot be held by a person, or a wall, a
             dominance factor, a force limit or a key of the staircase does not fit.
@@ -748,21 +767,24 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
                 "add hands = [{ kind = 'live' }]",
                 path=f"sites.{user}.hands",
             )
+
     slave = scenario.slave
     if protocol.task.needs_wall and not scenario.sites[slave].environment:
         raise ScenarioError(
             "the slave has no wall to press against", path=f"sites.{slave}.environment"
         )
-    shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
+    user_shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
     needs_shares = protocol.training is not None or protocol.task.needs_pair
-    if needs_shares and min(shares) <= 0.0:
+    if needs_shares and min(user_shares) <= 0.0:
         raise ScenarioError("both users must have a share above 0", path=f"dominance.{slave}")
+
     for group in protocol.groups:
         limit_forces(scenario, protocol, group)
+
     staircase = protocol.staircase
     if staircase is not None:
-        largest = staircase.standard + staircase.start
-        for value in (staircase.standard, largest):
+        largest_value = staircase.standard + staircase.start
+        for value in (staircase.standard, largest_value):
             load_scenario(scenario, {staircase.key: value})
     return scenario
 
@@ -790,11 +812,12 @@ def limit_forces(
     limited_sites: dict[str, Any] = {}
     # The lengths may differ: `_find_problems` reports a group that is too small.
     for user, name in zip(protocol.users, group, strict=False):
-        spec = scenario.sites[user]
+        site_settings = scenario.sites[user]
         limit_n = protocol.force_limit_n.get(name)
-        live_hand = spec.find_live_hand(is_open=True)
+        live_hand = site_settings.find_live_hand(is_open=True)
         if limit_n is None or live_hand is None:
             continue
+
         key = f"force_limit_n.{name}"
         if live_hand.mode == "joint":
             raise ScenarioError(
@@ -808,14 +831,20 @@ def limit_forces(
                 f"which is {hand_limit_n:g} N",
                 path=key,
             )
+
         limited_hand = replace(live_hand, force_limit_n=limit_n)
-        hands = tuple(limited_hand if hand is live_hand else hand for hand in spec.hands)
-        limited_sites[user] = replace(spec, hands=hands)
+        hands = tuple(
+            limited_hand if hand is live_hand else hand for hand in site_settings.hands
+        )
+        limited_sites[user] = replace(site_settings, hands=hands)
     return limited_sites
 
 
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
-    """Lists the orders of conditions, which are assigned to participants in turn.
+    """Lists orders of the experiment's conditions, which are assigned to participants in turn.
+
+    Participants get better by practice and worse by fatigue. If each of them meets the
+    conditions in another order, these effects are the same for all conditions on average.
 
     Args:
         design: "williams": each condition is equally often at each position, and equally often
@@ -828,6 +857,7 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
     count = len(conditions)
     if design == "fixed":
         return [tuple(conditions)]
+
     if design == "random":
         random = np.random.default_rng(seed)
         names = np.array(conditions)
@@ -836,6 +866,8 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
             order = names[random.permutation(count)]
             orders.append(tuple(order.tolist()))
         return orders
+
+    # Each row of the square is an order, as indices of conditions.
     first_row = list(range(count))
     if design == "williams":
         # The first row is 0, 1, n - 1, 2, n - 2, ...
@@ -843,9 +875,13 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
         for step in range(1, count // 2 + 1):
             first_row += [step, count - step]
         first_row = first_row[:count]
-    rows = [[(index + shift) % count for index in first_row] for shift in range(count)]
-    # For an odd number, only the rows and their mirror images together are balanced.
+
+    rows = []
+    for shift in range(count):
+        row = [(index + shift) % count for index in first_row]
+        rows.append(row)
     if design == "williams" and count % 2:
+        # For an odd number, only the rows and their mirror images together are balanced.
         rows += [row[::-1] for row in rows]
     return [tuple(conditions[index] for index in row) for row in rows]
 
@@ -911,7 +947,10 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
 
 
 def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) -> set[int]:
-    """Draws which trials of a block are catch trials.
+    """Draws which trials of a block are catch trials, which have an unexpected condition.
+
+    Participants cannot rely on the condition of the block then. If they behave differently in a
+    catch trial, they have adapted to the condition.
 
     Args:
         protocol: Design of the experiment: conditions, task and participants.
@@ -927,6 +966,6 @@ def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) ->
         return set()
     random = np.random.default_rng([protocol.seed, group, block, 1])
     count = round(catch.share * protocol.trials)
-    drawn = random.permutation(protocol.trials)[:count]
-    indices = protocol.practice + drawn
+    drawn_trials = random.permutation(protocol.trials)[:count]
+    indices = protocol.practice + drawn_trials
     return set(indices.tolist())

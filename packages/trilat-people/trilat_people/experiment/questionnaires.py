@@ -110,14 +110,14 @@ class Questionnaire(Frozen, frozen=True):
             `sus`, and the mean of the answers for any other questionnaire. None if an answer is
             missing.
         """
-        complete = {item: value for item, value in answers.items() if value is not None}
-        if len(complete) < len(answers):
+        given_answers = {item: value for item, value in answers.items() if value is not None}
+        if len(given_answers) < len(answers):
             return None
         if self.name == "tlx":
-            return raw_tlx(complete)
+            return raw_tlx(given_answers)
         if self.name == "sus":
-            return sus_score([int(value) for value in complete.values()])
-        return float(np.mean(list(complete.values())))
+            return sus_score([int(value) for value in given_answers.values()])
+        return float(np.mean(list(given_answers.values())))
 
 
 @cache
@@ -141,22 +141,24 @@ def find_form(questionnaire: Questionnaire) -> Questionnaire:
             does not have 2 to 101 numbers.
     """
     name = questionnaire.name
-    shipped = _read_shipped()
+    built_in = _read_shipped()
     if not questionnaire.items:
-        if name not in shipped:
+        if name not in built_in:
             raise UsageError(
                 f"questionnaire {name} has no items; "
-                f"the built-in questionnaires are {', '.join(shipped)}"
+                f"the built-in questionnaires are {', '.join(built_in)}"
             )
-        form = msgspec.convert({"name": name, **shipped[name]}, Questionnaire)
+        form = msgspec.convert({"name": name, **built_in[name]}, Questionnaire)
         return replace(form, after=questionnaire.after)
-    if name in shipped:
+
+    if name in built_in:
         raise UsageError(
             f"questionnaire {name} is built in and has its own items; "
             "give your questionnaire another name"
         )
-    length = questionnaire.most - questionnaire.least
-    if not questionnaire.step <= length <= 100 * questionnaire.step:
+
+    scale_length = questionnaire.most - questionnaire.least
+    if not questionnaire.step <= scale_length <= 100 * questionnaire.step:
         raise UsageError(
             f"questionnaire {name}: the scale must have 2 to 101 numbers; "
             "correct least, most or step"

@@ -84,7 +84,9 @@ class Staircase(Frozen, frozen=True):
         )
 
     def _list_directions(self, right: Sequence[bool]) -> list[int]:
-        """Returns the direction in which the difference changes after each answer.
+        """Returns the direction in which the tested difference changes after each answer.
+
+        It decreases after `down` right answers in a row, and increases after a wrong answer.
 
         Args:
             right: For each answer, True if it was right.
@@ -125,12 +127,12 @@ class Staircase(Frozen, frozen=True):
         return differences
 
     def find_threshold(self, right: Sequence[bool]) -> float | None:
-        """Computes the threshold, the geometric mean of the differences at the reversals.
+        """Returns the perception threshold: the difference at which the staircase has settled.
 
-        A reversal is a step in another direction than the previous step. The first two
-        reversals do not count, because the difference is still far from its final value. If the
-        number of reversals is odd, the third does not count either, so that as many reversals
-        lead up as down.
+        It is the geometric mean of the differences at the reversals, which are steps in another
+        direction than the previous step. The first two reversals do not count, because the
+        difference is still far from its final value. If the number of reversals is odd, the
+        third does not count either, so that as many reversals lead up as down.
 
         Args:
             right: For each answer, True if it was right.
@@ -141,10 +143,12 @@ class Staircase(Frozen, frozen=True):
         # There is one difference more than directions: that of the next pair.
         pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
         steps = [(difference, direction) for difference, direction in pairs if direction]
+
         reversals: list[float] = []
         for (_, previous_direction), (difference, direction) in pairwise(steps):
             if direction != previous_direction:
                 reversals.append(difference)
+
         skipped_count = SKIPPED_REVERSALS + len(reversals) % 2
         counted = reversals[skipped_count:]
         if not counted:
@@ -169,8 +173,9 @@ class Staircase(Frozen, frozen=True):
         random = np.random.default_rng([seed, 2])
         # The difference of two normal errors has sqrt(2) times their deviation.
         error = 2.0**0.5 * deviation * random.standard_normal()
-        standard = 3 - comparison
-        return comparison if difference + error > 0.0 else standard
+        standard_trial = 3 - comparison  # the other number of 1 and 2
+        perceived_difference = difference + error
+        return comparison if perceived_difference > 0.0 else standard_trial
 
     def describe(self) -> str:
         """Describes in a sentence how the perception threshold was measured, for a paper.

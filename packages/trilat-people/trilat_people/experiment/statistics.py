@@ -74,29 +74,34 @@ def average_trials(
         UsageError: No row has the measure, a row lacks a key, or a value is not a finite
             number.
     """
-    values: dict[str, dict[str, list[float]]] = {}
+    values_by_condition: dict[str, dict[str, list[float]]] = {}
     for row in rows:
-        missing = [key for key in (unit, "condition") if key not in row]
-        if missing:
+        missing_keys = [key for key in (unit, "condition") if key not in row]
+        if missing_keys:
             raise UsageError(
-                f"a row lacks {' and '.join(missing)}: "
+                f"a row lacks {' and '.join(missing_keys)}: "
                 f"every row must have the keys {unit} and condition"
             )
-        values_by_unit = values.setdefault(str(row["condition"]), {})
+
+        values_by_unit = values_by_condition.setdefault(str(row["condition"]), {})
         value = row.get(measure)
         if value not in (None, ""):
             number = read_number(value, measure, row)
             values_by_unit.setdefault(str(row[unit]), []).append(number)
+
     means: dict[str, dict[str, float]] = {}
-    for condition, values_by_unit in values.items():
+    for condition, values_by_unit in values_by_condition.items():
         means[condition] = {
             name: math.fsum(numbers) / len(numbers) for name, numbers in values_by_unit.items()
         }
+
     if not any(means.values()):
-        keys = {key for row in rows for key in row}
-        names = sorted(keys - {"participant", "pair", "condition"})
-        measures = ", ".join(names) or "no measures"
-        raise UsageError(f"no trial has a number for {measure}; the rows contain {measures}")
+        keys: set[str] = set()
+        for row in rows:
+            keys |= row.keys()
+        measure_names = sorted(keys - {"participant", "pair", "condition"})
+        names_text = ", ".join(measure_names) or "no measures"
+        raise UsageError(f"no trial has a number for {measure}; the rows contain {names_text}")
     return means
 
 
@@ -117,9 +122,10 @@ def read_number(value: Any, measure: str, row: Row) -> float:
         number = math.nan
     if not math.isfinite(number):
         keys = ("participant", "condition", "trial")
-        trial = ", ".join(f"{key} {row[key]}" for key in keys if key in row)
+        trial_text = ", ".join(f"{key} {row[key]}" for key in keys if key in row)
         raise UsageError(
-            f"{measure} = {value!r} ({trial}): give a finite number, or leave the value empty"
+            f"{measure} = {value!r} ({trial_text}): give a finite number, "
+            "or leave the value empty"
         )
     return number
 
@@ -170,17 +176,20 @@ def summarise_conditions(
     """
     means = average_trials(rows, measure, unit)
     rows_without_value = [row for row in rows if row.get(measure) in (None, "")]
-    missing = Counter(str(row["condition"]) for row in rows_without_value)
+    missing_by_condition = Counter(str(row["condition"]) for row in rows_without_value)
     summaries: list[ConditionMean] = []
     for condition, means_by_unit in means.items():
         if means_by_unit:
             summary = _summarise(condition, list(means_by_unit.values()), seed)
-            summaries.append(summary._replace(missing=missing[condition]))
+            summaries.append(summary._replace(missing=missing_by_condition[condition]))
     return summaries
 
 
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
     """Returns mean, deviation and confidence intervals of one condition.
+
+    A condition is a variant of the experiment, such as a network delay. Its numbers are one
+    mean per participant.
 
     Args:
         condition: Name of the condition.
@@ -191,7 +200,7 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
         The summary. With a single participant it has no deviation and no interval.
     """
     mean = MeanInterval.of_values(values)
-    if mean is None:
+    if mean is None:  # a single value
         return ConditionMean(
             condition=condition,
             number=len(values),
@@ -229,10 +238,13 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
     sample = np.asarray(values, dtype=np.float64)
     if sample.size < 2:
         return None
+
     # BCa divides by the spread of the sample, and returns NaN for equal values.
-    if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
+    are_equal = np.ptp(sample) <= _ROUNDING * np.abs(sample).max()
+    if are_equal:
         mean = float(sample.mean())
         return mean, mean
+
     result = import_scipy_stats().bootstrap(
         (sample,),
         np.mean,
@@ -306,10 +318,12 @@ def compare_conditions(
     comparisons: list[Comparison] = []
     for first, second in combinations(means, 2):
         comparisons.append(_compare(measure, first, second, means))
-    corrected = correct_holm([comparison.p for comparison in comparisons])
+
+    # Many tests find a difference by chance. Holm's method corrects the p values.
+    corrected_p = correct_holm([comparison.p for comparison in comparisons])
     return [
         comparison._replace(p_holm=p)
-        for comparison, p in zip(comparisons, corrected, strict=True)
+        for comparison, p in zip(comparisons, corrected_p, strict=True)
     ]
 
 
@@ -330,40 +344,45 @@ def _compare(
     Returns:
         The difference second minus first, with its interval and tests if there are any.
     """
-    units = [unit for unit in means[first] if unit in means[second]]
-    first_means = np.array([means[first][unit] for unit in units])
-    second_means = np.array([means[second][unit] for unit in units])
+    common_units = [unit for unit in means[first] if unit in means[second]]
+    first_means = np.array([means[first][unit] for unit in common_units])
+    second_means = np.array([means[second][unit] for unit in common_units])
     differences = second_means - first_means
-    untested = Comparison(measure, first, second, len(units))
-    if not units:
+    untested = Comparison(measure, first, second, len(common_units))
+    if not common_units:
         return untested
-    if len(units) < 2:
+    if len(common_units) < 2:
         return untested._replace(difference=float(differences[0]))
+
     mean = float(differences.mean())
-    spread = float(differences.std(ddof=1))
-    largest = max(np.abs(first_means).max(), np.abs(second_means).max())
-    if spread <= _ROUNDING * largest:
+    deviation = float(differences.std(ddof=1))
+    largest_mean = max(np.abs(first_means).max(), np.abs(second_means).max())
+    are_equal = deviation <= _ROUNDING * largest_mean
+    if are_equal:
         return untested._replace(difference=mean, interval=(mean, mean))
+
     stats = import_scipy_stats()
-    test = stats.ttest_rel(second_means, first_means)
-    low, high = test.confidence_interval(CONFIDENCE)
+    t_test = stats.ttest_rel(second_means, first_means)
+    low, high = t_test.confidence_interval(CONFIDENCE)
+
     sum_of_deviations = float(first_means.std(ddof=1) + second_means.std(ddof=1))
     mean_deviation = sum_of_deviations / 2.0
     return untested._replace(
         difference=mean,
         interval=(float(low), float(high)),
-        t=float(test.statistic),
-        p=float(test.pvalue),
-        d_z=mean / spread,
+        t=float(t_test.statistic),
+        p=float(t_test.pvalue),
+        d_z=mean / deviation,
         d_av=mean / mean_deviation,
         p_wilcoxon=float(stats.wilcoxon(differences).pvalue),
     )
 
 
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
-    """Corrects p values for the number of tests by Holm's method.
+    """Corrects the p values of several tests by Holm's method.
 
     Without a correction, the more tests are made, the more of them are significant by chance.
+    The smallest of n p values is multiplied by n, the next one by n - 1, and so on.
 
     Args:
         p: p values. None does not count as a test.
@@ -373,12 +392,13 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
     """
     ascending = sorted((value, index) for index, value in enumerate(p) if value is not None)
     corrected: list[float | None] = [None] * len(p)
-    largest = 0.0
+    largest_so_far = 0.0
     for rank, (value, index) in enumerate(ascending):
-        remaining = len(ascending) - rank
+        remaining_tests = len(ascending) - rank
         # A corrected value is never below the corrected value of a smaller p.
-        largest = max(largest, min(1.0, remaining * value))
-        corrected[index] = largest
+        corrected_value = min(1.0, remaining_tests * value)
+        largest_so_far = max(largest_so_far, corrected_value)
+        corrected[index] = largest_so_far
     return corrected
 
 
@@ -431,9 +451,11 @@ class MixedModel(NamedTuple):
 
 
 def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
-    """Fits a mixed model of a measure, with users nested within pairs.
+    """Fits a mixed model of a measure, with participants nested within pairs.
 
-    The model is for measures of single users. A measure that both users of a pair share is
+    Such a model compares the conditions of an experiment although the values are not
+    independent: those of one participant are similar, and so are those of the two participants
+    of a pair. It is for measures of single users. A measure that both users of a pair share is
     tested by `compare_conditions` with `unit="pair"`. The fit needs `pip install
     'trilat-net[stats]'`.
 
@@ -447,16 +469,20 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     """
     formulas = import_extra("statsmodels.formula.api", "stats", "mixed models")
     frames = import_extra("pandas", "stats", "mixed models")
+
     means = {
         condition: means_by_user
         for condition, means_by_user in average_trials(rows, measure).items()
         if means_by_user
     }
+
     pairs = _find_pairs(rows)
     records = []
     for condition, means_by_user in means.items():
         for user, mean in means_by_user.items():
             records.append((pairs[user], user, condition, mean))
+
+    # Each participant and each condition uses up a degree of freedom.
     users = {user for _, user, _, _ in records}
     freedom = len(records) - len(users) - len(means) + 1
     if len(means) < 2 or freedom < 1:
@@ -467,17 +493,21 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
             f"{measure}: {mean_count} of {user_count} under {condition_count}, "
             "which is too few to compare two conditions"
         )
+
+    # The first condition is the reference, with which the others are compared.
     frame = frames.DataFrame(records, columns=["pair", "participant", "condition", "measure"])
     frame["condition"] = frames.Categorical(frame["condition"], categories=list(means))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fit = _fit(formulas, frame, measure)
-    effects = [_read_effect(fit, name, freedom) for name in list(means)[1:]]
+        fitted_model = _fit(formulas, frame, measure)
+
+    effects = [_read_effect(fitted_model, name, freedom) for name in list(means)[1:]]
     variances = {
-        "pair": float(fit.cov_re.iloc[0, 0]),
-        "participant": float(fit.vcomp[0]),
-        "residual": float(fit.scale),
+        "pair": float(fitted_model.cov_re.iloc[0, 0]),
+        "participant": float(fitted_model.vcomp[0]),
+        "residual": float(fitted_model.scale),
     }
+
     notes = list(dict.fromkeys(str(warning.message) for warning in caught))
     return MixedModel(
         measure=measure,
@@ -500,27 +530,37 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
     Raises:
         UsageError: Neither optimizer gives finite numbers.
     """
-    parts = {"participant": "0 + C(participant)"}
+    variance_components = {"participant": "0 + C(participant)"}
     model = formulas.mixedlm(
-        "measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts
+        "measure ~ condition",
+        frame,
+        groups="pair",
+        re_formula="1",
+        vc_formula=variance_components,
     )
-    fits = []
+
+    fitted_models = []
     # The gradient method alone may stop before it reaches a variance of 0. Powell's method does
     # not use the gradient.
     for method in ("powell", "lbfgs"):
         with suppress(np.linalg.LinAlgError):
-            fits.append(model.fit(reml=True, method=method))
-    finite_fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
-    if not finite_fits:
+            fitted_models.append(model.fit(reml=True, method=method))
+
+    finite_models = [
+        fitted for fitted in fitted_models if np.isfinite([fitted.llf, *fitted.bse_fe]).all()
+    ]
+    if not finite_models:
         raise UsageError(
             f"{measure}: no mixed model can be fitted to the means of this measure; "
             "compare conditions instead"
         )
-    return max(finite_fits, key=lambda fit: float(fit.llf))
+    return max(finite_models, key=lambda fitted: float(fitted.llf))
 
 
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     """Returns the pair to which each participant belongs, by the participant's pseudonym.
+
+    A mixed model needs participants who are nested in pairs: each belongs to exactly one.
 
     Raises:
         UsageError: A participant is in two pairs, or no pair has two participants.
@@ -534,7 +574,10 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
                 f"participant {user} is in pairs {pairs[user]} and {pair}: "
                 "a participant must belong to exactly one pair"
             )
-    if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
+
+    has_single_user = "" in pairs.values()
+    has_only_single_users = len(set(pairs.values())) == len(pairs)
+    if has_single_user or has_only_single_users:
         raise UsageError(
             "no pair has two participants: a mixed model needs users nested within pairs"
         )
@@ -542,26 +585,32 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
-    """Returns the effect of a condition, its interval and test, from a fitted mixed model.
+    """Returns the effect of a condition from a fitted mixed model, with its interval and test.
+
+    The effect is the difference from the reference condition.
 
     Args:
         fit: The fit of statsmodels.
-        condition: Name of the condition, which is compared with the reference condition.
+        condition: Name of the condition.
         freedom: Degrees of freedom of the t statistic.
     """
     stats = import_scipy_stats()
-    name = f"condition[T.{condition}]"
+    name = f"condition[T.{condition}]"  # of the effect, in statsmodels
     estimate = float(fit.fe_params[name])
     error = float(fit.bse_fe[name])
-    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
-    p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
+
+    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom))
+    half_width = quantile * error
+
+    t_statistic = estimate / error
+    p_value = 2.0 * float(stats.t.sf(abs(t_statistic), freedom))
     return MixedEffect(
         condition=condition,
         estimate=estimate,
         error=error,
-        interval=(estimate - half, estimate + half),
-        t=estimate / error,
-        p=p,
+        interval=(estimate - half_width, estimate + half_width),
+        t=t_statistic,
+        p=p_value,
     )
 
 
@@ -592,19 +641,19 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
             "give at least two units, and an alpha between 0 and 1"
         )
     stats = import_scipy_stats()
-    shift = abs(d_z) * math.sqrt(number)
+    shift = abs(d_z) * math.sqrt(number)  # noncentrality of the t statistic
     freedom = number - 1
-    critical = stats.t.ppf(1.0 - alpha / 2.0, freedom)
-    upper_tail = stats.nct.sf(critical, freedom, shift)
+    critical_t = stats.t.ppf(1.0 - alpha / 2.0, freedom)
+    upper_tail = stats.nct.sf(critical_t, freedom, shift)
     # The lower tail is computed from its mirror image: `nct.cdf` returns NaN for small tails.
-    lower_tail = stats.nct.sf(critical, freedom, -shift)
+    lower_tail = stats.nct.sf(critical_t, freedom, -shift)
     return float(upper_tail + lower_tail)
 
 
 def find_least_number(
     d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
 ) -> int:
-    """Returns the smallest number of units whose `power` is at least `wanted`.
+    """Returns the smallest number of participants (or pairs) that gives a test enough power.
 
     Args:
         d_z: Size of the effect: mean over standard deviation of the differences.
@@ -620,6 +669,8 @@ def find_least_number(
             f"a power of {wanted} at d_z = {d_z} cannot be reached with {most} units; "
             "give a larger effect or a lower power"
         )
+
+    # The power grows with the number of units, so that the number can be found by bisection.
     return bisect_left(
         range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha)
     )
@@ -682,12 +733,15 @@ def simulate_power(
     # Variance of the difference of two means, each of which varies by effect and by trial.
     effect_variance = float(effect_deviation) ** 2
     trial_variance = float(trial_deviation) ** 2
-    variance = 2.0 * (effect_variance + trial_variance / trials)
-    deviation = math.sqrt(variance)
+    difference_variance = 2.0 * (effect_variance + trial_variance / trials)
+    difference_deviation = math.sqrt(difference_variance)
+
     powers: list[SimulatedPower] = []
     for comparisons in zip(*experiments, strict=True):
-        difference = float(means[comparisons[0].second] - means[comparisons[0].first])
-        powers.append(_count_significant(comparisons, difference / deviation, alpha))
+        conditions = comparisons[0]  # the same two conditions in all experiments
+        difference = float(means[conditions.second] - means[conditions.first])
+        d_z = difference / difference_deviation
+        powers.append(_count_significant(comparisons, d_z, alpha))
     return powers
 
 
@@ -710,18 +764,20 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
 def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
     """Returns the power: the share of simulated experiments that find a difference.
 
+    A study is planned with so many participants that the power is, for example, 80 %.
+
     Args:
         runs: Comparison of the same two conditions in each simulated experiment.
         d_z: Size of the simulated effect, the mean difference over its deviation.
         alpha: Significance level. A p below it counts as found, also after Holm's correction.
     """
-    significant = sum(run.p is not None and run.p < alpha for run in runs)
-    significant_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
+    significant_count = sum(run.p is not None and run.p < alpha for run in runs)
+    significant_count_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
     return SimulatedPower(
         first=runs[0].first,
         second=runs[0].second,
         d_z=d_z,
-        found=significant / len(runs),
-        interval=wilson_interval(significant, len(runs)),
-        found_holm=significant_holm / len(runs),
+        found=significant_count / len(runs),
+        interval=wilson_interval(significant_count, len(runs)),
+        found_holm=significant_count_holm / len(runs),
     )

@@ -134,7 +134,10 @@ class SyntheticParticipant:
         self._moved_s = 0.0
 
     def act(self, now: HandView) -> Array:
-        """Decides where the participant moves the arm now.
+        """Decides where the simulated person moves the arm now.
+
+        The person sees the slave arm and the target with a delay, and starts a new movement
+        when the slave is at rest off the target.
 
         Args:
             now: What the participant sees and feels at its site.
@@ -149,16 +152,19 @@ class SyntheticParticipant:
             self._start_m = now.pose
             self._end_m = now.pose
             return now.pose
+
         goal = self._goal
         seen_s = now.t_s - self._model.reaction_s
         target_m = goal.find_target_m(seen_s, self._user)
         error_m = target_m[: self._axes] - slave_m
+
         if goal.is_moving:
             return self._follow(now, error_m, slave.age_s)
         if goal.force_n and now.t_s > goal.appears_s:
             press_step_m = self._find_press_step(slave, now.t_s)
             if press_step_m.any():
                 return self._follow(now, press_step_m, slave.age_s)
+
         distance_m = float(np.linalg.norm(error_m))
         is_off_target = distance_m > OFF_TARGET_SHARE * goal.width_m
         if is_off_target and now.t_s >= self._find_next_start_s(slave):
@@ -186,6 +192,7 @@ class SyntheticParticipant:
             self._start_m = now.pose
             self._end_m = now.pose
             self._slave_m = slave_m
+
         step_m = slave_m - self._slave_m
         distance_m = float(np.linalg.norm(step_m))
         self._slave_m = slave_m
@@ -247,10 +254,10 @@ class SyntheticParticipant:
         return full_step_m * missing_share
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
-        """Starts a movement of minimum jerk, whose end scatters around the intended one.
+        """Starts a movement of minimum jerk to the target, as a person would make it.
 
-        The scatter is proportional to the length of the step, and the duration follows Fitts'
-        law and the practice so far.
+        The end of the movement scatters in proportion to the length of the step. The duration
+        follows Fitts' law and the practice so far.
 
         Args:
             t_s: Present time, in s.
@@ -260,13 +267,17 @@ class SyntheticParticipant:
         length_m = float(np.linalg.norm(step_m))
         deviation_m = model.noise * length_m
         scatter_m = deviation_m * self._random.standard_normal(self._axes)
+
         # Index of difficulty by Shannon's formulation of Fitts' law, in bit.
         relative_length = length_m / self._goal.width_m
         difficulty_bits = math.log2(relative_length + 1.0)
         practised_duration_s = model.fitts_a_s + model.fitts_b_s * difficulty_bits
+
+        # After `practised` trials, half of the initial slowness is gone.
         halvings = self._before / model.practised
-        practice = 0.5**halvings
-        slowness = 1.0 + model.learning * practice
+        remaining_slowness = 0.5**halvings
+        slowness = 1.0 + model.learning * remaining_slowness
+
         start_m = self._interpolate_movement(t_s)
         self._start_m = start_m
         self._end_m = start_m + step_m + scatter_m
@@ -279,13 +290,13 @@ class SyntheticParticipant:
         With s from 0 to 1 over the movement, the position is
         start + (end - start) (10 s^3 - 15 s^4 + 6 s^5).
         """
-        s = 1.0
+        s = 1.0  # before the first movement, start and end are equal
         if self._duration_s:
             elapsed_s = t_s - self._begins_s
             s = min(max(elapsed_s / self._duration_s, 0.0), 1.0)
-        share = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
-        way_m = self._end_m - self._start_m
-        position_m: Array = self._start_m + way_m * share
+        progress = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
+        movement_m = self._end_m - self._start_m
+        position_m: Array = self._start_m + movement_m * progress
         return position_m
 
     def _follow(self, now: HandView, error_m: Array, age_s: float) -> Array:

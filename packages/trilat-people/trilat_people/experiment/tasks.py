@@ -134,6 +134,8 @@ class TrialGoal:
     def judge(self, t_s: float, position_m: Array, force_n: float = 0.0) -> "Outcome | None":
         """Judges whether the trial ends now.
 
+        A trial is one execution of the task. The judgement begins when the target appears.
+
         Args:
             t_s: Time since the start of the session, in s.
             position_m: Position of the end effector, shape (2,) or (3,), in m.
@@ -161,10 +163,8 @@ class TrialGoal:
         # In the middle of the ramp, both users have the same authority.
         handed_over_s = self.appears_s + begins_s + ramp_s / 2.0
         leading_user = 1 if t_s >= handed_over_s else 0
-        authority = self.lead
-        if user != leading_user:
-            authority = self.lead - 1
-        return abs(authority) > 0.05
+        user_lead = self.lead if user == leading_user else 1.0 - self.lead
+        return abs(user_lead) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
         """Returns the corridor to the target, which the end effector may not leave.
@@ -320,7 +320,8 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         """Returns the position of a target on the ring around the start, in m.
 
         Consecutive targets are nearly opposite, so that each movement crosses the ring (ISO
-        9241-411). The ring lies in the plane of the first two axes.
+        9241-411). The ring lies in the plane of the first two axes. With 8 targets, the order
+        around the ring is 0, 4, 1, 5, 2, 6, 3, 7.
 
         Args:
             start_m: Centre of the ring, in m.
@@ -333,6 +334,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         if number % 2:
             step += half_ring
         index = step % self.targets
+
         angle = 2.0 * math.pi * index / self.targets
         direction = np.zeros(len(start_m))
         direction[0] = math.cos(angle)
@@ -365,15 +367,21 @@ class _DwellGoal(TrialGoal):
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
-        """Ends the trial with success after the dwell time, or as failed after `longest_s`."""
+        """Ends the trial with success after the dwell time, or as failed after the time limit.
+
+        The dwell time is the time for which the end effector must stay in the target. It starts
+        anew whenever the end effector leaves the target.
+        """
         after_s = t_s - self.appears_s
         if self._is_inside(after_s, position_m, force_n):
             self._inside_since_s = min(self._inside_since_s, t_s)
         else:
             self._inside_since_s = math.inf
+
         inside_s = t_s - self._inside_since_s
         if inside_s >= self._dwell_s:
             return Outcome(True, t_s)
+
         latest_end_s = self.appears_s + self._longest_s
         if t_s >= latest_end_s:
             return Outcome(False, t_s)
@@ -415,6 +423,7 @@ class _ReachGoal(_DwellGoal):
         has_begun = after_s >= self._handover_s
         has_not_ended = after_s < self._second_appears_s
         is_handover = has_begun & has_not_ended
+
         target_m = self._waypoints_m[1]
         distances_m = np.linalg.norm(position_m - target_m, axis=1)
         errors_m = distances_m[is_handover]
@@ -425,6 +434,9 @@ class _ReachGoal(_DwellGoal):
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:
         """Returns the corridor to the target, once the target has appeared.
+
+        The corridor is the straight path to the target, which participants must not leave. The
+        page draws it.
 
         Returns:
             The start of the corridor and its width, both in m. None before the target appears,
@@ -439,8 +451,9 @@ class _ReachGoal(_DwellGoal):
     def _find_segment(self, after_s: float) -> Sequence[Array]:
         """Returns the start and the end of the present movement, in m.
 
-        Before a handover this is the way from the start to the first target, afterwards that
-        from the first to the second target.
+        Usually this is the movement from the start to the target. After a handover between two
+        users, a second target follows, and the movement is that from the first to the second
+        target.
 
         Args:
             after_s: Time since the first target's appearance, in s.
@@ -468,9 +481,10 @@ class _ReachGoal(_DwellGoal):
         return is_in_target and after_s >= self._second_appears_s
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
-        """Ends the trial as failed if the end effector left the corridor to the target.
+        """Ends the trial as failed if the end effector has left the corridor to the target.
 
-        Otherwise, and in a task without a corridor, the rule for the dwell time decides.
+        Otherwise, and in a task without a corridor, the rule of `_DwellGoal` decides: the end
+        effector must stay in the target for some time.
         """
         if self._corridor_m is not None:
             after_s = t_s - self.appears_s
@@ -478,9 +492,9 @@ class _ReachGoal(_DwellGoal):
             path_m = end_m - start_m
             offset_m = position_m - start_m
             squared_length = path_m @ path_m
-            # The nearest point of the straight segment is at this share of its length.
-            share = np.clip(offset_m @ path_m / squared_length, 0.0, 1.0)
-            nearest_m = share * path_m
+            # The nearest point of the straight segment is at this fraction of its length.
+            progress = np.clip(offset_m @ path_m / squared_length, 0.0, 1.0)
+            nearest_m = progress * path_m
             distance_m = float(np.linalg.norm(offset_m - nearest_m))
             if distance_m > self._corridor_m / 2.0:
                 return Outcome(False, t_s)
@@ -567,11 +581,11 @@ class _ContactGoal(_DwellGoal):
         """
         dwell_start_s = after_s[-1] - self._dwell_s
         is_dwell = after_s >= dwell_start_s
-        held_n = force_n[is_dwell]
-        errors_n = held_n - self.force_n
+        dwell_forces_n = force_n[is_dwell]
+        errors_n = dwell_forces_n - self.force_n
         mean_square = np.mean(errors_n**2)
         return {
-            "wall_force_n": float(held_n.mean()),
+            "wall_force_n": float(dwell_forces_n.mean()),
             "error_force_n": float(np.sqrt(mean_square)),
         }
 
@@ -675,6 +689,8 @@ class _TrackGoal(TrialGoal):
         task = self._task
         if not task.needs_pair:
             return {}
+
+        # The error from the middle between both targets, along the axis of the path.
         targets = [self._find_target_m(after, None) for after in after_s.tolist()]
         middle_m = np.array(targets)
         errors_m = position_m - middle_m
@@ -699,10 +715,12 @@ class _TrackGoal(TrialGoal):
         sum_of_sines = float(sines.sum())
         largest_sum = 2.0 * len(sines)
         path_m = task.amplitude_m * sum_of_sines / largest_sum
+
         # The users' targets are on opposite sides of the path.
         offset_m = 0.0
         if user is not None:
             offset_m = task.apart_m * (0.5 - user)
+
         target_m = self.start_m.copy()
         target_m[task.axis] += offset_m + path_m
         return target_m

@@ -94,6 +94,9 @@ class TrialJudge:
     def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
         """Takes the next record of the slave into account.
 
+        A record contains what the site of the slave arm measured in one control period. The
+        trial may end with any record.
+
         Args:
             t_s: Time since the start of the session, in s.
             q: Joint positions, in rad or m.
@@ -107,6 +110,7 @@ class TrialJudge:
             force_n = 0.0
             if self.goal.force_n:
                 force_n = self._trial.find_force_n(q, tau_x)
+
             position = self._trial.arm.end_effector(q)
             position_m = np.array(position)
             self.outcome = self.goal.judge(t_s, position_m, force_n)
@@ -167,6 +171,7 @@ class ExperimentTrial:
         start = self.arm.end_effector(start_q)
         self._start_m = np.array(start, dtype=np.float64)
 
+        # The target appears after a random time (foreperiod), so that nobody anticipates it.
         shortest_s, longest_s = protocol.foreperiod_s
         random = np.random.default_rng(planned.seed)
         foreperiod_s = random.uniform(shortest_s, longest_s)
@@ -177,6 +182,8 @@ class ExperimentTrial:
         # of a trial may be noticed that late.
         latest_end_s = self.appears_s + protocol.task.longest_s
         self.longest_s = latest_end_s + 1.0 / HAND_HZ
+
+        # The log of the trial says what it is about.
         kind = "" if self.people else "synthetic "
         participants = ", ".join(planned.group)
         about = (
@@ -184,6 +191,7 @@ class ExperimentTrial:
             f"condition {planned.condition}, block {planned.block}, trial {planned.trial}; "
             f"protocol sha256 {digest}"
         )
+
         limited_sites = limit_forces(scenario, protocol, planned.group)
         self.scenario = replace(
             scenario,
@@ -195,17 +203,18 @@ class ExperimentTrial:
         self._rows = build_arm_rows(self.scenario, self.slave)
 
     def _set_authority(self, scenario: Scenario) -> Scenario:
-        """Returns the scenario with the users' authority over the slave in this trial.
+        """Returns the scenario with the users' authority over the slave arm in this trial.
 
-        The two users share the sum of their dominance factors, which are the weights with which
-        the slave follows them. A handover exchanges the parts during the trial.
+        The slave follows the users' arms with weights, the dominance factors. The protocol
+        determines how two users share the sum of their factors. A handover exchanges their
+        parts during the trial.
         """
         goal = self.make_goal()
         if goal.lead is None:
             return scenario
-        row = scenario.dominance[self.slave]
+        slave_factors = scenario.dominance[self.slave]
         first, second = self.protocol.users
-        sum_of_shares = row[first] + row[second]
+        sum_of_shares = slave_factors[first] + slave_factors[second]
 
         def divide_shares(lead: float) -> dict[str, float]:
             """Returns the weights with which the slave follows the other arms, in this trial.
@@ -220,7 +229,7 @@ class ExperimentTrial:
             first_share = sum_of_shares * lead
             second_share = sum_of_shares - first_share
             return {
-                **row,
+                **slave_factors,
                 first: first_share,
                 second: second_share,
             }
@@ -253,6 +262,8 @@ class ExperimentTrial:
 
     def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
         """Returns the magnitude of the external force on the slave's end effector, in N.
+
+        An example is the force with which the arm touches a wall.
 
         Args:
             q: Joint positions in K records, shape (K, n), in rad or m.
@@ -290,16 +301,13 @@ class ExperimentTrial:
         return goal
 
     def settle(self, path: Path) -> TrialEntry:
-        """Verifies the log of the trial, and computes the trial's result from it.
+        """Verifies the log of the trial, and returns the trial's result computed from it.
 
         The run is executed again from the log. The result counts only if the records are the
         same.
 
         Args:
             path: Path of the log.
-
-        Returns:
-            The result, as the journal stores it.
 
         Raises:
             LogError: The records are not those of a run, or they end before the trial does.
@@ -336,6 +344,7 @@ class ExperimentTrial:
             outcome = judge.accept(t_s, q, tau_x)
             if outcome is not None:
                 return outcome
+
         if log.diverged_s is not None:
             return Outcome(False, log.diverged_s)
         return None
@@ -349,6 +358,8 @@ class ExperimentTrial:
         measures = self._measure_motion(log, outcome.ended_s)
         aligned = align_records(log)
         users = self.protocol.users
+
+        # Force and work of each user.
         forces: list[Array] = []
         for number, user in enumerate(users, 1):
             records = aligned[user]
@@ -359,8 +370,10 @@ class ExperimentTrial:
             hand_force = end_effector.find_force(split.operator)
             force = hand_force[is_in_trial]
             forces.append(force)
+
             magnitude_n = np.linalg.norm(force, axis=1)
             velocity = end_effector.speed[is_in_trial]
+
             suffix = ""
             if len(users) > 1:
                 suffix = f"_user{number}"
@@ -369,6 +382,7 @@ class ExperimentTrial:
             measures[f"work{suffix}_j"] = energy_j(force, velocity, records.rate_hz)
         if len(forces) > 1:
             measures |= self._measure_pair(aligned, forces, outcome.ended_s)
+
         age_ms = sample_ages_ns(log, self.slave, users[0]) / 1e6
         mean_age_ms = 0.0
         if len(age_ms):
@@ -379,7 +393,7 @@ class ExperimentTrial:
     def _sample_motion(
         self, records: SiteLog | AlignedRecords, start_s: float, end_s: float
     ) -> _MotionSamples:
-        """Returns the motion of the slave's end effector between two times, at a reduced rate.
+        """Returns the motion of the slave's end effector between two times, for its measures.
 
         Only every `RECORD_STEP`-th record is used. Velocities are differences of positions.
 
@@ -391,6 +405,7 @@ class ExperimentTrial:
         has_started = records.t_s >= start_s
         is_between = has_started & (records.t_s <= end_s)
         indices = np.flatnonzero(is_between)[::RECORD_STEP]
+
         end_effector = self._place_end_effector(records.q[indices])
         positions_m = end_effector.position
         rate_hz = records.rate_hz / RECORD_STEP
@@ -406,7 +421,9 @@ class ExperimentTrial:
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
-        """Computes the measures of two users, as if each pushed at the slave's end effector.
+        """Computes the cooperation measures of two users, such as the force that cancels.
+
+        The forces are treated as if each user pushed at the slave's end effector.
 
         Args:
             aligned: Records of each site.
@@ -414,16 +431,17 @@ class ExperimentTrial:
             ended_s: End of the trial, in s.
         """
         motion = self._sample_motion(aligned[self.slave], 0.0, ended_s)
-        interpolated: list[Array] = []
+        interpolated_forces: list[Array] = []
         for user, force in zip(self.protocol.users, forces, strict=True):
             # The times of the user's records differ from those of the slave's records.
             force_t_s = aligned[user].t_s[: len(force)]
-            columns: list[Array] = []
+            components: list[Array] = []
             for component in force.T:
-                column = np.interp(motion.t_s, force_t_s, component)
-                columns.append(column)
-            interpolated.append(np.column_stack(columns))
-        first, second = interpolated
+                interpolated_component = np.interp(motion.t_s, force_t_s, component)
+                components.append(interpolated_component)
+            interpolated_forces.append(np.column_stack(components))
+
+        first, second = interpolated_forces
         pair = measure_pair(first, second, motion.velocities_m_s, motion.rate_hz)
         measures = pair._asdict()
         return {name: value for name, value in measures.items() if value is not None}
@@ -442,21 +460,28 @@ class ExperimentTrial:
         """
         goal = self.make_goal()
         records = log[self.slave]
+
         motion = self._sample_motion(records, goal.appears_s, ended_s)
+
+        # The movement begins when 5 % of the largest speed is exceeded.
         speed = np.linalg.norm(motion.velocities_m_s, axis=1)
         onset_speed = 0.05 * speed.max()
         is_moving = speed > onset_speed
+
+        # The target may move, so that the error is computed at each time.
         targets = [goal.find_target_m(t_s) for t_s in motion.t_s]
         targets_m = np.array(targets)
         error_vectors_m = motion.positions_m - targets_m
         errors_m = np.linalg.norm(error_vectors_m, axis=1)
         rms_error_m = float(np.sqrt(np.mean(errors_m**2)))
         first_moving = float(np.argmax(is_moving))
+
         force_n = 0.0 * motion.t_s
         if goal.force_n:
             q = records.q[motion.indices]
             tau_x = records.tau_x[motion.indices]
             force_n = self._find_forces_n(q, tau_x)
+
         measures = {
             "completion_s": ended_s - goal.appears_s,
             "movement_s": movement_time_s(speed, motion.rate_hz) or 0.0,
@@ -468,8 +493,10 @@ class ExperimentTrial:
         smoothness = sparc(speed, motion.rate_hz)
         if smoothness is not None:
             measures["sparc"] = smoothness
+
         after_s = motion.t_s - goal.appears_s
         measures |= goal.compute_measures(after_s, motion.positions_m, force_n)
+
         points = {
             "start": goal.start_m,
             "target": targets_m[-1],
@@ -501,18 +528,19 @@ class SyntheticTrial(ExperimentTrial):
             scenario: Scenario of the trial.
         """
         players: dict[str, HandPlayer] = {}
-        pairs = zip(self.protocol.users, self.planned.group, strict=True)
-        for user_index, (site, name) in enumerate(pairs):
-            hand = scenario.sites[site].find_live_hand(is_open=True)
+        sites_and_names = zip(self.protocol.users, self.planned.group, strict=True)
+        for user_index, (site, name) in enumerate(sites_and_names):
+            operator = scenario.sites[site].find_live_hand(is_open=True)
             # `plan_experiment` has checked that the scenario has the hands of all users.
-            assert hand is not None
+            assert operator is not None
             hand_site = HandSite(
                 scenario=scenario,
                 name=site,
-                spec=hand,
+                spec=operator,
                 rate_hz=HAND_HZ,
                 delay_s=HAND_DELAY_S,
             )
+
             participant = SyntheticParticipant(
                 facts=hand_site.describe(),
                 model=self._draw_model(name),
@@ -540,7 +568,9 @@ class SyntheticTrial(ExperimentTrial):
         return self.protocol.model.draw(participant_seed)
 
     def find_end_s(self) -> float:
-        """Finds out how long the trial lasts, by a fast run without a log.
+        """Returns how long the trial lasts, from a fast simulation that writes no log.
+
+        A second run then writes the log, and ends soon after that time.
 
         Returns:
             The end of the trial, in s since the start of the session.
@@ -549,26 +579,32 @@ class SyntheticTrial(ExperimentTrial):
         judge = TrialJudge(self)
         slave = self.slave
         ticks_per_period = scenario.sites[slave].rate_hz // HAND_HZ
+
+        # Simulated operators (players) move the arms in place of people.
         players = self._make_players(scenario)
         run = FusedRun(scenario, keep=ticks_per_period + 1, hands=players)
         tick_counts = [scenario.ticks(name) for name in scenario.names]
         run.plan(tick_counts)
+
         slave_index = scenario.names.index(slave)
         columns = scenario.layout(slave).columns()
         q_columns = columns["q"]
         torque_columns = columns["tau_x"]
         # The run is judged after each period of the hands.
+
         period_count = math.ceil(self.longest_s * HAND_HZ)
         for period in range(period_count):
             period_end_ns = (period + 1) * NS_PER_S // HAND_HZ
             run.step_to(period_end_ns)
             records = run.pop_records()
             t_ns, rows = records[slave_index]
+
             times_s = (t_ns / NS_PER_S).tolist()
             positions = rows[:, q_columns].tolist()
             torques = rows[:, torque_columns].tolist()
             for t_s, q, tau_x in zip(times_s, positions, torques, strict=True):
                 judge.accept(t_s, q, tau_x)
+
             if judge.outcome is not None:
                 return judge.outcome.ended_s
             if run.diverged_s is not None:
@@ -588,6 +624,7 @@ class SyntheticTrial(ExperimentTrial):
         scenario = replace(self.scenario, duration_s=duration_s)
         players = self._make_players(scenario)
         hands = {site: player.track for site, player in players.items()}
+
         record_virtual(
             scenario,
             path,

@@ -81,6 +81,9 @@ class ExperimentSessions:
     def run(self) -> bool:
         """Runs the remaining steps. Steps that were completed earlier are skipped.
 
+        A step is a trial or a questionnaire. An experiment may be interrupted and continued on
+        another day.
+
         Returns:
             True if all steps are completed. False if the experiment was ended earlier.
 
@@ -91,11 +94,11 @@ class ExperimentSessions:
         trials = self.experiment.open_trials(people=True)
         notes = self.experiment.open_notes()
         with trials as self._trials, notes as self._notes:
-            done = {entry.cell for entry in self._trials.done.values()}
+            completed_trials = {entry.cell for entry in self._trials.done.values()}
             for step in self.experiment.plan.list_steps():
                 if step.kind != "trial":
                     is_done = self._request_step(step)
-                elif step.planned.number in done:
+                elif step.planned.number in completed_trials:
                     is_done = True
                 else:
                     is_done = self._run_trial(step)
@@ -246,6 +249,7 @@ class ExperimentSessions:
             reason: Why the attempt does not count, for the experimenter.
         """
         last_attempt = self._list_attempts(planned)[-1]
+
         self._add_note(
             cell=f"aborted {last_attempt.name}",
             kind="aborted",
@@ -319,9 +323,10 @@ class ExperimentSessions:
         return not reason
 
     def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:
-        """Judges a trial by its log, and writes the result to the journal.
+        """Judges a trial by its log, and writes the result to the journal of the experiment.
 
-        A log that cannot be judged is moved back to the folder of its attempt.
+        A log that cannot be judged is moved back to the folder of its attempt, so that the
+        trial is repeated.
 
         Args:
             trial: The trial.
@@ -330,26 +335,27 @@ class ExperimentSessions:
         Returns:
             The reason why the trial does not count. Empty if it counts.
         """
-        attempts = self._list_attempts(trial.planned)[-1:]
+        last_attempt = self._list_attempts(trial.planned)[-1:]
         try:
             entry = trial.settle(path)
         except LogError as error:
-            folder = attempts[0] if attempts else self.experiment.folder
+            folder = last_attempt[0] if last_attempt else self.experiment.folder
             path.replace(folder / path.name)
             return str(error)
 
         self._trials.add(entry)
-        for folder in attempts:
+        for folder in last_attempt:
             shutil.rmtree(folder, ignore_errors=True)
         self.stage.show_feedback(entry)
         self.experiment.write_tables()
+
         planned = trial.planned
         total = len(self.experiment.plan.trials)
-        outcome = "succeeded" if entry.succeeded else "failed"
+        outcome_text = "succeeded" if entry.succeeded else "failed"
         completion_s = entry.measures["completion_s"]
         self.say(
             f"trial {planned.number} of {total}, {', '.join(planned.group)}, "
-            f"{planned.condition}: {outcome} after {completion_s:.2f} s"
+            f"{planned.condition}: {outcome_text} after {completion_s:.2f} s"
         )
         return ""
 
@@ -361,6 +367,7 @@ def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
     """
     if result.interrupted:
         return "the experiment was interrupted"
+
     problems = "; ".join(result.problems)
     if watch.aborted:
         return watch.aborted
@@ -454,10 +461,11 @@ def _show_session(
     endpoints: Sequence[str],
     _say: Callable[[str], None],
 ) -> Iterator[Callable[[], bool]]:
-    """Shows the session of a trial on the pages, in the form of a `SessionAttendant`.
+    """Shows the session of a trial on the pages of the experiment while it runs.
 
-    After the session the pages observe the experiment's own network connection, on which
-    nothing happens, so that the connection to the session can be closed.
+    The function has the form of a `SessionAttendant`, and is a context manager. After the
+    session the pages observe the experiment's own network connection, on which nothing happens,
+    so that the connection to the session can be closed.
 
     Args:
         page: Server of the pages.

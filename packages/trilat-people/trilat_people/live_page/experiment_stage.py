@@ -101,13 +101,15 @@ class TrialWatch:
         """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
+
         modes = {name: site.record.mode for name, site in view.sites.items() if site.record}
         self.diverged = "diverged" in modes.values()
-        halted = [name for name, mode in modes.items() if mode in HALTED_MODES]
+        halted_sites = [name for name, mode in modes.items() if mode in HALTED_MODES]
+
         if absent:
             self.aborted = f"the page of {', '.join(absent)} is gone"
-        elif halted:
-            self.aborted = f"{', '.join(halted)} stopped"
+        elif halted_sites:
+            self.aborted = f"{', '.join(halted_sites)} stopped"
         if self.aborted:
             return [f"trial {self.trial.planned.number} aborted: {self.aborted}"]
         return self._judge_records(view)
@@ -126,34 +128,39 @@ class TrialWatch:
         """
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
-        moments: list[str] = []
-        first = max(self._next_tick, slave.window.first)
-        last = slave.complete
-        if last < first:
+        log_marks: list[str] = []
+        first_tick = max(self._next_tick, slave.window.first)
+        last_tick = slave.complete
+        if last_tick < first_tick:
             return []
+
         if self._next_tick == 0:
-            moments.append(f"trial {number} begins")
-        self._next_tick = last + 1
-        rows = slave.window.rows(first, last)
+            log_marks.append(f"trial {number} begins")
+        self._next_tick = last_tick + 1
+
+        rows = slave.window.rows(first_tick, last_tick)
         are_known = rows.known.tolist()
         positions = rows.q.tolist()
         torques = rows.tau_x.tolist()
-        ticks = range(first, last + 1)
+        ticks = range(first_tick, last_tick + 1)
         records = zip(ticks, are_known, positions, torques, strict=True)
         for tick, is_known, q, tau_x in records:
             t_s = tick_ns(tick, slave.window.rate_hz) / NS_PER_S
             if not self._has_appeared and t_s >= self.trial.appears_s:
                 self._has_appeared = True
-                moments.append("target appears")
+                log_marks.append("target appears")
+
             outcome = self.judge.accept(t_s, q, tau_x) if is_known else None
             if outcome is not None:
                 self._ended_ns = self._clock.monotonic_ns()
                 result = "succeeded" if outcome.succeeded else "failed"
-                return [*moments, f"trial {number} {result}"]
-        return moments
+                return [*log_marks, f"trial {number} {result}"]
+        return log_marks
 
     def describe(self, t_s: float, site: str) -> Json:
         """Describes the target that the participants must reach now, for a page.
+
+        The page also learns whether the target has appeared already.
 
         Args:
             t_s: Time of the pose that the page shows, counted in the trial, in s.
@@ -172,10 +179,12 @@ class TrialWatch:
         fields: Json = {
             "target": {"site": trial.slave, "at": target_m.tolist(), "width_m": goal.width_m}
         }
+
         corridor = goal.find_corridor(t_s)
         if corridor is not None:
             start_m, width_m = corridor
             fields["way"] = {"from": start_m.tolist(), "width_m": width_m}
+
         fields["appeared"] = t_s >= goal.appears_s
         # The time of a trial runs from the appearance of the target.
         running_s = max(t_s, goal.appears_s)
@@ -238,6 +247,8 @@ class Stage:
     ) -> _StepRequest:
         """Asks the users on their pages to complete a step, such as a questionnaire.
 
+        The experiment waits for all users, and then continues with the next step.
+
         Args:
             step: The step.
             rest_s: Time that the users must rest before the step, in s.
@@ -248,7 +259,8 @@ class Stage:
         """
         rest_end_ns = self._clock.monotonic_ns() + int(rest_s * NS_PER_S)
         request = _StepRequest(step, rest_end_ns)
-        request.replies |= {site: ({}, 0) for site in done}
+        no_answers: dict[str, float | None] = {}
+        request.replies |= dict.fromkeys(done, (no_answers, 0))
         self._step = step
         self._watch = None
         self._phase = step.kind
@@ -278,9 +290,11 @@ class Stage:
             why: Reason for the repetition.
         """
         self._feedback = {"why": why, "measures": {}}
-        names = self._plan.protocol.feedback
-        if entry is not None and names:
-            measures = {name: entry.measures[name] for name in names if name in entry.measures}
+        measure_names = self._plan.protocol.feedback
+        if entry is not None and measure_names:
+            measures = {
+                name: entry.measures[name] for name in measure_names if name in entry.measures
+            }
             self._feedback["measures"] = measures
             self._feedback["succeeded"] = entry.succeeded
 
@@ -315,20 +329,21 @@ class Stage:
 
         if request is not None and request.step.kind == "trial":
             # A user who leaves is not ready any more.
-            for site, (_, page) in list(request.replies.items()):
-                if self._holders.get(site) != page:
+            for site, (_, replying_page) in list(request.replies.items()):
+                if self._holders.get(site) != replying_page:
                     del request.replies[site]
 
         if self._watch is None:
             return []
         if view.running and self._phase == "starting":
             self._phase = "trial"
-        absent: list[str] = []
+
+        absent_sites: list[str] = []
         for site in self.users:
             absence_ns = now_ns - self._page_seen_ns.get(site, now_ns)
             if absence_ns > MAX_ABSENCE_NS:
-                absent.append(site)
-        return self._watch.poll(view, absent)
+                absent_sites.append(site)
+        return self._watch.poll(view, absent_sites)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
         """Processes a message of a page, such as the answers to a questionnaire.
@@ -345,11 +360,14 @@ class Stage:
         if isinstance(message, AbortTrial):
             is_allowed = is_holder or not site
             return is_allowed and self._abort_trial(site, message.why)
+
         request = self._request
         if request is None or self._clock.monotonic_ns() < request.from_ns:
             return False
-        if not is_holder or message.key != request.step.key:
+        is_for_this_step = message.key == request.step.key
+        if not is_holder or not is_for_this_step:
             return False
+
         form = request.step.form
         try:
             answers = form.read(message.answers) if form else {}
@@ -361,6 +379,8 @@ class Stage:
     def _abort_trial(self, site: str, why: str) -> bool:
         """Aborts the running trial, which is repeated later. Returns False if no trial runs.
 
+        For example, the experimenter sees that a participant has misunderstood the task.
+
         Args:
             site: Site of the user who aborts it. Empty for the experimenter.
             why: The reason, for the journal; it may be empty.
@@ -368,12 +388,14 @@ class Stage:
         watch = self._watch
         if watch is None or watch.over:
             return False
-        reason = f": {why}" if why else ""
-        watch.aborted = f"{site or 'the experimenter'} stopped it{reason}"
+        reason_text = f": {why}" if why else ""
+        watch.aborted = f"{site or 'the experimenter'} stopped it{reason_text}"
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
         """Describes for a page what it must show of the experiment now.
+
+        The server of the page calls this for each message that it sends to the page.
 
         Args:
             role: Role of the page: that of an experimenter, a user or a watcher.
@@ -396,9 +418,11 @@ class Stage:
         }
         if step is None:
             return fields
+
         planned = step.planned
         # The experiment's thread may end the request at any time.
         done_sites = () if request is None else tuple(request.replies)
+
         slave = self._plan.scenarios[planned.condition].slave
         fields |= {
             "key": step.key,
@@ -410,6 +434,7 @@ class Stage:
             "blocks": len(protocol.conditions),
             "practice": planned.practice,
         }
+
         if request is not None:
             rest_ns = request.from_ns - self._clock.monotonic_ns()
             fields["rest_s"] = max(0.0, rest_ns / NS_PER_S)
@@ -461,13 +486,13 @@ class Stage:
         }
 
     def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
-        """Returns the fields of a step for the page of a user, such as a text or questionnaire.
+        """Returns what only the page of a participant shows, such as a questionnaire.
 
         Args:
             step: The present step.
-            site: Site of the user.
-            page: Number of the page. Of several pages of one site only the first counts; the
-                others show so by the field "second".
+            site: Site of the participant's arm.
+            page: Number of the page. Of several pages of one site only the first counts. The
+                field "second" tells the others so.
         """
         pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
         fields: Json = {

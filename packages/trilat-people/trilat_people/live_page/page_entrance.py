@@ -99,7 +99,10 @@ def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
 
 
 def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
-    """Chooses the open page that must be closed so that another page of a role can be opened.
+    """Returns the open page that must be closed so that another page can be opened.
+
+    The number of pages is limited for each role: experimenter, user of an arm, or watcher. The
+    oldest page of the role is closed.
 
     Args:
         pages: The open pages of all roles.
@@ -118,6 +121,7 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
         for page in oldest_first:
             if not page.takes_part:
                 return page
+
     return oldest_first[0]
 
 
@@ -130,7 +134,8 @@ def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
     """
     role_pages: list[Page] = []
     for page in pages:
-        is_same_site = page.role.site == role.site
-        if page.role.kind == role.kind and (role.kind != "user" or is_same_site):
+        has_same_kind = page.role.kind == role.kind
+        is_of_other_user = role.kind == "user" and page.role.site != role.site
+        if has_same_kind and not is_of_other_user:
             role_pages.append(page)
     return role_pages

@@ -80,15 +80,16 @@ class PageFiles:
         """
         result = self.results.get(path)
         if result is not None and result.is_file():
-            kind = _KINDS.get(result.suffix[1:], "application/octet-stream")
-            return _make_response(kind, result.read_bytes(), _REPORT_POLICY, "no-store")
+            media_type = _KINDS.get(result.suffix[1:], "application/octet-stream")
+            return _make_response(media_type, result.read_bytes(), _REPORT_POLICY, "no-store")
+
         asset = self._assets.get(path)
         if asset is None:
             return None
-        kind, content = asset
+        media_type, content = asset
         # The start page has a token in its address, and must not be stored.
-        cache = "no-store" if path in ("/", "/index.html") else "no-cache"
-        return _make_response(kind, content, _POLICY, cache)
+        cache_control = "no-store" if path in ("/", "/index.html") else "no-cache"
+        return _make_response(media_type, content, _POLICY, cache_control)
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
@@ -105,10 +106,12 @@ def _list_assets() -> dict[str, tuple[str, bytes]]:
     for file in [*page_assets, *plot_assets]:
         address = "/" + file.name
         # The end of the name follows the last "." or "-", as in "uPlot-LICENSE".
-        kind = _KINDS.get(file.name.rpartition(".")[2].rpartition("-")[2])
+        _, _, behind_dot = file.name.rpartition(".")
+        _, _, ending = behind_dot.rpartition("-")
+        media_type = _KINDS.get(ending)
         is_report_asset = file.name.startswith("report.")
-        if kind is not None and not is_report_asset and address not in assets:
-            assets[address] = kind, file.read_bytes()
+        if media_type is not None and not is_report_asset and address not in assets:
+            assets[address] = media_type, file.read_bytes()
     assets["/"] = assets["/index.html"]
     return assets
 

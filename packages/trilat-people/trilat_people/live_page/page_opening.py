@@ -58,6 +58,7 @@ class BrowserOpening:
         self._folder = Path(tempfile.mkdtemp(prefix="trilat-live-", dir=Path.home()))
         text = _make_template().render(link=self._target_link)
         file = self._folder / "open.html"
+        # The file must be new, and only its user may read it (mode 0600).
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "wb") as stream:
             stream.write(text.encode())

@@ -278,7 +278,10 @@ class MessageLimits:
             self._buckets[kind] = _TokenBucket(float(burst))
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
-        """Checks whether a message of a page is within its rate, and counts it if it is.
+        """Returns True if a message of a page is within the allowed rate, and counts it.
+
+        The rate is limited by the method of the token bucket. A message needs a token. Tokens
+        are added at the allowed rate, up to the largest burst.
 
         Args:
             kind: Kind of the message.
@@ -289,14 +292,16 @@ class MessageLimits:
         """
         if kind not in _RATES:
             return True
-        rate, burst = _RATES[kind]
+
+        rate_per_s, largest_burst = _RATES[kind]
         bucket = self._buckets[kind]
         # The bucket is full before the first message.
         if bucket.filled_ns:
             elapsed_ns = now_ns - bucket.filled_ns
-            new_tokens = elapsed_ns * 1e-9 * rate
-            bucket.tokens = min(bucket.tokens + new_tokens, burst)
+            new_tokens = elapsed_ns * 1e-9 * rate_per_s
+            bucket.tokens = min(bucket.tokens + new_tokens, largest_burst)
         bucket.filled_ns = now_ns
+
         is_allowed = bucket.tokens >= 1.0
         if is_allowed:
             bucket.tokens -= 1.0
@@ -305,6 +310,8 @@ class MessageLimits:
 
 def read_page_message(text: str | bytes) -> PageMessage:
     """Decodes a message that a page sent, and checks the range of its numbers.
+
+    The content of a message may come from anybody, and must be checked before it moves an arm.
 
     Args:
         text: The message as JSON.
@@ -372,12 +379,12 @@ class Role:
         The text "as=m1" stands for the view of the user of site m1. It is empty for an
         experimenter.
         """
-        parts: list[str] = []
+        fields: list[str] = []
         if self.kind == "watcher":
-            parts.append("watch")
+            fields.append("watch")
         if self.site:
-            parts.append(f"as={self.site}")
-        return "&".join(parts)
+            fields.append(f"as={self.site}")
+        return "&".join(fields)
 
 
 class RoleLinks:
@@ -406,19 +413,21 @@ class RoleLinks:
         return f"{address}{query}#token={token}"
 
     def find(self, query: str) -> Role | None:
-        """Finds out which role a link grants to the page that was opened with it.
+        """Returns the role that a link grants to the page that was opened with it.
+
+        The link contains a secret token of its role. An experimenter may use a lower role, for
+        example to see what the user of an arm sees.
 
         Args:
-            query: Query part of the page's request. It contains the secret token of the link.
+            query: Query part of the page's request, with the token.
 
         Returns:
             The role. None if the token is not that of any role.
         """
         fields = parse_qs(query, keep_blank_values=True)
-        tokens = fields.get("token", [""])
-        token = tokens[0]
-        sites = fields.get("as", [""])
-        site = sites[0]
+        token = fields.get("token", [""])[0]
+        site = fields.get("as", [""])[0]
+
         experimenter = Role()
         user = Role("user", site)
         if self._is_token(token, experimenter):
@@ -477,9 +486,9 @@ class PageHands:
         self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
-        """Sends a site the target or the force with which the person at the page moves its arm.
+        """Moves the arm of a site as the person at the page requests, or releases the arm.
 
-        If the person has released the arm, the site is told that instead.
+        A message with a grip holds the arm, and one without it releases the arm.
 
         Args:
             order: Message of the page, with the name of the site and the target or force.
@@ -489,21 +498,23 @@ class PageHands:
         site = order.site
         if site not in self._senders:
             if not order.grip:
-                return
+                return  # the page has never held this arm
             new_sender = SiteSender.for_hand(self._bus, self._clock, self._session, site)
             new_sender.number = 0  # the messages of a page are numbered from 1
             self._senders[site] = new_sender
+
         sender = self._senders[site]
         if order.grip:
             self._held_sites.add(site)
         else:
             self._held_sites.discard(site)
-        goal = order.to if order.grip else []
-        goal_field = "force" if pushes else "target"
+
+        numbers = order.to if order.grip else []
+        field = "force" if pushes else "target"
         content = {
             "source": self._source,
             "grip": order.grip,
-            goal_field: goal,
+            field: numbers,
         }
         sender.send(HandMessage, **content)
 
@@ -578,17 +589,17 @@ class OrderDesk:
     def queue_change(
         self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
     ) -> None:
-        """Queues an order that changes the settings of a link, or dominance factors.
+        """Queues a request to change the settings of a link, or the weights of a site.
 
-        The order replaces one about the same link or site that still waits. An order about an
-        unknown link or site is refused and counted.
+        A slider of a page sends many values. Therefore a request replaces a waiting one about
+        the same link or site. A request about an unknown link or site is refused and counted.
 
         Args:
             order: New settings of a link, or new dominance factors, which are the weights with
-                which a site follows its peers.
+                which a site follows the other sites.
             sites: Names of the sites of the session.
             links: Names of the links of the session.
-            source: Who sends the order, for the site's event.
+            source: Who sends the request, for the site's event.
         """
         if isinstance(order, SetLink):
             if order.link not in links:
@@ -610,13 +621,13 @@ class OrderDesk:
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Orders sites to stop at once, ahead of all waiting orders.
+        """Requests sites to stop their arms at once, ahead of all waiting requests.
 
-        Orders that would release the same arms are withdrawn.
+        Waiting requests that would release the same arms are withdrawn.
 
         Args:
             sites: Names of the sites.
-            source: Who sends the order, for the sites' events.
+            source: Who sends the request, for the sites' events.
         """
         stop = ChangeRequest(order="stop")
         request = _add_source(stop, source)
@@ -661,6 +672,9 @@ class OrderDesk:
     def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
         """Sends a request to a site. `poll` receives the reply.
 
+        For example, the request changes a link's delay or stops an arm. Only one request waits
+        for its reply at a time.
+
         Args:
             site: Name of the site.
             channel: Channel for changes or for stops.
@@ -690,6 +704,7 @@ class OrderDesk:
         `replies` receives an entry that says so.
         """
         now_ns = self._clock.monotonic_ns()
+        # A copy of the items, because answered requests are removed.
         open_queries = list(self._open_queries.items())
         for (site, channel), query in open_queries:
             reply = query.inbox.poll()
@@ -702,16 +717,18 @@ class OrderDesk:
                 del self._open_queries[site, channel]
                 problem = f"{site} does not answer"
                 self.replies.append((site, channel, False, problem))
+
         pending = list(self._pending.items())
         for (site, subject), request in pending:
-            if (site, topics.SET) not in self._open_queries:
+            waits_for_reply = (site, topics.SET) in self._open_queries
+            if not waits_for_reply:
                 del self._pending[site, subject]
                 self._send_request(site, topics.SET, request)
 
     def _handle_reply(
         self, site: str, channel: str, request: ChangeRequest, payload: bytes
     ) -> None:
-        """Stores a reply for the pages, or repeats a refused stop without its source.
+        """Stores the reply of a site for the pages, or repeats a refused stop in an older form.
 
         A site of an older program does not know the field `source` and refuses the whole
         request, but its arm must stop too. A reply that cannot be decoded is counted.
@@ -721,6 +738,7 @@ class OrderDesk:
         except WireError as error:
             self.refused[error.reason] += 1
             return
+
         is_refused_stop = channel == topics.STOP and not reply.accepted
         has_source = request.source is not msgspec.UNSET
         if is_refused_stop and has_source:
@@ -738,13 +756,14 @@ def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
 
 
 def _make_link_request(order: SetLink) -> ChangeRequest:
-    """Returns the request for new settings of a link.
+    """Returns the request that changes the settings of a link as a page wants it.
 
     The page sets a delay and its standard deviation. Unless it names a preset, a delay with a
     deviation becomes a gamma distribution, and a delay without one is constant.
     """
     settings: dict[str, Any] = dict(order.to)
-    if "preset" not in settings and "delay_ms" in settings:
+    sets_delay = "preset" not in settings and "delay_ms" in settings
+    if sets_delay:
         delay_ms = settings["delay_ms"]
         deviation_ms = settings.get("deviation_ms", 0.0)
         is_random = not _is_zero(delay_ms) and not _is_zero(deviation_ms)

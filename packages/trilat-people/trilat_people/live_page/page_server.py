@@ -175,14 +175,15 @@ class _Visitor(ServerConnection):
         super().data_received(data)
 
     def send_data(self) -> None:
-        """Sends the waiting data to the browser.
+        """Sends the waiting data to the browser, and counts connections that were refused.
 
-        Browsers talk to the server over a WebSocket. If the browser's data were not a valid
-        request to open one, the connection is first counted as refused. If the data were not
-        even HTTP, the reply has the HTTP status 400.
+        A connection is refused if the browser's data were not a valid request to open a
+        WebSocket. If the data were not even HTTP, the reply has the HTTP status 400.
         """
         problem = self.protocol.handshake_exc
-        if problem is not None and self._has_received and not self._is_counted:
+        # A browser may also close a connection unused, which is no problem.
+        is_new_refusal = problem is not None and self._has_received and not self._is_counted
+        if is_new_refusal:
             self._is_counted = True
             self.refused["malformed request"] += 1
             if self.request is None and isinstance(problem, InvalidMessage):
@@ -290,13 +291,16 @@ class PageOptions:
         Raises:
             UsageError: The address is in use, or neither encrypted nor declared as insecure.
         """
-        if self.make_context() is None and self.host not in HERE and not self.insecure:
+        is_encrypted = self.make_context() is not None
+        is_local = self.host in HERE
+        if not (is_encrypted or is_local or self.insecure):
             raise UsageError(
                 f"--host {self.host}: anyone who can listen on this network can read the "
                 "token of the page and take part; give the keys of a member with --tls, "
                 "give --insecure if you trust everybody on this network, or leave out "
                 "--host and use an SSH tunnel"
             )
+
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             socket.create_server((self.host, self.port), family=family).close()
@@ -343,15 +347,21 @@ class PageServer:
         self._ends = ends
         self._say = say
         self._stage = stage
+
+        # Address of the server, and encryption.
         self._host = options.host
         self._port = options.port
         self._tls = options.make_context()
         self._scheme = "http" if self._tls is None else "https"
+
+        # Connected pages, and the session that they show.
         self._pages: set[Page] = set()
         self.refused: Counter[str] = Counter()
         self._next_session: tuple[Bus, str] | None = None
         self._switch_session(bus, session)
         self._is_local = options.host in HERE
+
+        # Links for the users, and the opening of the first page in a browser.
         self._opens = options.opens
         self._links = RoleLinks()
         self._links_are_printed = False
@@ -362,6 +372,8 @@ class PageServer:
         self.end_requested = threading.Event()
         self.address = ""
         self._opening = BrowserOpening("")
+
+        # State of the server's thread.
         self._closing: set[asyncio.Task[None]] = set()
         self._ready = threading.Event()
         self._problem: OSError | None = None
@@ -392,10 +404,7 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends the server and closes its pages.
-
-        It waits at most five seconds for the thread.
-        """
+        """Ends the server and closes its pages, waiting at most five seconds for its thread."""
         self._ending.set()
         if self._loop is not None and self._stop is not None:
             # The loop of the server may have ended already.
@@ -419,10 +428,10 @@ class PageServer:
             self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
 
     def _switch_session_if_requested(self) -> None:
-        """Switches to the session of the last call of `show`, in the thread of the server.
+        """Shows the session that the last call of `show` requested.
 
-        Only this thread uses the view of a session. `show` waits until the switch is done, also
-        if it fails.
+        Only the thread of the server uses the state of a session. `show` runs in another
+        thread, and waits until this method has switched, also if it fails.
         """
         if self._next_session is not None:
             bus, session = self._next_session
@@ -465,7 +474,8 @@ class PageServer:
     def _run(self) -> None:
         """Runs the server in its thread until the end, and restarts it after a failure.
 
-        A failure before the server was ready is kept for `__enter__`, which raises it.
+        A failure before the server was ready is kept for `__enter__`, which raises it, because
+        the user must know that there is no page.
         """
         raise_priority(NICE)
         while not self._ending.is_set() and self._problem is None:
@@ -548,19 +558,24 @@ class PageServer:
         return f"{self._scheme}://{host}:{self._port}/"
 
     def _print_links(self) -> None:
-        """Prints the links for users and watchers, once the scenario says who the users are.
+        """Prints the links with which users and watchers can open their pages.
 
-        Users are the masters, or the participants of an experiment. The links are printed once.
+        Users are those who hold a master arm, or the participants of an experiment. The links
+        are printed once, when the scenario that names the arms is known.
         """
         scenario = self.view.scenario
-        if self._links_are_printed or (scenario is None and self._stage is None):
+        are_users_known = scenario is not None or self._stage is not None
+        if self._links_are_printed or not are_users_known:
             return
         self._links_are_printed = True
         if self._stage is not None:
             users = [*self._stage.users]
         else:
             sites = {} if scenario is None else scenario.sites
-            users = [name for name, spec in sites.items() if spec.role == "master"]
+            users = [
+                name for name, site_settings in sites.items() if site_settings.role == "master"
+            ]
+
         roles = [Role("user", site) for site in users]
         for role in (*roles, Role("watcher")):
             name = f"{role.kind} {role.site}".rstrip()
@@ -573,7 +588,7 @@ class PageServer:
         each round, the pages may send the new frame.
         """
         while True:
-            begun_ns = self._clock.monotonic_ns()
+            started_ns = self._clock.monotonic_ns()
             steps = (
                 self._desk.poll,
                 self.view.poll,
@@ -588,30 +603,29 @@ class PageServer:
                     step()
                 except Exception as error:
                     self._count_failure(step.__qualname__, error)
+
             for page in self._pages:
                 page.wake.set()
-            spent_s = (self._clock.monotonic_ns() - begun_ns) * 1e-9
-            await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
+            elapsed_s = (self._clock.monotonic_ns() - started_ns) * 1e-9
+            remaining_s = 1.0 / FRAMES_PER_S - elapsed_s
+            await asyncio.sleep(max(0.002, remaining_s))
 
     def _poll_stage(self) -> None:
-        """Lets the experiment judge the new records, and marks its moments in the log.
+        """Lets the experiment judge the new records, and writes its marks into the log.
 
-        Moments are, for example, the beginning of a trial. Without an experiment nothing
-        happens.
+        A mark is, for example, "trial 3 begins". Without an experiment nothing happens.
         """
         if self._stage is None:
             return
-        users = [
-            (page.role.site, page.number) for page in self._pages if page.role.kind == "user"
-        ]
+        user_pages = [page for page in self._pages if page.role.kind == "user"]
+        users = [(page.role.site, page.number) for page in user_pages]
         for moment in self._stage.poll(self.view, users):
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
         """Makes the next frame, the message from which pages draw the present state.
 
-        It also collects the sites' replies to orders, of which the latest 20 are kept for
-        pages.
+        The replies of sites to requests of pages are collected too. The latest 20 are kept.
         """
         self._frame_number += 1
         for site, channel, is_accepted, text in self._desk.replies:
@@ -625,6 +639,7 @@ class PageServer:
             self._notices.append(notice)
         self._desk.replies.clear()
         del self._notices[:-20]
+
         self._frame = self._frames.make_frame() or self._frame
         self._frames_as_site.clear()
 
@@ -646,17 +661,22 @@ class PageServer:
         if problem is not None:
             self.refused[problem] += 1
             return connection.respond(HTTPStatus.FORBIDDEN, problem + "\n")
+
         if target.path == "/socket":
             role = self._links.find(target.query)
             if role is not None and role.kind == "watcher" and is_full(self._pages, role):
                 self.refused["too many watchers"] += 1
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many watchers\n")
             return None
+
         response = self.files.find(target.path)
         return response or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
 
     def _find_refusal(self, request: Request, query: str) -> str | None:
         """Returns the reason why a request must be refused. Returns None if it is accepted.
+
+        Requests that come from pages of other web sites, for example, could move an arm without
+        its user's knowledge.
 
         Args:
             request: The request.
@@ -697,6 +717,7 @@ class PageServer:
             connection.strangers.remove(connection)
         if role.kind == "experimenter":
             self._opening.remove_file()
+
         sending = asyncio.create_task(self._send(page))
         try:
             async for text in connection:
@@ -716,7 +737,7 @@ class PageServer:
     def _close_page_for(self, role: Role) -> None:
         """Closes an older page if there are too many pages of a role for a new one.
 
-        The arms that the closed page holds are released.
+        The arms that the person at the closed page holds are released.
 
         Args:
             role: Role of the new page.
@@ -730,6 +751,7 @@ class PageServer:
         self.refused[f"too many pages of {role.kind}s"] += 1
         close = page.connection.close(_POLICY_VIOLATION, "a newer page took its place")
         task = asyncio.get_running_loop().create_task(close)
+        # A task without a reference could be removed by the garbage collector.
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
 
@@ -744,6 +766,7 @@ class PageServer:
             page.excess += 1
             self.refused["too many"] += 1
             return
+
         try:
             message = read_page_message(text)
             is_release = isinstance(message, MoveHand) and not message.grip
@@ -757,11 +780,11 @@ class PageServer:
             self._count_failure("message", error)
 
     def _handle_message(self, page: Page, message: PageMessage) -> None:
-        """Carries out the request of a page's message, if the page may request it.
+        """Carries out the request of a page's message, if the page has the right to it.
 
-        A request that the page may not make is counted as refused, with the reason. The rights
-        depend on the role of the page's user, for example a watcher. Most requests are carried
-        out only for a page that takes part in the control of the session.
+        A request without the right is counted as refused, with the reason. The right depends on
+        the role of the person, for example a watcher. Most requests also need a page that takes
+        part, which means that it may move arms and change settings.
 
         Args:
             page: The page.
@@ -796,13 +819,17 @@ class PageServer:
         page.wake.set()
 
     def _control_session(self, page: Page, message: PageMessage) -> None:
-        """Carries out a request that only a page that takes part in the session may make.
+        """Carries out a request of a page that moves an arm or changes the session.
+
+        For example, an experimenter changes the delay of a link, or a user moves an arm with
+        the mouse.
 
         Args:
-            page: The page, which takes part.
+            page: The page, which has the right to control the session.
             message: The decoded message, which the role of the page's user permits.
         """
         view = self.view
+
         if isinstance(message, SetLink | SetShares):
             self._desk.queue_change(message, view.sites, view.links, page.role.noun)
         elif isinstance(message, ReleaseArms):
@@ -827,13 +854,13 @@ class PageServer:
             self.end_requested.set()
 
     def _request_part(self, page: Page, want: bool) -> None:
-        """Handles a page's request to take part, or to take part no longer.
+        """Handles a page's request for the right to control the session, or its return.
 
-        If other pages hold an arm, the page takes part only if they agree.
+        If other pages hold an arm, the page gets the right only if they agree.
 
         Args:
             page: The page.
-            want: True to take part.
+            want: True to request the right, False to return it.
         """
         if not want:
             page.takes_part = False
@@ -842,8 +869,10 @@ class PageServer:
         elif not page.takes_part and page.asks is None:
             others = self.experimenters - {page}
             holders = {other for other in others if self._list_held_sites(other)}
-            page.asks = (holders, self._clock.monotonic_ns()) if holders else None
-            page.takes_part = not holders
+            if holders:
+                page.asks = (holders, self._clock.monotonic_ns())
+            else:
+                page.takes_part = True
 
     @property
     def experimenters(self) -> set[Page]:
@@ -851,17 +880,20 @@ class PageServer:
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:
-        """Applies the answer of a page to another page's request to take part in the control.
+        """Applies the answer of a page to another page's request to control the session.
 
-        An answer to a request that does not exist, or was put to other pages, is counted as
-        refused.
+        An answer to a request that does not exist, or that was put to other pages, is counted
+        as refused.
 
         Args:
             page: The page that answers.
             answer: Whether the other page may take part.
         """
         for other in self._pages:
-            if other.number == answer.page and other.asks is not None and page in other.asks[0]:
+            if other.number != answer.page or other.asks is None:
+                continue
+            asked_pages, _ = other.asks
+            if page in asked_pages:
                 other.takes_part = answer.yes
                 other.asks = None
                 return
@@ -878,10 +910,11 @@ class PageServer:
             if page.asks is None:
                 continue
             asked_pages, asked_ns = page.asks
-            remaining = asked_pages & self._pages
+            remaining_pages = asked_pages & self._pages
             is_too_late = now_ns - asked_ns > ANSWER_TIMEOUT_NS
-            if not remaining or is_too_late:
-                page.takes_part = not any(map(self._list_held_sites, remaining))
+            if not remaining_pages or is_too_late:
+                is_arm_held = any(map(self._list_held_sites, remaining_pages))
+                page.takes_part = not is_arm_held
                 page.asks = None
 
     def _list_held_sites(self, page: Page) -> list[str]:
@@ -915,6 +948,7 @@ class PageServer:
                     return await page.connection.close(
                         _POLICY_VIOLATION, "the session has no such site"
                     )
+
                 page.notified = page.sent
                 page.sent = self._frame_number
                 page.unseen.append(page.sent)
@@ -927,19 +961,26 @@ class PageServer:
                 except Exception as error:
                     self._count_failure("frame", error)
                     continue
+
                 page.greeted = has_begun
                 await page.connection.send(payload, text=True)
 
     def _is_frame_due(self, page: Page, *, has_begun: bool) -> bool:
         """Returns True if the page should receive the newest frame now.
 
+        A page that has not drawn the previous frame yet gets none, so that messages do not pile
+        up.
+
         Args:
             page: The page.
             has_begun: False before the session has a frame. Then pages receive a message only
                 now and then.
         """
-        if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._frame_number:
+        is_page_behind = len(page.unseen) >= FRAMES_AHEAD
+        has_newest_frame = page.sent == self._frame_number
+        if is_page_behind or has_newest_frame:
             return False
+
         if has_begun or not page.sent:
             return True
         return self._frame_number - page.sent >= WAITING_FRAME_STEP
@@ -985,6 +1026,9 @@ class PageServer:
 
     def _describe_frame(self, page: Page) -> dict[str, Any]:
         """Returns the newest frame for a page: the state of the session and of the page itself.
+
+        A frame is a message from which the page draws the session, about 30 times a second.
+        What a page receives depends on the role of its user.
 
         Args:
             page: The page.
@@ -1044,26 +1088,28 @@ class PageServer:
             return notices
         refused_stops: list[dict[str, Any]] = []
         for notice in notices:
-            if notice["of"] == topics.STOP and not notice["ok"]:
+            is_refused_stop = notice["of"] == topics.STOP and not notice["ok"]
+            if is_refused_stop:
                 text = f"{notice['site']} was not stopped"
                 refused_stops.append({**notice, "text": text})
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns the frame for the user of a site, who sees the other arms delayed.
+        """Returns the frame for the user of an arm, who sees the other arms delayed.
 
         It has no plots and no events, which would reveal the present state. All pages of the
-        site get the same frame.
+        arm get the same frame.
 
         Args:
-            site: Name of the site.
+            site: Name of the site that controls the arm.
         """
         if site not in self._frames_as_site:
             assert self._frame is not None
             self._frames_as_site[site] = self._frames.describe_as(
                 self._frame, site, ages=self._shows_ages
             )
-        return {**self._frames_as_site[site], "points": [], "energies": [], "events": []}
+        hidden_fields: dict[str, Any] = {"points": [], "energies": [], "events": []}
+        return {**self._frames_as_site[site], **hidden_fields}
 
     def _describe_all(self, page: Page) -> dict[str, Any]:
         """Returns the frame for a page that sees everything, with new points and events.
@@ -1082,6 +1128,7 @@ class PageServer:
         points = frames.points.since(page.points, limit)
         energies = frames.energies.since(page.energies, limit)
         events = [render_event(event) for event in view.events.since(page.events, 100)]
+
         page.points = frames.points.count
         page.energies = frames.energies.count
         page.events = view.events.count
@@ -1153,10 +1200,11 @@ class PageAttendant(ExitStack):
         # The processes of the session have ended.
         page.view.finish()
         page.files.add_results(paths)
-        give_up_ns = clock.monotonic_ns() + RESULTS_TIMEOUT_NS
+        offer_ends_ns = clock.monotonic_ns() + RESULTS_TIMEOUT_NS
         with suppress(KeyboardInterrupt):
-            while page.experimenters and clock.monotonic_ns() < give_up_ns:
-                clock.sleep_until(clock.monotonic_ns() + RESULTS_TIMEOUT_NS // 3000)
+            poll_period_ns = RESULTS_TIMEOUT_NS // 3000
+            while page.experimenters and clock.monotonic_ns() < offer_ends_ns:
+                clock.sleep_until(clock.monotonic_ns() + poll_period_ns)
 
 
 @contextmanager

@@ -95,7 +95,7 @@ class _ArmFrames:
             values for JSON.
         """
         model = self._model
-        spec = self._spec
+        settings = self._spec
         colours = self._scenario.assign_colours(COLOURS)
         site_number = self._scenario.names.index(self._site)
         colour = colours[site_number % len(colours)]
@@ -103,24 +103,27 @@ class _ArmFrames:
         if model.chain is not None:
             up_axes = upright_axes(model.chain)
             up = _round(up_axes)
-        q0 = np.array([spec.q0_rad], dtype=np.float64)
+
+        q0 = np.array([settings.q0_rad], dtype=np.float64)
         start_m = joint_positions_m(model, q0)[0]
         link_vectors_m = np.diff(start_m, axis=0)
         link_lengths_m = np.linalg.norm(link_vectors_m, axis=1)
-        reach_m = float(link_lengths_m.sum())
+        reach_m = float(link_lengths_m.sum())  # of the stretched arm
+
         body_sizes_m = self._scenario.bodies_m(self._site).values()
         walls: list[Json] = []
         for wall in self._walls:
             point_m = list(wall.a)
             normal = list(wall.b)
             walls.append({"at": point_m, "normal": normal})
+
         return {
-            "role": spec.role,
+            "role": settings.role,
             "colour": colour,
-            "rate_hz": spec.rate_hz,
+            "rate_hz": settings.rate_hz,
             "planar": model.chain is None,
             "up": up,
-            "joints": len(spec.q0_rad),
+            "joints": len(settings.q0_rad),
             "start": _round(start_m),
             "reach": reach_m,
             "tau_limit": _round(self._tau_limit),
@@ -129,14 +132,15 @@ class _ArmFrames:
             "task": model.shares_pose,
             "unit": "m" if model.shares_pose else "rad",
             "hand": self._describe_hand(),
-            "stops": spec.on_stale.action == "glide",
-            "law": identify_law(spec.control),
+            "stops": settings.on_stale.action == "glide",
+            "law": identify_law(settings.control),
         }
 
     def _describe_hand(self) -> Json | None:
-        """Returns how people can hold the arm, for example its reach and the mode of the hand.
+        """Describes how people can hold the arm: by force or position, and in which limits.
 
-        None if the scenario has no live hand at this site, so that nobody can hold the arm.
+        None if the scenario has no operator of the kind "live" at this site, so that nobody can
+        hold the arm.
         """
         hand = self._hand
         if hand is None:
@@ -208,10 +212,12 @@ class _ArmFrames:
         split = TorqueSplit.of_records(records, self._scenario)
         hand_force = self._compute_hand_force(records, split)
         wall_force_n = self._compute_wall_force(records, split)
+
         error_norm = np.linalg.norm(records.e, axis=1)
         torque_size = np.abs(records.tau)
         full_torque = self._tau_limit * (1.0 - 1e-12)
         is_at_limit = torque_size >= full_torque
+
         present_pose = self.describe_pose(records.q[-1])
         reference_m = self._place_reference(records)
         present_torque = records.tau[-1]
@@ -228,6 +234,7 @@ class _ArmFrames:
             "wall": _round(wall_force_n[-1], 3),
             **present_grip,
         }
+
         hand_force_size = np.linalg.norm(hand_force, axis=1)
         wall_force_size = np.linalg.norm(wall_force_n, axis=1)
         extremes = [
@@ -239,7 +246,7 @@ class _ArmFrames:
         return state, extremes
 
     def _place_reference(self, records: AlignedRecords) -> Array:
-        """Computes where the reference is that the arm follows, so that a page can draw it.
+        """Returns where the reference is that the arm follows, so that a page can draw it.
 
         The reference `q_des` is what the control law makes the arm follow. It consists of joint
         positions, or of a pose of the end effector if the sites exchange such poses. A pose
@@ -263,7 +270,9 @@ class _ArmFrames:
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
-        """Returns who holds the arm in the last record, and how. Empty if nobody can hold it.
+        """Describes who holds the arm in the last record, with which strength, and its target.
+
+        Empty if nobody can hold the arm.
 
         Args:
             records: Records since the previous frame.
@@ -274,11 +283,13 @@ class _ArmFrames:
         last_values = records.hand[-1].tolist()
         grip = HandInForce.read(last_values)
         hand = self._hand
+
         is_limited = False
         if hand is not None and hand.mode != "joint" and grip.source:
             force_size_n = float(np.linalg.norm(force))
             limit_n = grip.grip * hand.force_limit_n
-            is_limited = force_size_n >= limit_n * (1.0 - 1e-6)
+            is_limited = force_size_n >= limit_n * (1.0 - 1e-6)  # up to rounding
+
         pulls_tip = hand is not None and hand.mode == "tip"
         has_target = pulls_tip and grip.grip > 0.0
         target = grip.target if has_target else None
@@ -325,7 +336,9 @@ class _ArmFrames:
             speed=motion.speed[-1:],
             J=motion.J[-1:],
         )
+
         last_q = records.q[-1:]
+
         gravity_torque = self._rows.gravity_torque(last_q)
         law_torque = records.tau[-1:] - gravity_torque
         forces = last_motion.find_force(law_torque, _MIN_SINGULAR_SHARE)
@@ -373,7 +386,8 @@ class SessionFrames:
         self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
         self._energy_s = -1.0
-        # By the user's site and the peer; a site's own arm is turned under the user "".
+        # Poses in which users see other arms, and signs of the quaternions of touched bodies.
+        # The keys are the user's site and the arm's site. A page for all arms has the user "".
         self._peer_poses: dict[tuple[str, str], Json] = {}
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
@@ -394,18 +408,22 @@ class SessionFrames:
             self._arms = arms
             for site, arm in self._arms.items():
                 self._arm_constants[site] = arm.describe()
+
         if scenario is None or not view.running:
             return self._describe_waiting(scenario)
+
         columns: list[str] = []
         for site in scenario.names:
             columns += [f"{site}.{kind}" for kind in ("e", "tau", "hand", "wall")]
         columns += [f"{link}.age" for link in scenario.links]
+
         link_ends: dict[str, list[str]] = {}
         for link in scenario.links:
             link_ends[link] = link.split("->")
         shares: Json = {}
         for site in scenario.names:
             shares[site] = scenario.dominance[site]
+
         return {
             "running": True,
             "session": view.session,
@@ -420,20 +438,20 @@ class SessionFrames:
         }
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
-        """Returns the frame of a session that has not begun: which members are here or missing.
+        """Describes a session that has not begun: its present and its missing members.
 
         Args:
             scenario: Scenario of the session. None until a member has sent it.
         """
         members = self._view.members
         names = [] if scenario is None else scenario.names
-        missing = [name for name in names if name not in members]
+        missing_names = [name for name in names if name not in members]
         return {
             "session": self._view.session,
             "running": False,
             "title": "",
             "here": sorted(members),
-            "missing": missing,
+            "missing": missing_names,
         }
 
     def make_frame(self) -> Json | None:
@@ -459,12 +477,14 @@ class SessionFrames:
             sites[name], extremes = self._describe_site(name, site)
             t_s = max(t_s, sites[name]["t"])
             point += extremes
+
         links = {name: self._describe_link(name) for name in view.links}
         point += [link["age_ms"] for link in links.values()]
         has_new_records = any(site["new"] for site in sites.values())
         if has_new_records:
             self._add_point(t_s, point)
         self._add_energies()
+
         energy_problem = ""
         if view.energy is not None:
             energy_problem = view.energy.reason
@@ -502,13 +522,14 @@ class SessionFrames:
         There is a value for each complete tick. At most one per `ENERGY_PERIOD_S` becomes a
         point.
         """
-        course = self._view.advance_energy()
-        if course is None:
+        new_energies = self._view.advance_energy()
+        if new_energies is None:
             return
-        columns = [column.tolist() for column in course]
+        columns = [column.tolist() for column in new_energies]
         for t_s, V, supplied in zip(*columns, strict=True):
             next_point_s = self._energy_s + ENERGY_PERIOD_S
-            if t_s >= next_point_s - 1e-9:
+            is_due = t_s >= next_point_s - 1e-9  # up to rounding
+            if is_due:
                 self._energy_s = t_s
                 self.energies.add([t_s, V, supplied])
 
@@ -546,30 +567,37 @@ class SessionFrames:
         Returns:
             The frame for this user.
         """
-        local = frame["sites"][site]
-        ticks = self._view.find_peer_ticks(site, local["tick"], local["used"])
+        user_site_state = frame["sites"][site]
+        ticks = self._view.find_peer_ticks(
+            site, user_site_state["tick"], user_site_state["used"]
+        )
+
         sites: Json = {}
         for name in frame["sites"]:
             if name not in ticks:
-                sites[name] = local
+                sites[name] = user_site_state
                 continue
             peer = self._describe_peer(site, name, ticks[name])
             if ages:
-                age_ms = self._compute_age_ms(name, peer["tick"], local["t"])
+                age_ms = self._compute_age_ms(name, peer["tick"], user_site_state["t"])
                 peer = {**peer, "age_ms": age_ms}
             sites[name] = peer
+
         return {
-            "t": local["t"],
+            "t": user_site_state["t"],
             "sites": sites,
             "links": {},
             "shares": {},
             "energy": "",
             "ended": frame["ended"],
-            "silent_s": local["silent_s"],
+            "silent_s": user_site_state["silent_s"],
         }
 
     def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
         """Returns the age of a site's record at a time, in ms.
+
+        The users of an experiment or a demonstration see there how old the pose of a remote arm
+        is.
 
         Args:
             site: Name of the site.
@@ -635,15 +663,18 @@ class SessionFrames:
         stats = site.stats
         assert record is not None
         state, extremes, has_new_records = self._describe_new_records(name, site)
+
         has_ended = self._view.ended
         alarm = None
         silence_s = 0.0
         if not has_ended:
             alarm = site.find_alarm(self._view.session, name)
             silence_s = round(self._view.silence_s(site), 1)
+
         # Chooses the signs of the bodies' quaternions, so that the picture does not jump. The
         # empty name stands for a page that sees all arms.
         bodies = self._turns["", name].align(record.bodies)
+
         # A view that joined late does not know how many earlier records are missing.
         missing_count = 0
         has_seen_all = site.first_tick == 0
@@ -682,11 +713,12 @@ class SessionFrames:
     def _describe_new_records(
         self, name: str, site: SiteView
     ) -> tuple[Json, list[float], bool]:
-        """Evaluates the records of a site since the previous frame.
+        """Describes the newest state of an arm, with the extremes since the previous frame.
+
+        Without new records, the newest record is evaluated again.
 
         Returns:
-            The state of the arm, the extremes, and whether there are new records. Without new
-            records, the newest record is evaluated again.
+            The state of the arm, the extremes, and True if there are new records.
         """
         window = site.window
         newest_tick = max(window.newest, 0)
@@ -697,6 +729,7 @@ class SessionFrames:
         earliest_tick = newest_tick - most_ticks
         next_tick = min(previous_tick + 1, newest_tick)
         first_tick = max(next_tick, earliest_tick, window.first)
+
         records = window.rows(first_tick, newest_tick)
         state, extremes = self._arms[name].describe_now(records)
         has_new_records = newest_tick > previous_tick
@@ -704,6 +737,9 @@ class SessionFrames:
 
     def _describe_link(self, name: str) -> Json:
         """Returns the present state of a link: age of samples in use, settings and counts.
+
+        A link is the connection from one site to another, over which the sites send the states
+        of their arms.
 
         Args:
             name: Name of the link, for example "m1->s".
@@ -723,6 +759,7 @@ class SessionFrames:
             if used_tick >= 0:
                 used_ms = used_tick * 1e3 / sending.window.rate_hz
                 age_ms = record.t_ns / 1e6 - used_ms
+
         newest_tick = used_tick
         if sending.record:
             newest_tick = sending.record.tick
@@ -730,26 +767,31 @@ class SessionFrames:
         if used_tick >= 0:
             newer_samples = min(newest_tick - used_tick, 100_000)
             samples_under_way = max(0, newer_samples)
-        stated: Json = {}
+
+        stated_settings: Json = {}
         for key, value in view.links[name].items():
             if isinstance(value, str | int | float):
-                stated[key] = value
+                stated_settings[key] = value
+
         shares = view.dominance.get(receiver, {})
         sample_counts = _count_samples(receiving, peer)
         return {
             "age_ms": age_ms,
             "under_way": samples_under_way,
-            "stated": stated,
+            "stated": stated_settings,
             "share": shares.get(peer, 0.0),
             **sample_counts,
         }
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns the delay and the counts of a peer's samples, as a site's statistics state them.
+    """Returns how many samples of a peer have arrived, and with which delay.
+
+    A sample is the state that a peer, another site, publishes in a control period. The
+    receiving site counts them in its statistics.
 
     Args:
-        receiving: View of the site.
+        receiving: View of the receiving site.
         peer: Name of the peer.
 
     Returns:

@@ -97,11 +97,11 @@ class Tail(Generic[T]):
         Returns:
             The entries, the oldest first. Empty if there are no new ones.
         """
-        size = len(self._entries)
+        kept_count = len(self._entries)
         unread_count = self.count - count
-        new_count = min(unread_count, most, size)
-        first = size - new_count
-        return [self._entries[index] for index in range(first, size)]
+        new_count = min(unread_count, most, kept_count)
+        first_index = kept_count - new_count
+        return [self._entries[index] for index in range(first_index, kept_count)]
 
 
 class SiteView:
@@ -145,14 +145,14 @@ class SiteView:
         boot: int,
         window: RecordWindow,
     ) -> None:
-        spec = scenario.sites[name]
-        rule = spec.on_stale
-        self.glides = rule.action == "glide"
+        settings = scenario.sites[name]
+        loss_rule = settings.on_stale
+        self.glides = loss_rule.action == "glide"
         self.peers = scenario.peers(name)
         self.layout = None
-        if rule.rule.degrades:
+        if loss_rule.rule.degrades:
             self.layout = scenario.layout(name)
-        self.hand = spec.find_live_hand(is_open=True)
+        self.hand = settings.find_live_hand(is_open=True)
         self.reception = SiteReception(scenario, name, boot)
         self.window = window
         self.holder = ""
@@ -187,6 +187,7 @@ class SiteView:
             lost_peers = self.layout.list_lost_peers(record.mem, self.peers)
         shared_coordinates = len(record.q_des)  # by which `mem` is divided
         # The function of the module `ticks`, which derives an alarm from a record alone.
+
         alarm = LifeAlarm.find(
             session=session,
             site=name,
@@ -197,6 +198,7 @@ class SiteView:
         )
         if alarm is None:
             return None
+
         # The order "enable" ends a stop that was ordered. Only an event says by whom.
         was_stopped_by_order = alarm.order == "enable"
         if was_stopped_by_order and self.stopped_by:
@@ -216,10 +218,10 @@ class SiteView:
         A record is the result of one tick, a period of the site's control loop. Every record up
         to this tick has arrived or is lost for good. The value is -1 before the first record.
         """
-        account = self.reception.accounts[topics.STATE]
-        gap = account.find_requestable_gap()
+        record_account = self.reception.accounts[topics.STATE]
+        gap = record_account.find_requestable_gap()
         if gap is None:
-            return account.last
+            return record_account.last
         first_missing, _ = gap
         return first_missing - 1
 
@@ -333,7 +335,7 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """Time for which no running site has been heard, in s. 0 while any of them is heard.
+        """Time for which no running site has been heard, in s. It is 0 while any site is heard.
 
         Displays then say that they wait, because either the session or their own connection is
         gone.
@@ -357,16 +359,19 @@ class SessionView:
             self._connect_to_sites()
         if not self.running:
             return
+
         for message in self._queue.drain(now_ns):
             try:
                 self._receive(message)
             except WireError as error:
                 self.dropped[error.reason] += 1
+
         for name, site in self.sites.items():
             # Silent sites are queried too: the missing message may be their `end` event.
             repaired = site.repair.poll(now_ns, alive=not site.ended)
             for channel, reply, _ in repaired:
                 self._store(name, site, channel, reply.content)
+
         newest_ns = 0
         for site in self.sites.values():
             if site.record is not None:
@@ -376,7 +381,8 @@ class SessionView:
     def _note_presence(self, now_ns: int) -> None:
         """Notes which sites have appeared on the network or disappeared, for `has_left`.
 
-        Recorders do not count.
+        Each member of a session has a liveliness token, which the network removes when the
+        member disappears. Recorders do not count.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
@@ -439,7 +445,7 @@ class SessionView:
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
-        """Receives the replies of members, and creates the sites once all of them run.
+        """Receives the replies of members, and observes the sites once all of them run.
 
         The scenario comes with the first reply. An invalid scenario is counted as dropped.
         """
@@ -452,6 +458,7 @@ class SessionView:
                     self.dropped["another scenario"] += 1
         if self.scenario is None:
             return
+
         names = self.scenario.names
         infos = [self.members[name] for name in names if name in self.members]
         have_all_replied = len(infos) == len(names)
@@ -491,11 +498,10 @@ class SessionView:
             WireError: The message cannot be decoded.
         """
         parts = topics.parse_key(inbound.key)
-        if parts is None:
+        site = self.sites.get(parts.member) if parts is not None else None
+        if parts is None or site is None:
             return
-        site = self.sites.get(parts.member)
-        if site is None:
-            return
+
         channel = parts.channel
         payloads: Iterable[bytes] = (inbound.payload,)
         # A message on the channel of records contains a block of records.
@@ -512,17 +518,22 @@ class SessionView:
                     raise
                 # From now on, messages of the new boot can be read.
                 message = site.reception.read(channel, payload)
+
             has_stored_none = site.record is None and site.stats is None
             is_first = has_stored_none and channel != topics.EVENT
             if is_first:
                 self._skip_records_before(site, message.content)
+
             # A message that has arrived before, for example on request, is not stored again.
             is_new = site.reception.accept(channel, message, inbound.mono_ns)
             if is_new:
                 self._store(parts.member, site, channel, message.content)
 
     def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Follows a site that was started again, if an event says that it has joined.
+        """Follows a site that was started again, if an event announces the new start.
+
+        Each start of a site has a random number, its boot. Messages of an unknown boot are
+        dropped, until an event says that the new process has joined the session.
 
         Args:
             name: Name of the site.
@@ -534,10 +545,12 @@ class SessionView:
         event = decode(payload, Event)
         site = self.sites[name]
         is_join = event.kind == "join" and event.member == name
-        if not is_join or event.boots.get(name) != event.boot:
+        names_own_boot = event.boots.get(name) == event.boot
+        if not is_join or not names_own_boot:
             return False
         if self.scenario is None or not self.scenario.sites_may_return:
             return False
+
         reception = SiteReception(self.scenario, name, event.boot, site.reception)
         site.reception = reception
         site.repair = GapRepair(self.bus, self.session, reception, site.dropped)
@@ -556,8 +569,10 @@ class SessionView:
         if isinstance(content, State | LinkStats):
             tick = content.tick
         first_s = tick / site.window.rate_hz
-        if first_s < LATE_S:
+        has_joined_late = first_s >= LATE_S
+        if not has_joined_late:
             return
+
         site.first_tick = tick
         for channel in (topics.STATE, topics.LINK):
             account = site.reception.accounts[channel]
@@ -568,6 +583,9 @@ class SessionView:
         self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
     ) -> None:
         """Stores the content of a new message where pages look for it.
+
+        A record is the result of one control period of an arm, and an event reports something
+        rare, such as the end of the run.
 
         Args:
             name: Name of the site that sent it.
@@ -596,12 +614,14 @@ class SessionView:
         if site.record is None or record.tick > site.record.tick:
             site.record = record
         site.window.receive(record)
+
         if record.bodies:
             site.bodies[record.tick] = record.bodies
             kept_ticks = KEPT_S * site.window.rate_hz
             while len(site.bodies) > kept_ticks:
                 oldest_tick = next(iter(site.bodies))
                 del site.bodies[oldest_tick]
+
         for change in record.cmd:
             self._apply_change(name, change)
 
@@ -621,13 +641,14 @@ class SessionView:
             holder, separator, _ = event.text.partition(f" {TAKEN} ")
             if separator:
                 site.holder = holder.removeprefix(f"{name}: ")
+
         if event.kind == "change":
             site.stopped_by = find_requester(event.text) or site.stopped_by
             if event.command:
                 self._apply_change(name, event.command)
 
     def _apply_change(self, site: str, text: str) -> None:
-        """Applies a change to the links, the dominance factors and the energies.
+        """Applies a change of the session to the displayed links, weights and energies.
 
         A change is in a record and in an event of its site. It is applied only once.
 
@@ -641,12 +662,15 @@ class SessionView:
         if identity in self._applied_changes:
             return
         self._applied_changes.add(identity)
+
         try:
             change = parse_core_change(self.scenario, site, text)
         except ScenarioError:
             self.dropped["no change"] += 1
             return
+
         self.energy.add_changes(site, [change])
+
         table = msgspec.json.decode(text)
         if "link" in table:
             self.links[table["link"]] = table["to"]

@@ -68,24 +68,28 @@ def watch_session(
     with Interrupt() as interrupt:
         names = embedded_names_reader(session)
         stopped = interrupt.is_requested
-        reached = connect_to_session(
+        connection_to_session = connect_to_session(
             connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
         )
-        with reached as bus:
+
+        with connection_to_session as bus:
             if bus is None:
                 return interrupt.exit_code
+
             with show(bus) as (view, update_display):
-                give_up_ns = clock.monotonic_ns() + int(timeout_s * NS_PER_S)
+                reply_deadline_ns = clock.monotonic_ns() + int(timeout_s * NS_PER_S)
                 while not (stopped() or view.ended):
                     update_display()
                     now_ns = clock.monotonic_ns()
-                    if now_ns > give_up_ns and not view.members:
+                    if now_ns > reply_deadline_ns and not view.members:
                         raise SessionError(
                             f"no site of session {session!r} answered within {timeout_s:g} s"
                         )
                     clock.sleep_until(now_ns + POLL_NS)
+
         if stopped():
             return interrupt.exit_code
+
     if view.has_left:
         say(f"session {session} has ended: all of its sites have left")
     else:
@@ -147,14 +151,16 @@ class SessionWatch:
         """
         view = self.view
         silence_s = view.session_silence_s
-        state = f"as {self._as_site} knows it" if self._as_site else self._energy_text
+        details = f"as {self._as_site} knows it" if self._as_site else self._energy_text
+        parts = [details]
         if not view.running:
-            state = "waits for its members"
+            parts = ["waits for its members"]
         elif view.ended:
-            state = "; ".join(filter(None, ("has ended", state)))
+            parts = ["has ended", details]
         elif silence_s > 0.0:
-            state = "; ".join(filter(None, (f"silent for {silence_s:.0f} s, waiting", state)))
-        return f"session {self.view.session}" + (f"; {state}" if state else "")
+            parts = [f"silent for {silence_s:.0f} s, waiting", details]
+        shown_parts = [part for part in parts if part]
+        return "; ".join([f"session {view.session}", *shown_parts])
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
@@ -251,9 +257,9 @@ def show_in_terminal(
             watch.update()
             wants_stop = read_keys is not None and STOP_KEYS.intersection(read_keys())
             if wants_stop:
-                display.say(
-                    "stopping every arm" if watch.view.running else "the session has not begun"
-                )
+                is_running = watch.view.running
+                notice = "stopping every arm" if is_running else "the session has not begun"
+                display.say(notice)
                 desk.stop(watch.view.sites, "a watcher at a terminal")
             desk.poll()
             while desk.replies:
@@ -288,12 +294,10 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         return
 
     def read() -> str:
-        """Returns the keys pressed since the last call, as a text.
-
-        Empty if the terminal has gone.
-        """
+        """Returns the keys pressed since the last call. Empty if the terminal has gone."""
         with suppress(OSError):
-            if select.select([keyboard], [], [], 0.0)[0]:
+            readable, _, _ = select.select([keyboard], [], [], 0.0)
+            if readable:
                 return os.read(keyboard, 64).decode(errors="replace")
         return ""
 

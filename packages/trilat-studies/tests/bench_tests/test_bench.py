@@ -78,6 +78,12 @@ from trilat_net.scenario.laws import BUILT_IN
 from trilat_net.work.study_folder import encode_csv
 
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}
+WALL_M = 1.3376933693863516
+"""Position of the wall of the task with contact."""
+WALL_N_M = 2000.0
+"""Stiffness of that wall."""
+HAND_NM_RAD = 50.0
+"""Stiffness with which the user's hand pulls each joint to its target."""
 
 
 def plan_small_suite(**more: Any) -> BenchPlan:
@@ -88,6 +94,7 @@ def plan_small_suite(**more: Any) -> BenchPlan:
 
 
 def files(results: BenchResults) -> list[str]:
+    """Returns the page, the table of cells and the table of runs that a benchmark writes."""
     return [
         build_bench_page(results, "trilat bench"),
         encode_csv(results.to_rows()),
@@ -97,6 +104,7 @@ def files(results: BenchResults) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
+    """A benchmark that ran without an interruption."""
     folder = prepare_bench_folder(
         plan_small_suite(), tmp_path_factory.mktemp("suite") / "whole"
     )
@@ -106,21 +114,24 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
 def test_an_interrupted_suite_resumes_to_the_same_bytes(
     whole: BenchResults, tmp_path: Path
 ) -> None:
-    folder, finished = prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), []
+    """The second call computes only the missing run, and all files equal those of one call."""
+    path = tmp_path / "parts"
+    finished_runs = []
 
-    def stop(done: int, _total: int) -> None:
-        finished.append(done)
+    def interrupt_after_two(done: int, _total: int) -> None:
+        finished_runs.append(done)
         if done == 2:
             raise KeyboardInterrupt
 
+    folder = prepare_bench_folder(plan_small_suite(), path)
     with pytest.raises(KeyboardInterrupt):
-        run_bench(folder, jobs=1, progress=stop)
-    again = run_bench(
-        prepare_bench_folder(plan_small_suite(), tmp_path / "parts"), jobs=1, progress=stop
-    )
-    assert finished == [1, 2, 3]
-    assert again.runs == whole.runs
-    assert files(again) == files(whole)
+        run_bench(folder, jobs=1, progress=interrupt_after_two)
+
+    reopened_folder = prepare_bench_folder(plan_small_suite(), path)
+    resumed = run_bench(reopened_folder, jobs=1, progress=interrupt_after_two)
+    assert finished_runs == [1, 2, 3]
+    assert resumed.runs == whole.runs
+    assert files(resumed) == files(whole)
 
 
 @pytest.mark.long
@@ -143,16 +154,19 @@ def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
 
 
 def test_a_cell_equals_the_log_of_its_command(whole: BenchResults) -> None:
+    """The error and the user's torque of a run follow from a log of its printed command."""
     cell = whole.plan.cells[1]
+    run = whole.runs[1]
     arguments = shlex.split(cell.build(1).command)
     assert arguments[:3] == ["trilat", "sim", "_bench_two"]
+
     log = trilat_net.simulate(load_scenario(arguments[2], arguments[4::2]))
-    run, user = whole.runs[1], log["m1"]
     assert log.scenario.sha256 == run.sha256
-    off = log["s"].q - user.q
-    assert run.error_rad == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
-    hand = user.tau_x - 0.5 * user.qd  # without the friction of the user's arm
-    assert run.hand_nm == pytest.approx(np.sqrt(np.mean(hand**2)), rel=1e-12)
+    user = log["m1"]
+    error_rad = log["s"].q - user.q
+    assert run.error_rad == pytest.approx(np.sqrt(np.mean(error_rad**2)), rel=1e-12)
+    hand_nm = user.tau_x - 0.5 * user.qd  # without the friction of the user's arm
+    assert run.hand_nm == pytest.approx(np.sqrt(np.mean(hand_nm**2)), rel=1e-12)
 
 
 def test_effort_equals_that_of_the_compiled_run(whole: BenchResults) -> None:
@@ -164,16 +178,21 @@ def test_effort_equals_that_of_the_compiled_run(whole: BenchResults) -> None:
 
 def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
     """Returns the pose of the user's arm at rest under P+d, and the torque of the hand on that arm."""
-    target = np.array(settings["sites.m1.hands"][0]["to_rad"])
+    target_rad = np.array(settings["sites.m1.hands"][0]["to_rad"])
 
-    def unbalanced(q: Array) -> Array:
-        tip, slave = reach(q[2:])
-        wall = slave.T @ [-2000.0 * max(tip[0] - 1.3376933693863516, 0.0), 0.0]
-        link = K * (q[:2] - q[2:])
-        return np.concatenate([50.0 * (target - q[:2]) - link, link + wall])
+    def compute_unbalanced_torque(q_of_both: Array) -> Array:
+        """Returns the torques that remain on the user's arm and on the slave, in N m."""
+        user_q, slave_q = q_of_both[:2], q_of_both[2:]
+        tip, jacobian = reach(slave_q)
+        wall_force = [-WALL_N_M * max(tip[0] - WALL_M, 0.0), 0.0]
+        wall_torque = jacobian.T @ wall_force
+        link_torque = K * (user_q - slave_q)
+        hand_torque = HAND_NM_RAD * (target_rad - user_q)
+        return np.concatenate([hand_torque - link_torque, link_torque + wall_torque])
 
-    q = optimize.fsolve(unbalanced, [*target, *target], xtol=1e-12)[:2]
-    return q, 50.0 * (target - q)
+    start = [*target_rad, *target_rad]
+    q = optimize.fsolve(compute_unbalanced_torque, start, xtol=1e-12)[:2]
+    return q, HAND_NM_RAD * (target_rad - q)
 
 
 def test_stiffness_at_the_hand_is_static() -> None:
@@ -184,29 +203,36 @@ def test_stiffness_at_the_hand_is_static() -> None:
         q, torque = rest_in_contact(60.0, settings)
         tip, jacobian = reach(q)
         ends.append((tip[0], np.linalg.solve(jacobian.T, torque)[0]))
+
     (near_m, near_n), (far_m, far_n) = ends
     run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=6.0), 1))
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=5e-2)
 
 
 def test_stiffness_is_measured_two_seconds_after_contact() -> None:
+    """Two runs that press differently far give the stiffness, each 1.9 to 2.1 s after contact."""
     (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     cell = with_gains(cell, K=60.0, d=6.0)
-    built, ends = cell.build(1), []
+    experiment = cell.build(1)
+    ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
-        overrides = [*built.overrides, *format_settings(settings)]
-        log = trilat_net.simulate(load_tuning_scenario(built.source, overrides).scenario)
-        user, slave = log["m1"], log["s"]
+        overrides = [*experiment.overrides, *format_settings(settings)]
+        scenario = load_tuning_scenario(experiment.source, overrides).scenario
+        log = trilat_net.simulate(scenario)
+        user = log["m1"]
+        slave = log["s"]
         slave_m = np.cos(slave.q[:, 0]) + np.cos(slave.q.sum(axis=1))
-        touch_s = slave.t_s[slave_m > 1.3376933693863516][0]
+        touch_s = slave.t_s[slave_m > WALL_M][0]
+
         window = (user.t_s > touch_s + 1.8995) & (user.t_s < touch_s + 2.0995)
         tips = [reach(q) for q in user.q[window]]
-        hand = 0.5 * user.qd[window] - user.tau_x[window]
-        forces = [
+        hand_torques = 0.5 * user.qd[window] - user.tau_x[window]
+        forces_n = [
             np.linalg.solve(jacobian.T, torque)[0]
-            for (_, jacobian), torque in zip(tips, hand, strict=True)
+            for (_, jacobian), torque in zip(tips, hand_torques, strict=True)
         ]
-        ends.append((np.mean([tip[0] for tip, _ in tips]), np.mean(forces)))
+        ends.append((np.mean([tip[0] for tip, _ in tips]), np.mean(forces_n)))
+
     (near_m, near_n), (far_m, far_n) = ends
     run = run_bench_task(BenchRunItem(cell, 1))
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-6)
@@ -215,18 +241,22 @@ def test_stiffness_is_measured_two_seconds_after_contact() -> None:
 def test_free_impedance_is_that_of_coupled_arms() -> None:
     """P+d over 4 ms: D = M s^2 + (d + 0.5) s + K - K e^-sT (M s^2 + d s + K)^-1 K e^-sT."""
     (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
-    K, d, s = 60.0, 12.0, 2j * np.pi
+    K, d = 60.0, 12.0
+    s = 2j * np.pi  # at 1 Hz
     q, _ = rest_in_contact(K, TASKS["contact"].settings)
     cosine = np.cos(q[1])
     M = np.array([[3.0 + 2.0 * cosine, 1.0 + cosine], [1.0 + cosine, 1.0]])
     identity = np.eye(2)
+
     coupling = K * np.exp(-4e-3 * s)
     slave = M * s**2 + (d * s + K) * identity
     user = M * s**2 + ((d + 0.5) * s + K) * identity - coupling**2 * np.linalg.inv(slave)
+
     jacobian = reach(q)[1]
     motion = np.linalg.solve(user + (5.0 * s + 50.0) * identity, jacobian[0])
     force = np.linalg.solve(jacobian.T, user @ motion)
     expected = abs(force[0] / (s * (jacobian @ motion)[0]))
+
     run = run_bench_task(BenchRunItem(with_gains(cell, K=K, d=d), 1))
     assert run.free_impedance_n_s_m == pytest.approx(expected, rel=2e-2)
     assert run.impedance_n_s_m is not None
@@ -234,12 +264,13 @@ def test_free_impedance_is_that_of_coupled_arms() -> None:
 
 def reach(q: Array) -> tuple[Array, Array]:
     """Returns the end effector of two links of 1 m, and its Jacobian."""
-    a, b = q[0], q[0] + q[1]
-    tip = np.array([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)])
-    return tip, np.array([[-tip[1], -np.sin(b)], [tip[0], np.cos(b)]])
+    first, second = q[0], q[0] + q[1]  # angles of the links to the horizontal
+    tip = np.array([np.cos(first) + np.cos(second), np.sin(first) + np.sin(second)])
+    return tip, np.array([[-tip[1], -np.sin(second)], [tip[0], np.cos(second)]])
 
 
 def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
+    """Returns a cell whose control law has other gains."""
     return cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
 
 
@@ -290,10 +321,10 @@ def test_an_interrupted_confirmation_resumes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Every run is repeated once over twice its length, and no finished run a second time."""
-    repeated: list[float] = []
+    lengths_s: list[float] = []  # 0 for a first run, and its length for a repetition
 
-    def run(item: BenchRunItem) -> BenchRun:
-        repeated.append(item.to_s)
+    def run_bounded(item: BenchRunItem) -> BenchRun:
+        lengths_s.append(item.to_s)
         return make_run(
             item.cell,
             item.seed,
@@ -305,25 +336,23 @@ def test_an_interrupted_confirmation_resumes(
 
     counts: list[int] = []
 
-    def stop(done: int, _total: int) -> None:
+    def interrupt_first_repetition(done: int, _total: int) -> None:
         counts.append(done)
         if len(counts) == 4:  # the first of three repetitions
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench_run, "run_bench_task", run)
+    monkeypatch.setattr(bench_run, "run_bench_task", run_bounded)
     folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
-        run_bench(folder, on=executor, progress=stop)
-    assert repeated.count(0.0) == 3
-    before = len(repeated)
+        run_bench(folder, on=executor, progress=interrupt_first_repetition)
+    assert lengths_s.count(0.0) == 3
+
+    before = len(lengths_s)
+    folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor:
-        results = run_bench(
-            prepare_bench_folder(plan_small_suite(), tmp_path / "suite"), on=executor
-        )
-    assert repeated[before:] == [60.0, 60.0]
-    assert [
-        (confirmed_run.confirmed, confirmed_run.length_s) for confirmed_run in results.runs
-    ] == [(True, 60.0)] * 3
+        results = run_bench(folder, on=executor)
+    assert lengths_s[before:] == [60.0, 60.0]
+    assert [(run.confirmed, run.length_s) for run in results.runs] == [(True, 60.0)] * 3
 
 
 def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
@@ -375,28 +404,28 @@ def test_a_decided_run_at_rest_is_not_extended() -> None:
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:
+    """The judgement of the longer run counts, and only the same judgement confirms the first."""
     cell = plan_small_suite(links=["rtt8"]).cells[0]
-    judged = [
-        (Stability.STABLE, Stability.STABLE, False),
-        (Stability.NOT_STABLE, Stability.NOT_STABLE, True),
-    ]
-    for longer, stability, confirmed in judged:
-        run = make_run(cell, 1, stability=Stability.NOT_STABLE, length_s=40.0)
-        again = make_run(cell, 1, stability=longer, length_s=80.0, to_s=80.0)
-        results = BenchResults(
-            BenchPlan("round-trips", [cell], [("p_d", "level")]),
-            {(one.cell, 1): one for one in (run, again)},
-        )
-        (found,) = results.runs
-        assert (found.stability, found.confirmed) == (stability, confirmed)
+    plan = BenchPlan("round-trips", [cell], [("p_d", "level")])
+    for longer_stability, is_confirmed in (
+        (Stability.STABLE, False),
+        (Stability.NOT_STABLE, True),
+    ):
+        first = make_run(cell, 1, stability=Stability.NOT_STABLE, length_s=40.0)
+        longer = make_run(cell, 1, stability=longer_stability, length_s=80.0, to_s=80.0)
+        results = BenchResults(plan, {(run.cell, 1): run for run in (first, longer)})
+        (run,) = results.runs
+        assert (run.stability, run.confirmed) == (longer_stability, is_confirmed)
 
 
 def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = {
-        key: msgspec.structs.replace(gains, gains={}) if gains.law == "pd_d" else gains
-        for key, gains in read_gains().items()
-    }
-    monkeypatch.setattr(bench_plan, "read_gains", lambda: kept)
+    """The page says that a law without gains has none, and a study of that law alone is refused."""
+    gains_without_pd_d = read_gains()
+    for key, gains in gains_without_pd_d.items():
+        if gains.law == "pd_d":
+            gains_without_pd_d[key] = msgspec.structs.replace(gains, gains={})
+    monkeypatch.setattr(bench_plan, "read_gains", lambda: gains_without_pd_d)
+
     plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
     assert [cell.law for cell in plan.cells] == ["p_d"]
     run = make_run(plan.cells[0], 1)
@@ -423,6 +452,7 @@ def test_laws_get_nine_tenths_of_gravity() -> None:
         for law in laws[form]:
             reason = explain_no_cell(law, form, "gravity-90")
             assert reason == ("exact model" if law == "impedance" else bench_plan.NO_GAINS)
+
     (gravity_cell,) = plan_bench(
         "full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]
     ).cells
@@ -460,14 +490,14 @@ def test_sharing_error_counts_dominance_at_that_time() -> None:
     plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
     run = run_bench_task(BenchRunItem(plan.cells[0], 1))
     log = trilat_net.simulate(plan.cells[0].build(1).scenario)
-    t_s, (m1, m2, s) = log["s"].t_s, (log[name].q for name in ("m1", "m2", "s"))
-    a = np.interp(t_s, [7.0, 9.0], [0.75, 0.25])[:, None]
-    assert run.error_rad == pytest.approx(
-        np.sqrt(np.mean((s - a * m1 - (1.0 - a) * m2) ** 2)), rel=1e-9
-    )
+    m1, m2, s = (log[name].q for name in ("m1", "m2", "s"))
+    share_of_m1 = np.interp(log["s"].t_s, [7.0, 9.0], [0.75, 0.25])[:, None]
+    error_rad = s - share_of_m1 * m1 - (1.0 - share_of_m1) * m2
+    assert run.error_rad == pytest.approx(np.sqrt(np.mean(error_rad**2)), rel=1e-9)
 
 
 def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
+    """Returns a stable run of a cell, with some of its facts replaced."""
     facts = {
         "stability": Stability.STABLE,
         "behaviour": EndBehaviour.CONVERGED,
@@ -478,6 +508,7 @@ def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
 
 
 def make_cell_result(*errors: float | None) -> BenchCellResult:
+    """Returns the result of a cell with these errors, one for each seed."""
     cell = plan_small_suite().cells[1]
     return BenchCellResult(
         cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
@@ -491,10 +522,12 @@ def test_intervals_over_twenty_seeds_equal_scipys() -> None:
     assert (mean.mean - mean.half, mean.mean + mean.half) == pytest.approx(
         (low, high), rel=1e-12
     )
+
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
     assert make_cell_result(*errors).interval == pytest.approx(
         (share.low, share.high), rel=1e-12
     )
+
     assert make_cell_result(*errors[:19]).interval is None
     assert make_cell_result(*errors[:19]).compute_mean("error_rad") == pytest.approx(
         np.mean(errors[:19]), rel=1e-12
@@ -544,28 +577,32 @@ def test_all_studies_have_gains_within_their_ranges() -> None:
 
 @pytest.mark.long
 def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
+    """The stored gains have the least error of all candidates that also settle at the margin."""
     tuning = tune_laws({"level": ["p_d"]}, 1, budget=4)
     assert [gains.round_trip_ms for gains in tuning] == list(TUNED_ROUND_TRIPS_MS)
+
     settings = format_settings(build_settings("level", "contact", "rtt272"))
     (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
-    places = [
+    by_error = [
         n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED
     ]
-    places.sort(key=lambda n: search.scores[n].error_rad or 0.0)
-    assert (tuning[1].settled, tuning[1].tried) == (len(places), 8)
-    later = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
+    by_error.sort(key=lambda n: search.scores[n].error_rad or 0.0)
+    assert (tuning[1].settled, tuning[1].tried) == (len(by_error), 8)
 
-    def keeps(place: int) -> bool:
-        longer = later.with_gains(SEARCH_SPACES["p_d"], KNOWLEDGE, search.tried[place])
-        return measure_candidate(*longer.texts).outcome is CandidateClass.SETTLED
+    longer_delay = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
 
-    first = next(place for place in places if keeps(place))
-    assert (tuning[1].gains, tuning[1].passed) == (search.tried[first], places.index(first))
-    write_gains(tuning[:2], tmp_path / "gains.json")
-    write_gains(tuning[1:], tmp_path / "gains.json")
-    assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(
-        map(str, tuning)
-    )
+    def settles_at_margin(n: int) -> bool:
+        """Returns True if a candidate also settles with one and a half times the delay."""
+        candidate = longer_delay.with_gains(SEARCH_SPACES["p_d"], KNOWLEDGE, search.tried[n])
+        return measure_candidate(*candidate.texts).outcome is CandidateClass.SETTLED
+
+    best = next(n for n in by_error if settles_at_margin(n))
+    assert (tuning[1].gains, tuning[1].passed) == (search.tried[best], by_error.index(best))
+
+    file = tmp_path / "gains.json"
+    write_gains(tuning[:2], file)
+    write_gains(tuning[1:], file)
+    assert sorted(map(str, read_gains(file).values())) == sorted(map(str, tuning))
     assert find_stale(tuning) == []
 
 
@@ -598,7 +635,7 @@ def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path
         mark = fingerprint_tuning(form, law, round_trip_ms)
         return TunedGains(form, law, round_trip_ms, {"K": 1.0}, 1, 1, 0, 0.1, 1.0, mark)
 
-    def go_on() -> list[TunedGains]:
+    def tune_and_store() -> list[TunedGains]:
         return tune_laws(
             {"level": ["p_d"]},
             known=read_gains(path).values(),
@@ -607,10 +644,11 @@ def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path
 
     monkeypatch.setattr(bench_plan, "_tune_law", tune)
     with pytest.raises(KeyboardInterrupt):
-        go_on()
+        tune_and_store()
     assert len(read_gains(path)) == 2
+
     tuned_names.clear()
-    assert len(go_on()) == 3
+    assert len(tune_and_store()) == 3
     assert tuned_names == [TUNED_ROUND_TRIPS_MS[-1]]
 
 
@@ -683,33 +721,35 @@ def test_impossible_requests_are_refused(more: dict[str, Any], phrase: str) -> N
 
 @pytest.mark.long
 def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path) -> None:
-    first = run_bench(
-        prepare_bench_folder(plan_small_suite(links=["rtt8"]), tmp_path / "one"), jobs=1
-    )
+    """Finished runs are kept if cells are added, and other programs or files are refused."""
+    path = tmp_path / "one"
+    one_link = plan_small_suite(links=["rtt8"])
+    first = run_bench(prepare_bench_folder(one_link, path), jobs=1)
     finished: list[int] = []
-    more = run_bench(
-        prepare_bench_folder(plan_small_suite(), tmp_path / "one"),
+    extended = run_bench(
+        prepare_bench_folder(plan_small_suite(), path),
         jobs=1,
         progress=lambda done, _: finished.append(done),
     )
     assert finished == [2, 3]
-    assert more.runs == whole.runs
-    assert more.runs[0] == first.runs[0]
-    gains = {"K": 20.0, "d": 5.0}
-    cell = plan_small_suite().cells[0]
-    other = cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
-    changed = BenchPlan("round-trips", [other], [])
-    assert (
-        run_bench(prepare_bench_folder(changed, tmp_path / "one"), jobs=1).runs[0]
-        != first.runs[0]
-    )
-    origin = tmp_path / "one" / "origin.json"
+    assert extended.runs == whole.runs
+    assert extended.runs[0] == first.runs[0]
+
+    # a cell with other gains is another cell
+    changed_cell = with_gains(plan_small_suite().cells[0], K=20.0, d=5.0)
+    changed_plan = BenchPlan("round-trips", [changed_cell], [])
+    changed = run_bench(prepare_bench_folder(changed_plan, path), jobs=1)
+    assert changed.runs[0] != first.runs[0]
+
+    origin = path / "origin.json"
     origin.write_text(origin.read_text().replace("numpy", "numpi"))
     with pytest.raises(
         UsageError, match="results from both cannot be mixed: choose another folder with out"
     ):
-        prepare_bench_folder(plan_small_suite(), tmp_path / "one")
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").touch()
+        prepare_bench_folder(plan_small_suite(), path)
+
+    path_with_file = tmp_path / "full"
+    path_with_file.mkdir()
+    (path_with_file / "mine.txt").touch()
     with pytest.raises(UsageError, match="is not empty"):
-        prepare_bench_folder(plan_small_suite(), tmp_path / "full")
+        prepare_bench_folder(plan_small_suite(), path_with_file)

@@ -15,13 +15,16 @@ from trilat_net.analysis.metrics.measures import Metric, quantities
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with logs of `free` and `two_sites`, and with a file that is no log."""
     folder = tmp_path_factory.mktemp("logs")
     quick = ["--set", "rate_hz=100", "--duration"]
     trilat("sim", "free", "-o", "a.mcap", *quick, "2", cwd=folder)
     trilat("sim", "free", "-o", "b.mcap", *quick, "2", "--set", "link.delay_ms=50", cwd=folder)
+
     hanging = ["--set", "control.law=pd_d", "--set", "control.gravity=0"]
     trilat("sim", "free", "-o", "hang.mcap", *quick, "12", *hanging, cwd=folder)
     trilat("sim", "two_sites", "-o", "c.mcap", *quick, "1", cwd=folder)
+
     (folder / "trio.toml").write_text(TRIO)
     (folder / "no.mcap").write_bytes(b"no log")
     return folder
@@ -29,27 +32,26 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_logs_are_compared_under_their_differing_settings(logs: Path) -> None:
     lines = trilat("compare", "a.mcap", "b.mcap", "--all", cwd=logs).succeeds().splitlines()
-    assert next(line.split() for line in lines if "every link" in line)[2:] == [
-        "200",
-        "ms",
-        "50",
-        "ms",
-    ]
+    link_row = next(line.split() for line in lines if "every link" in line)
+    assert link_row[2:] == ["200", "ms", "50", "ms"]
     assert any("RMS spread, undelayed" in line and " rad " in line for line in lines)
     assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
 
 
 def test_short_text_has_verdicts_metrics_and_conclusion(logs: Path) -> None:
+    """The short text has ten of all metrics, each verdict once, and a conclusion."""
     files = ("a.mcap", "b.mcap")
     facts = json.loads(trilat("compare", *files, "--json", cwd=logs).succeeds())
     brief = trilat("compare", *files, cwd=logs).succeeds().splitlines()
     full = trilat("compare", *files, "--all", cwd=logs).succeeds().splitlines()
+
     indented = [line.split("  ")[1].strip() for line in brief if line.startswith("  ")]
     rows = [name for name in indented if name]
     names = [row["name"] for row in facts["rows"]]
     assert len(rows) == 10
     assert rows == [name for name in names if name in rows]
     assert all(any(name in line for line in full) for name in names)
+
     for log, (verdict, *_) in facts["remarks"].items():
         assert sum(f"{log}: {verdict}" in line for line in brief) == 1
     assert brief[-3].startswith(f"in short: a is {verdict.partition(':')[0]} and b is ")
@@ -62,9 +64,11 @@ def test_other_links_bring_the_undelayed_error(logs: Path) -> None:
     (row,) = [row for row in facts["rows"] if row["key"] == "undelayed_max_rad"]
     brief = trilat("compare", "a.mcap", "b.mcap", cwd=logs).succeeds().splitlines()
     assert any(line.strip().startswith(f"{row['name']}  ") for line in brief)
+
     first, second = row["values"]
     clause = f"delay included, a site is at most {first:.3g} rad in a and {second:.3g} rad in b"
     assert clause in brief[-3]
+
     other_law = trilat("compare", "a.mcap", "hang.mcap", cwd=logs).succeeds()
     assert "delay included" not in other_law
 
@@ -99,29 +103,23 @@ def test_json_is_for_programs(logs: Path) -> None:
 
 @pytest.mark.long
 def test_search_reports_time_and_procedure_and_writes_folder(logs: Path) -> None:
-    options = [
-        "--law",
-        "p_d,known",
-        "--budget",
-        "8",
-        "--jobs",
-        "1",
-        "--duration",
-        "12",
-        "--out",
-        "fronts",
-    ]
+    """A tuning prints its cost and its commands, writes four files, and overwrites only by force."""
+    laws_and_budget = ["--law", "p_d,known", "--budget", "8"]
+    options = [*laws_and_budget, "--jobs", "1", "--duration", "12", "--out", "fronts"]
     output = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
     assert "18 runs on 1 core: about " in output
     assert "torques clamped at 60 N m" in output
     assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in output
+
     written = sorted(path.name for path in (logs / "fronts").iterdir())
     assert written == ["front.json", "front.md", "front.pdf", "front.png"]
+
     again = trilat(
         "compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs
     ).succeeds()
     assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
     assert is_documented("compare --tune", json.loads(again))
+
     trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses(
         "fronts: is not empty", "--force"
     )
@@ -158,9 +156,11 @@ def test_bad_input_is_refused_in_one_line(
 
 @pytest.mark.long
 def test_a_shipped_law_is_called_by_its_name(tmp_path: Path) -> None:
+    """Messages about a shipped law name it, and do not call it a user's own law."""
     for law in ("tdpa", "wave", "adaptive"):
         how = ["--set", f"control.law={law}", "--set", "scheme=digital", "--duration", "0.5"]
         trilat("sim", "two_sites", *how, "-o", f"{law}.mcap", cwd=tmp_path).succeeds()
+
     text = trilat("compare", "tdpa.mcap", "wave.mcap", "adaptive.mcap", cwd=tmp_path).succeeds()
     assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(
         text.split()

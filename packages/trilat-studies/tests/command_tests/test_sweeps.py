@@ -15,6 +15,7 @@ OVER = ("--over", "link.delay_ms=0:40:20", "--over", "control.Kd=1:4:1")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scenario and a finished sweep of twelve cells, with its map."""
     path = tmp_path_factory.mktemp("sweeps")
     (path / "trio.toml").write_text(SHORT)
     text = trilat(
@@ -25,16 +26,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_sweep_prints_plan_outcome_and_next_step(folder: Path, tmp_path: Path) -> None:
+    """The verdicts in the text count every run, and each proposed command runs."""
     text = trilat("sweep", folder / "trio.toml", *OVER, "--jobs", "1", cwd=tmp_path).succeeds()
     lines = text.splitlines()
     assert lines[0] == "trio: 12 cells (3 x 4), seed 1"
     assert "  over link.delay_ms=0:40:20: 0, 20, 40" in lines
+
     (verdicts,) = (line for line in lines if line.startswith("12 runs of 12 cells: "))
-    assert sum(int(part.split()[0]) for part in verdicts.partition(": ")[2].split(", ")) == 12
+    counts = [int(part.split()[0]) for part in verdicts.partition(": ")[2].split(", ")]
+    assert sum(counts) == 12
     assert "times real time per process" in text
     # without lines of progress
     assert len(re.findall(r"\d+ runs", text.replace("of 12 runs", ""))) == 1
     assert "results: runs/sweep-trio-001/results.csv" in lines
+
     again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
     assert verdicts in again
     for line in (line for line in again if line.startswith("  trilat sweep ")):
@@ -134,32 +139,25 @@ def test_map_shows_progress_and_fixed_settings(folder: Path) -> None:
 
 @pytest.mark.long
 def test_redrawn_results_are_the_same(folder: Path) -> None:
-    before = {
-        name: (folder / "done" / name).read_bytes() for name in ("map.md", "map.png", "map.svg")
-    }
+    """A map drawn again from its results has the same bytes, and another width changes them."""
+    names = ("map.md", "map.png", "map.svg")
+    before = {name: (folder / "done" / name).read_bytes() for name in names}
     text = trilat("sweep", "done", "--map", "--jobs", "1", cwd=folder).succeeds()
     assert "done/map.png" in text
     for name, data in before.items():
         assert (folder / "done" / name).read_bytes() == data
-    trilat(
-        "sweep", "done/results.csv", "--map", "--width", "7", "--jobs", "1", cwd=folder
-    ).succeeds()
+
+    width = ("--width", "7", "--jobs", "1")
+    trilat("sweep", "done/results.csv", "--map", *width, cwd=folder).succeeds()
     assert (folder / "done" / "map.png").read_bytes() != before["map.png"]
 
 
 @pytest.mark.long
 def test_margins_are_printed_and_kept(folder: Path) -> None:
-    arguments = (
-        "--over",
-        "link.delay_ms=0,40",
-        "--margin",
-        "control.Kd=1:4",
-        "--tolerance",
-        "0.1",
-    )
-    text = trilat(
-        "sweep", "trio.toml", *arguments, "--jobs", "1", "-o", "edges", cwd=folder
-    ).succeeds()
+    """The edges of a gain for two delays appear in the text and in both files."""
+    search = ("--margin", "control.Kd=1:4", "--tolerance", "0.1")
+    arguments = ("--over", "link.delay_ms=0,40", *search, "--jobs", "1", "-o", "edges")
+    text = trilat("sweep", "trio.toml", *arguments, cwd=folder).succeeds()
     assert "edge of Kd (N m s/rad)" in text
     facts = json.loads((folder / "edges" / "margin.json").read_text())
     assert [point["link.delay_ms"] for point in facts["places"]] == [0.0, 40.0]

@@ -35,21 +35,22 @@ def test_met_expectations_exit_0_with_a_table(folder: Path) -> None:
 
 
 def test_failed_expectations_exit_1_with_their_commands(folder: Path) -> None:
-    done = trilat(
-        "test", "./quick.toml", "--seeds", "4,6", "--jobs", "1", *TOO_MUCH, cwd=folder
-    )
+    """A failed trial prints two commands: one repeats the trial, the other writes its log."""
+    options = ("--seeds", "4,6", "--jobs", "1", *TOO_MUCH)
+    done = trilat("test", "./quick.toml", *options, cwd=folder)
     assert done.code == 1, done
     assert done.err == ""
     assert "0/2" in done.out
+    lines = done.out.splitlines()
+
     again = "trilat test ./quick.toml --seeds 6 --set expect.mean_age_max_ms=1.0"
-    assert f"  again: {again}" in done.out.splitlines()
+    assert f"  again: {again}" in lines
     repeated = trilat(*again.split()[1:], cwd=folder)
     assert repeated.code == 1, repeated
-    (figures,) = (line for line in done.out.splitlines() if "seed 6: mean_age_max_ms" in line)
+    (figures,) = (line for line in lines if "seed 6: mean_age_max_ms" in line)
     assert figures in repeated.out
-    (look,) = (
-        line for line in done.out.splitlines() if "trilat sim" in line and "--seed 6" in line
-    )
+
+    (look,) = (line for line in lines if "trilat sim" in line and "--seed 6" in line)
     trilat(*look.split()[2:], cwd=folder).succeeds()
     assert (folder / "quick-seed6.mcap").exists()
 
@@ -88,6 +89,7 @@ def test_bad_input_exits_2_before_any_run(arguments: tuple[str, ...], folder: Pa
 
 
 def test_default_is_every_shipped_scenario_with_expectations() -> None:
+    """Without a name the command runs each shipped scenario that states expectations."""
     from trilat_studies.study_commands import _list_trials
 
     named = [trial.source for trial in _list_trials([], [1, 2], [], live=False)]
@@ -118,10 +120,12 @@ def test_other_texts_name_no_seeds(text: str) -> None:
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_ctrl_c_exits_130_and_leaves_no_process(folder: Path) -> None:
+    """Ctrl-C ends the program and its worker processes without a traceback."""
     (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))
     process = started("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
 
-    def workers() -> list[Path]:
+    def list_workers() -> list[Path]:
+        """Returns the folders in /proc of the program's worker processes."""
         threads = Path(f"/proc/{process.pid}/task").glob("*/children")
         children = [
             Path("/proc", pid) for thread in threads for pid in thread.read_text().split()
@@ -131,12 +135,12 @@ def test_ctrl_c_exits_130_and_leaves_no_process(folder: Path) -> None:
         ]
 
     try:
-        until(lambda: len(workers()) == 2, timeout_s=60)
-        begun = workers()
+        until(lambda: len(list_workers()) == 2, timeout_s=60)
+        workers = list_workers()
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
         assert process.returncode == 130, err
         assert "Traceback" not in err
-        until(lambda: not any(path.exists() for path in begun), timeout_s=20)
+        until(lambda: not any(path.exists() for path in workers), timeout_s=20)
     finally:
         process.kill()

@@ -25,14 +25,14 @@ def judge_by_condition(delay_ms: float, d: float, *_: Any) -> CellClass:
 
 def rows(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> Iterator[Row]:
     """Yields one row per place and seed, judged by a function of its values and its seed."""
-    every = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS} | {
-        key.replace("__", "."): some for key, some in axes.items()
+    values_by_key = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS} | {
+        key.replace("__", "."): axis_values for key, axis_values in axes.items()
     }
-    for number, values in enumerate(product(*every.values())):
+    for number, values in enumerate(product(*values_by_key.values())):
         for seed in range(1, seeds + 1):
             yield {
                 "cell": number,
-                **dict(zip(every, values, strict=True)),
+                **dict(zip(values_by_key, values, strict=True)),
                 "law": "p_d",
                 "seed": seed,
                 "verdict": verdict(*values, seed).value,
@@ -44,5 +44,5 @@ def rows(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> It
 
 def make_plane(verdict: Judge = judge_by_condition, seeds: int = 1, **axes: Any) -> MapPlane:
     """Returns the plane of these rows."""
-    all_rows = list(rows(verdict, seeds, **axes))
-    return build_plane(all_rows, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)
+    rows_of_map = list(rows(verdict, seeds, **axes))
+    return build_plane(rows_of_map, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)

@@ -33,14 +33,17 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
 def test_command_of_cell_gives_its_numbers_bitwise(
     results: SweepResults, tmp_path: Path
 ) -> None:
+    """The log of a cell's command ends as its run did, with the same verdict and errors."""
     assert any(row["diverged_s"] is not None for row in results.rows)
     assert any(row["extended"] for row in results.rows)
+
     for row in results.rows:
         command, note = build_reproduce_command(results, row, tmp_path)
         arguments = shlex.split(command)
         done = trilat(*arguments[1:], cwd=tmp_path)
         outcome = results.outcome(row)
         assert done.code == (0 if outcome.diverged_s is None else 1), done
+
         log = open_log(tmp_path / arguments[-1])
         run_end = RunEnd.of_log(log)
         assert run_end.end_error_rad == outcome.end_error_rad
@@ -48,6 +51,7 @@ def test_command_of_cell_gives_its_numbers_bitwise(
         stability = certify_run(log).stability
         assert outcome.stability == stability
         assert classify_decision(stability, run_end.behaviour) is outcome.verdict
+
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
         ended_s = max(float(log[name].t_s[-1]) for name in log.sites)
@@ -57,6 +61,7 @@ def test_command_of_cell_gives_its_numbers_bitwise(
 
 
 def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: Path) -> None:
+    """If the source has changed or is gone, the command runs the text that the row contains."""
     source = Path(results.plan.written.label)
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
@@ -66,12 +71,14 @@ def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: 
         source.write_text(SHORT)
     assert "has changed since the sweep" in note
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
+
     arguments = shlex.split(command)
     trilat(*arguments[1:], cwd=tmp_path)
     assert (
         RunEnd.of_log(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad
         == row["end_error_rad"]
     )
+
     source.rename(source.with_suffix(".away"))
     assert "or is missing" in build_reproduce_command(results, row, tmp_path)[1]
     source.with_suffix(".away").rename(source)

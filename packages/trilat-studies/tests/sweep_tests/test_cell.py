@@ -28,6 +28,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
 
 
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
+    """The stored difference restores the judged scenario, and only draws make it random."""
     plan = plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=2)
     entry = run_cell(CellItem(plan, plan.cell(5), 2))
     (text,) = judge.texts
@@ -39,13 +40,13 @@ def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -
 
 
 def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Judge) -> None:
-    plan = plan_quick_sweep(
-        tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
-    )
-    run_cell(CellItem(plan, plan.cell(1), 1))
-    arguments = shlex.split(
-        build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap")
-    )
+    """The options of the printed command give the text that was judged."""
+    overrides = ("link.loss=0.1", "duration_s=0.25")
+    plan = plan_quick_sweep(tmp_path, *overrides, laws=["p_d"], over=["link.delay_ms=0,20"])
+    cell = plan.cell(1)
+    run_cell(CellItem(plan, cell, 1))
+    command = build_sim_command(plan, cell.overrides, 1, 0.25, "a b.mcap")
+    arguments = shlex.split(command)
     assert arguments[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
     assert arguments[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
     settings = arguments[3:-6]
@@ -58,12 +59,10 @@ def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
     plan = plan_quick_sweep(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
     task = CellItem(plan, plan.cell(3), 1)
     restored_task = pickle.loads(pickle.dumps(task))
-    assert run_cell(restored_task) == run_cell(task)
-    assert (
-        parse_scenario(apply_diff(run_cell(restored_task).scenario, plan.base.text))
-        .sites["s"]
-        .control.K
-    )
+    entry = run_cell(restored_task)
+    assert entry == run_cell(task)
+    scenario = parse_scenario(apply_diff(entry.scenario, plan.base.text))
+    assert scenario.sites["s"].control.K
 
 
 def test_a_cell_without_valid_scenario_is_refused(tmp_path: Path) -> None:

@@ -61,15 +61,16 @@ def test_every_panel_has_its_own_lines() -> None:
 
 @pytest.mark.long
 def test_lines_depend_on_neither_runs_nor_processes() -> None:
-    everything = results()
-    fewer = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
-    (closed, rooted), (again, other) = (
-        build_stability_map(some, (), jobs).lines[0]
-        for some, jobs in ((everything, 1), (fewer, 2))
+    """Lines from theory stay the same if a run is missing, or if two processes compute them."""
+    all_runs = results()
+    one_run_less = replace(all_runs, rows=[row for row in all_runs.rows if row["cell"] != 7])
+    (closed, rooted), (same_closed, same_rooted) = (
+        build_stability_map(results_of_runs, (), jobs).lines[0]
+        for results_of_runs, jobs in ((all_runs, 1), (one_run_less, 2))
     )
     assert (closed.rank, rooted.rank) == (0, 1)
-    assert np.array_equal(closed.excess, again.excess)
-    assert np.array_equal(rooted.excess, other.excess)
+    assert np.array_equal(closed.excess, same_closed.excess)
+    assert np.array_equal(rooted.excess, same_rooted.excess)
 
 
 def test_short_delays_have_the_condition_as_line() -> None:
@@ -115,10 +116,12 @@ def test_place_of_panel_is_cell_of_plan() -> None:
     rows_by_panel = []
     for law, row in product(("p_d", "pd_d"), rows(link__playout_ms=(0.0, 400.0))):
         rows_by_panel.append({**row, "law": law})
+
     plane = build_stability_map(SweepResults(plan, rows_by_panel), (), linearly=False).plane
     assert [panel.title for panel in plane.panels] == [
         f"{law}, playout {ms} ms" for law in ("p_d", "pd_d") for ms in (0, 400)
     ]
+
     for n in range(0, plan.cells, 7):
         cell = plan.cell(n)
         playout = cell.values[2]
@@ -127,6 +130,7 @@ def test_place_of_panel_is_cell_of_plan() -> None:
             for p in plane.panels
             if p.settings == (("law", cell.law), ("link.playout_ms", playout))
         )
+
         at = make_panel_loader(plan, panel, plane.x.key, plane.y.key)
         delay, damping = cell.values[:2]
         assert isinstance(delay, float)
@@ -150,10 +154,12 @@ P_D = load_scenario("p_d_margin")
 
 
 def at(x: float, y: float) -> Scenario:
+    """Returns P+d with a delay of x ms and the damping y."""
     return load_scenario(P_D, {"link.delay_ms": x, "control.d": y})
 
 
 def spare(excess: float) -> StabilityCriterion:
+    """Returns a criterion that holds with some margin, or fails if it is negative."""
     return StabilityCriterion("", "", "", excess)
 
 
@@ -190,6 +196,8 @@ def test_an_unaffected_condition_has_no_line() -> None:
 
 @given(st.floats(-50.0, 50.0), st.floats(1.0, 3.0), st.sampled_from([-1.0, 1.0]))
 def test_a_condition_holds_without_any_reserve(root: float, power: float, sign: float) -> None:
+    """The edge is found as a zero of the margin, also where the margin's slope is zero."""
+
     def condition(value: float) -> StabilityCriterion:
         gap = value - root
         return spare(sign * float(np.sign(gap)) * abs(gap) ** power)
@@ -209,6 +217,7 @@ def test_whole_number_keys_have_no_points_between() -> None:
 
 
 def grows(growth_per_s: list[float], edges: dict[int, float] | None = None) -> GrowthColumn:
+    """Returns the growth rates of one column of a map."""
     return GrowthColumn(growth_per_s, edges or {}, [])
 
 
@@ -234,6 +243,7 @@ def test_a_column_may_be_crossed_again_and_again() -> None:
 
 @given(st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6), st.sampled_from([-1.0, 1.0]))
 def test_columns_are_crossed_at_edges_however_close(shares: list[float], sign: float) -> None:
+    """A line passes through the exact edge between each two values of different sign."""
     side = PlaneAxis("y", tuple(map(float, range(len(shares) + 1))), "y")
     edges = {n: n + share for n, share in enumerate(shares)}
     column = grows([sign * (-1.0) ** n for n in range(len(shares) + 1)], edges)
@@ -265,6 +275,7 @@ DELAY_MS = st.integers(2, 5000)  # of one tick the sampling asks for more
 
 
 def excess(scenario: Scenario) -> float:
+    """Returns the margin by which a scenario satisfies its stability criterion."""
     criterion = evaluate_criterion(scenario)
     assert criterion is not None
     return criterion.excess
@@ -283,6 +294,7 @@ def test_equal_sites_need_half_stiffness_times_delay(K: float, d: float, delay_m
 def test_the_general_conditions_sign_judges_two_sites(
     K1: float, K2: float, d1: float, d2: float, there_ms: int, back_ms: int
 ) -> None:
+    """Two unlike sites satisfy 4 d1 d2 > (T12 + T21)^2 K1 K2."""
     names = load_scenario("p_d_margin_two").names
     settings: dict[str, Any] = {}
     for name, K, d in zip(names, (K1, K2), (d1, d2), strict=True):
@@ -371,11 +383,13 @@ def test_line_between_few_columns_is_that_of_theory() -> None:
             (0.0, 400.0, 800.0), [round(0.4 * n, 1) for n in range(1, 10)]
         )
     ]
+
     drawn = build_stability_map(SweepResults(plan, cells), (), linearly=False)
     ((line,),) = drawn.lines
     step_ms = np.diff(line.fine_positions).max()
     assert step_ms <= 800.0 / 24 + 1e-9
     assert line.excess.shape == (9, 3)
+
     for row, damping in zip(line.drawn_excess, drawn.plane.y.values, strict=True):
         (n,) = np.flatnonzero(np.diff(row > 0.0))
         crossing_ms = np.interp(0.0, -row[n : n + 2], line.fine_positions[n : n + 2])

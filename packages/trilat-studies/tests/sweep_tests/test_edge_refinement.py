@@ -74,6 +74,8 @@ def refine_all(plan: SweepPlan, side_at: Side) -> tuple[np.ndarray, np.ndarray]:
 def test_both_sides_of_a_rising_edge_run(
     refine: int, x: int, y: int, first: float, slope: float, bend: float, stable_below: bool
 ) -> None:
+    """Neighbours on different sides of a monotone edge are among the refined cells."""
+
     def side_at(i: float, j: float) -> int:
         return int((j < first + slope * x * (i / x) ** bend) == stable_below)
 
@@ -137,6 +139,7 @@ def judge_by_line(text: str, longest_s: float) -> CellResult:
 
 
 def outcome_fields(outcome: CellResult) -> dict[str, object]:
+    """Returns the fields of a result by name."""
     return {name: getattr(outcome, name) for name in outcome.__struct_fields__}
 
 
@@ -152,6 +155,7 @@ def test_an_interrupted_refinement_ends_as_any_other(
     plan = small_plan()._replace(refine=2)
     whole = run_sweep(prepare_sweep_folder(small_plan(), tmp_path / "whole"), 1)
     refined = run_sweep(prepare_sweep_folder(plan, tmp_path / "refined"), 1)
+
     rows_of_whole = {row["cell"]: row for row in whole.results.rows}
     runs = len(refined.results.rows)
     assert 25 < runs < 0.5 * len(rows_of_whole)

@@ -75,6 +75,7 @@ def test_zero_line_is_the_linear_analysis_edge(chart: StabilityMap) -> None:
 
 
 def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> None:
+    """The table of edges has the zero of the exponents beside the interval of the verdicts."""
     table = tabulate_edges(chart.plane, chart.plane.panels[0], chart.lines[0])
     assert table.headers[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
     assert [row[0] for row in table.rows] == ["200", "250"]
@@ -113,6 +114,7 @@ def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
 
 
 def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
+    """A sweep with another kind of judge cannot continue in the folder."""
     verdicts, twins = (
         plan_quick_sweep(tmp_path, judge=judge) for judge in ("verdict", "twins")
     )

@@ -27,6 +27,7 @@ from .quick import DAMPING, SHORT, outcome_of, plan_quick_sweep
 
 
 def refused(path: Path, *overrides: str, **settings: Any) -> str:
+    """Returns the message with which a sweep is refused in a folder."""
     with pytest.raises(UsageError) as error:
         prepare_sweep_folder(plan_quick_sweep(path.parent, *overrides, **settings), path)
     assert error.value.exit_code == 2
@@ -129,6 +130,7 @@ NAME = "the sweep"
 
 
 def entry(cell: int, seed: int = 1) -> CellRun:
+    """Returns a run of a sweep as its journal stores it."""
     return CellRun(
         cell,
         seed,
@@ -141,19 +143,22 @@ def entry(cell: int, seed: int = 1) -> CellRun:
 
 
 def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
+    """Opens the journal of a sweep."""
     return RunJournal(
         path, sweep, CellRun, folders.build_resume_hint("sweep", "--resume", str(path.parent))
     )
 
 
 def write_journal(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:
+    """Appends runs to a journal, and returns the bytes of the file."""
     with opened(path, sweep) as journal:
-        for one in entries:
-            journal.add(one)
+        for run in entries:
+            journal.add(run)
     return path.read_bytes()
 
 
 def read(path: Path, sweep: str = NAME) -> list[CellRun]:
+    """Returns all runs that a journal contains."""
     with opened(path, sweep) as journal:
         return list(journal.done.values())
 
@@ -185,6 +190,7 @@ def test_written_numbers_are_read_back_exactly(path: Path) -> None:
 def test_a_cut_file_keeps_whole_lines_and_grows(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
+    """A journal that ends within a line keeps the lines before, and takes further runs."""
     cut = data.draw(st.integers(0, len(five)))
     path = tmp_path_factory.mktemp("cut") / "j"
     path.write_bytes(five[:cut])
@@ -200,6 +206,7 @@ def test_a_cut_file_keeps_whole_lines_and_grows(
 def test_a_wrong_byte_loses_only_its_line(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
+    """One damaged byte loses its line, or two lines if it was the line feed between them."""
     at = data.draw(st.integers(0, len(five) - 1))
     flipped = data.draw(st.integers(0, 255).filter(lambda byte: byte != five[at]))
     path = tmp_path_factory.mktemp("flip") / "j"
@@ -207,10 +214,9 @@ def test_a_wrong_byte_loses_only_its_line(
     kept = read(path)
     line = five[:at].count(b"\n")
     lost = {line, line + 1} if five[at : at + 1] == b"\n" else {line}
-    assert [kept_entry for kept_entry in FIVE if kept_entry.cell not in lost] == [
-        kept_entry for kept_entry in kept if kept_entry.cell not in lost
-    ]
-    assert all(kept_entry in FIVE for kept_entry in kept)
+    undamaged = [run for run in FIVE if run.cell not in lost]
+    assert [run for run in kept if run.cell not in lost] == undamaged
+    assert all(run in FIVE for run in kept)
 
 
 def test_lines_of_another_sweep_are_ignored(path: Path) -> None:

@@ -9,6 +9,7 @@ from trilat_studies.sweep.sweep_plan import plan_sweep
 
 @given(st.lists(st.integers(1, 4), min_size=1, max_size=4), st.data())
 def test_every_cell_is_in_one_group(sizes: list[int], data: st.DataObject) -> None:
+    """Groups in any partition of the axes contain each cell once."""
     parts = []
     for size in sizes:
         labels = data.draw(st.lists(st.integers(0, 2), min_size=size, max_size=size))
@@ -16,8 +17,10 @@ def test_every_cell_is_in_one_group(sizes: list[int], data: st.DataObject) -> No
         for index, label in enumerate(labels):
             indices_of.setdefault(label, []).append(index)
         parts.append(tuple(map(tuple, indices_of.values())))
+
     groups = CellGroups(("key",), tuple(parts))
     cells = list(groups.iterate_cells(sizes))
+
     total = 1
     for size in sizes:
         total *= size

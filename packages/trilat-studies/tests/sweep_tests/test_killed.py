@@ -15,16 +15,8 @@ from tests.net.waiting import until
 
 from .quick import SHORT
 
-OPTIONS = (
-    "--over",
-    "control.Kd=1:4:0.1",
-    "--over",
-    "link.loss=0,0.1",
-    "--seeds",
-    "2",
-    "--longest",
-    "8",
-)
+AXES = ("--over", "control.Kd=1:4:0.1", "--over", "link.loss=0,0.1")
+OPTIONS = (*AXES, "--seeds", "2", "--longest", "8")
 RUNS = 31 * 3
 LONGER = SHORT.replace("rate_hz = 100", "rate_hz = 500").replace(
     "duration_s = 0.5", "duration_s = 8.0"
@@ -53,7 +45,8 @@ def stopped(folder: Path, number: int, count: int, *arguments: str) -> tuple[int
         start_new_session=True,
     )
     until(lambda: lines(folder / "parts") >= count or process.poll() is not None, 120.0)
-    (os.killpg if number == signal.SIGKILL else os.kill)(process.pid, number)
+    send_signal = os.killpg if number == signal.SIGKILL else os.kill
+    send_signal(process.pid, number)
     err = process.communicate(timeout=120)[1]
     return process.returncode, err
 
@@ -75,9 +68,11 @@ def test_killed_and_interrupted_sweeps_resume_to_equal_bytes(tmp_path: Path) -> 
     (tmp_path / "trio.toml").write_text(LONGER)
     sweep = ("trio.toml", *OPTIONS, "-o")
     trilat("sweep", *sweep, "whole", "--jobs", "1", cwd=tmp_path).succeeds()
+
     parts = tmp_path / "parts"
     code, err = stopped(tmp_path, signal.SIGKILL, 11, *sweep, "parts")
     assert (code, err) == (-signal.SIGKILL, "")
+
     done = lines(parts)
     code, err = stopped(tmp_path, signal.SIGINT, done + 10, "--resume", "parts")
     kept = len(keys(parts / JOURNAL_FILE))
@@ -88,6 +83,7 @@ def test_killed_and_interrupted_sweeps_resume_to_equal_bytes(tmp_path: Path) -> 
     ]
     assert done + 10 <= kept < RUNS
     assert not (parts / "results.csv").exists()
+
     text = trilat("sweep", *sweep, "parts", "--jobs", "2", cwd=tmp_path).succeeds()
     assert f"{kept} runs are done already" in text
     assert (parts / "results.csv").read_bytes() == (tmp_path / "whole/results.csv").read_bytes()

@@ -38,17 +38,20 @@ def test_linear_cells_have_the_known_edge(
     plan = plan_sweep("p_d_margin", over=AXES, judge="linear")
     results = run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results
     assert read_results(tmp_path / "o").rows == results.rows
+
     chart = build_stability_map(results, (), 1)
     (panel,) = chart.plane.panels
     assert chart.plane.is_linear
     assert chart.lines[0][0].text == ZERO_RATE
+
     edges = find_map_edges(chart.plane, panel)
     assert len(edges) == 3
     for delay_ms, edge in edges:
         scenario = load_scenario("p_d_margin", {"link.delay_ms": delay_ms})
-        (known,) = iterate_linear_edges(scenario, "control.d", 0.4, 2.4, points=8)
-        assert edge.low <= known.value <= edge.high
-        assert edge.stable_below is not known.stable_above
+        (linear_edge,) = iterate_linear_edges(scenario, "control.d", 0.4, 2.4, points=8)
+        assert edge.low <= linear_edge.value <= edge.high
+        assert edge.stable_below is not linear_edge.stable_above
+
     for row in results.rows:
         assert row["rests_on"].startswith("characteristic roots")
         assert (row["exponent_per_s"] > 0.0) == (row["verdict"] == "diverged")

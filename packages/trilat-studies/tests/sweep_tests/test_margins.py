@@ -31,6 +31,7 @@ WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
 
 
 def plan_margin_sweep(*over: str, **settings: object) -> SweepPlan:
+    """Returns the plan of a search along the damping, at each delay if no axis is given."""
     axes = over or ("link.delay_ms=100,200",)
     return plan_sweep("p_d_margin", over=[*axes, format_range_axis(WITHIN)], **settings)  # type: ignore[arg-type]
 
@@ -100,6 +101,7 @@ def test_whole_number_keys_are_searched_in_integers() -> None:
 
 
 def make_point_margin(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
+    """Returns the result of a search at 100 ms with these edges."""
     cell = plan_margin_sweep().cell(0)
     return GridPointMargin(
         cell._replace(values=(100.0,)), 1, KeyMargin(spans, stable, 0, 12), (0.5, 2.0), "", 0.51
@@ -107,6 +109,7 @@ def make_point_margin(*spans: StabilityEdge, stable: bool | None = None) -> Grid
 
 
 def test_table_shows_edges_islands_and_missing_edges() -> None:
+    """Each edge has a row beside its linear edge, and a search without edges says why."""
     edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
     points = [
         make_point_margin(*edges),
@@ -114,6 +117,7 @@ def test_table_shows_edges_islands_and_missing_edges() -> None:
         make_point_margin(stable=False),
         make_point_margin(),
     ]
+
     grid = SweepMargins(plan_margin_sweep(), WITHIN, points).table()
     edge = grid.headers.index("edge of d (N m s/rad)")
     assert [row[edge] for row in grid.rows] == [
@@ -124,13 +128,13 @@ def test_table_shows_edges_islands_and_missing_edges() -> None:
         "none: nothing decided",
     ]
     assert [row[edge + 1] for row in grid.rows] == ["above", "below", "-", "-", "-"]
+
     linear = grid.headers.index("linear")
     assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
-    assert (
-        "not monotone at 1 of 2 grid points"
-        in SweepMargins(plan_margin_sweep(), WITHIN, points[:2]).page()
-    )
+
+    page = SweepMargins(plan_margin_sweep(), WITHIN, points[:2]).page()
+    assert "not monotone at 1 of 2 grid points" in page
 
 
 def test_the_facts_are_json_and_name_the_command() -> None:
@@ -171,6 +175,7 @@ def test_a_range_is_read_as_written() -> None:
 def test_an_edge_is_enclosed_to_the_tolerance(
     edge: float, above: bool, tolerance: float
 ) -> None:
+    """The search encloses a sharp edge, runs no value twice, and needs few runs."""
     values = []
 
     def stable(value: float) -> bool:
@@ -184,15 +189,17 @@ def test_an_edge_is_enclosed_to_the_tolerance(
     assert span.stable_below is not above
     assert span.sharp
     assert margin.runs == len(values) == len(set(values))
-    assert margin.runs <= SCAN_POINTS + 1 + math.log2(
-        2.8 / (SCAN_POINTS - 1) / (0.2 * tolerance)
-    )
+    scan_step = 2.8 / (SCAN_POINTS - 1)
+    most_bisections = 1 + math.log2(scan_step / (0.2 * tolerance))
+    assert margin.runs <= SCAN_POINTS + most_bisections
 
 
 @given(st.floats(0.35, 2.8), st.floats(0.001, 0.1), st.booleans())
 def test_an_undecided_part_is_the_reported_interval(
     edge: float, width: float, above: bool
 ) -> None:
+    """An edge is as wide as the values around it at which runs stay undecided."""
+
     def stable(value: float) -> bool | None:
         return None if abs(value - edge) < width else (value > edge) is above
 

@@ -74,29 +74,17 @@ def test_seeds_give_a_metric_its_mean_and_interval(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
     places = pandas.read_csv(tmp_path / "o" / "places.csv")
     rows = pandas.read_csv(tmp_path / "o" / "results.csv")
-    last = rows[rows["cell"] == 1]["spread_rms_rad"]
-    assert places["spread_rms_rad_mean"][1] == pytest.approx(last.mean(), rel=1e-12)
+    spreads_rad = rows[rows["cell"] == 1]["spread_rms_rad"]
+    assert places["spread_rms_rad_mean"][1] == pytest.approx(spreads_rad.mean(), rel=1e-12)
     assert places["spread_rms_rad_half"][1] > 0.0
 
 
 def test_unknown_metrics_are_refused_with_the_nearest(tmp_path: Path) -> None:
-    done = trilat(
-        "sweep",
-        "two_sites",
-        "--over",
-        "link.delay_ms=20,200",
-        "--metric",
-        "settle",
-        cwd=tmp_path,
-    )
+    """A misspelt metric and a metric of a search are refused with what is possible."""
+    misspelt = ("--over", "link.delay_ms=20,200", "--metric", "settle")
+    done = trilat("sweep", "two_sites", *misspelt, cwd=tmp_path)
     done.refuses("--metric", "settle", "settle_s", "docs/reference/metrics.md")
-    done = trilat(
-        "sweep",
-        "two_sites",
-        "--margin",
-        "control.d=0.1:3",
-        "--metric",
-        "settle_s",
-        cwd=tmp_path,
-    )
+
+    of_search = ("--margin", "control.d=0.1:3", "--metric", "settle_s")
+    done = trilat("sweep", "two_sites", *of_search, cwd=tmp_path)
     done.refuses("--metric applies only to a sweep")

@@ -52,10 +52,12 @@ def test_folder_has_a_picture_vector_and_page(chart: StabilityMap, tmp_path: Pat
 
 @pytest.mark.long
 def test_equal_results_give_equal_bytes(chart: StabilityMap, tmp_path: Path) -> None:
-    again = tmp_path / "again"
-    again.mkdir()
-    for one, other in zip(write_map(chart, tmp_path), write_map(chart, again), strict=True):
-        assert one.read_bytes() == other.read_bytes()
+    other_folder = tmp_path / "again"
+    other_folder.mkdir()
+    for file, same_file in zip(
+        write_map(chart, tmp_path), write_map(chart, other_folder), strict=True
+    ):
+        assert file.read_bytes() == same_file.read_bytes()
 
 
 def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
@@ -74,23 +76,19 @@ def test_counts_are_of_all_runs() -> None:
 
 
 def test_an_edge_stands_beside_each_lines_difference() -> None:
+    """A row has the measured edge, then each line's edge and its distance from the middle."""
     plane = make_plane()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
-    heads = [
-        "delay (ms)",
-        "edge of d (N m s/rad)",
-        "stable is",
-        "d = 5 T",
-        "difference",
-        "half of it",
-    ]
-    assert table.headers == (*heads, "difference")
+    measured_heads = ("delay (ms)", "edge of d (N m s/rad)", "stable is")
+    line_heads = ("d = 5 T", "difference", "half of it", "difference")
+    assert table.headers == (*measured_heads, *line_heads)
     assert [row[0] for row in table.rows] == ["100", "200", "300", "400"]
     for row in table.rows:
         low, high = map(float, row[1].split(" to "))
         assert row[2] == "above"
         assert low <= float(row[3]) <= high
         assert row[4] == "within"
+
         half, middle = 2.5e-3 * float(row[0]), 0.5 * (low + high)
         expected = "within" if low <= half <= high else f"{100 * (half / middle - 1):+.1f} %"
         assert row[6] == expected
@@ -113,21 +111,24 @@ LINE = MapLine("$d$", "d", "", SPARE, 0)
 
 
 def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = ()) -> Figure:
+    """Draws the map of a plane, with the same lines in each panel."""
     return draw_stability_map(
         plane, [lines] * len(plane.panels), FigureSize.for_print(width_in)
     )
 
 
-def meshes(made: Figure) -> list[QuadMesh]:
+def meshes(figure_of_map: Figure) -> list[QuadMesh]:
+    """Returns the coloured grids of a figure, one for each panel."""
     return [
         collection
-        for axes in made.axes
+        for axes in figure_of_map.axes
         for collection in axes.collections
         if isinstance(collection, QuadMesh)
     ]
 
 
 def every(*point: Any) -> CellClass:
+    """Returns a verdict for each place, so that all verdicts occur."""
     return CELL_CLASSES[(DELAYS_MS.index(point[0]) + DAMPINGS.index(point[1])) % 4]
 
 
@@ -161,6 +162,7 @@ def test_classes_differ_in_lightness() -> None:
 
 
 def test_lines_are_drawn_where_they_are_and_named() -> None:
+    """Two lines along d = 5 T are straight, differ in their style, and are in the legend."""
     figure_of_lines = figure(
         make_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1))
     )
@@ -169,11 +171,13 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
         for collection in figure_of_lines.axes[0].collections
         if isinstance(collection, QuadContourSet)
     )
+
     for line in (first, second):
         ends = np.concatenate([path.vertices for path in line.get_paths()])
         assert np.allclose(ends[:, 1], 5e-3 * ends[:, 0])
         assert ends[:, 1].max() - ends[:, 1].min() > 2.0
     assert first.get_linestyle() != second.get_linestyle()
+
     (legend,) = figure_of_lines.legends
     label_texts = [text.get_text() for text in legend.get_texts()]
     assert label_texts == ["converged", "bounded oscillation", "$d$", "linear analysis"]
@@ -185,12 +189,14 @@ def test_the_legend_has_only_occurring_classes() -> None:
 
 
 def test_several_runs_show_their_share_with_a_scale() -> None:
+    """A cell has the colour of its share, and a count if its seeds disagree."""
     plane = make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4)
     figure_of_runs = figure(plane, 7.0)
     share = meshes(figure_of_runs)[0].get_array()
     assert share is not None
     assert np.allclose(np.ma.getdata(share), plane.panels[0].share)
     assert "share of stable runs" in [axes.get_ylabel() for axes in figure_of_runs.axes]
+
     texts = {text.get_text() for text in figure_of_runs.axes[0].texts}
     assert texts
     for i, j in np.argwhere((plane.panels[0].share > 0.0) & (plane.panels[0].share < 1.0)):
@@ -250,6 +256,7 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 @pytest.mark.parametrize("panels", [(0.0,), (0.0, 400.0)])
 @pytest.mark.parametrize("width_in", [3.5, 7.0])
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
+    """The gains below the panels stand apart from every label and inside the figure."""
     plane = make_plane(link__playout_ms=panels)
     figure = draw_stability_map(
         plane, [()] * len(plane.panels), FigureSize.for_print(width_in), FIXED
@@ -258,6 +265,7 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
     (caption,) = figure.texts[:1]
     box = caption.get_window_extent()
     assert box.x1 <= figure.bbox.width
+
     others = [axes.get_tightbbox() for axes in figure.axes]
     others += [text.get_window_extent() for text in figure.texts[1:]]
     for text in (figure._supxlabel, figure._supylabel):  # type: ignore[attr-defined]
@@ -265,6 +273,7 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
     for other in others:
         assert other is not None
         assert not box.overlaps(other)
+
     caption_text = " ".join(caption.get_text().split())
     assert caption_text.startswith(f"not swept: {'; '.join(FIXED)}")
     assert "trilat compare --tune" in caption_text

@@ -25,18 +25,21 @@ from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, judge_by_condition, make_plane
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
 def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> None:
+    """A cell of the map counts the verdicts of its own runs, in any order of the rows."""
     random = np.random.default_rng(chance)
     shuffled_rows = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
     plane = build_plane([shuffled_rows[n] for n in order], KEYS, P_D)
     (panel,) = plane.panels
     assert panel.counts.sum() == 50
-    for row in shuffled_rows:
-        i, j = DAMPINGS.index(row[KEYS[1]]), DELAYS_MS.index(row[KEYS[0]])
-        same = [
-            r for r in shuffled_rows if (r[KEYS[0]], r[KEYS[1]]) == (row[KEYS[0]], row[KEYS[1]])
-        ]
-        for n, verdict in enumerate(CELL_CLASSES):
-            assert panel.counts[i, j, n] == sum(r["verdict"] == verdict for r in same)
+    for i, damping in enumerate(DAMPINGS):
+        for j, delay_ms in enumerate(DELAYS_MS):
+            verdicts = [
+                row["verdict"]
+                for row in shuffled_rows
+                if (row[KEYS[0]], row[KEYS[1]]) == (delay_ms, damping)
+            ]
+            expected = [verdicts.count(verdict.value) for verdict in CELL_CLASSES]
+            assert panel.counts[i, j].tolist() == expected
 
 
 def test_the_share_is_of_decided_runs() -> None:
@@ -128,18 +131,16 @@ def test_the_condition_lies_in_its_own_edges() -> None:
 def test_edges_separate_all_decided_places(column: tuple[CellClass, ...]) -> None:
     """From below, the side changes at every edge and nowhere else."""
     edges = list_column_edges(column)
-    side = [verdict.stable for verdict in column]
-    decided = [
-        (d, is_stable)
-        for d, is_stable in zip(DAMPINGS, side, strict=True)
-        if is_stable is not None
-    ]
+    stable_at = {d: verdict.stable for d, verdict in zip(DAMPINGS, column, strict=True)}
+    decided = [d for d, is_stable in stable_at.items() if is_stable is not None]
     changes = [
-        (a, b) for (a, one), (b, other) in itertools.pairwise(decided) if one is not other
+        (lower, upper)
+        for lower, upper in itertools.pairwise(decided)
+        if stable_at[lower] is not stable_at[upper]
     ]
     assert [(edge.low, edge.high) for edge in edges] == changes
     for edge in edges:
-        assert edge.stable_below is (side[DAMPINGS.index(edge.low)])
+        assert edge.stable_below is stable_at[edge.low]
 
 
 def test_undecided_places_widen_an_edge() -> None:

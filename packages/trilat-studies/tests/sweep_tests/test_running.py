@@ -52,23 +52,27 @@ class _StopError(Exception):
 
 
 def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> None:
+    """A sweep that is interrupted four times runs each cell once and writes the same table."""
     sweep = plan_quick_sweep(tmp_path, "link.loss=0.2", seeds=2)
     run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1)
     whole = (tmp_path / "whole" / RESULTS_FILE).read_bytes()
+
     texts = judge.texts.copy()
     assert len(texts) == 24
     judge.texts.clear()
+
     folder = prepare_sweep_folder(sweep, tmp_path / "parts")
     for stop in (1, 2, 7, 20):
 
-        def stopped(done: int, _total: int, stop: int = stop) -> None:
+        def interrupt(done: int, _total: int, stop: int = stop) -> None:
             if done >= stop:
                 raise _StopError
 
         with pytest.raises(_StopError):
-            run_sweep(folder, 1, stopped)
+            run_sweep(folder, 1, interrupt)
         assert not (folder.path / RESULTS_FILE).exists()
         folder = open_sweep_folder(folder.path)
+
     swept = run_sweep(folder, 1)
     assert (folder.path / RESULTS_FILE).read_bytes() == whole
     assert Counter(judge.texts) == Counter(texts)
@@ -78,6 +82,7 @@ def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> Non
 
 
 def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> None:
+    """Cells without drawn numbers run one seed, and the progress counts further seeds later."""
     progress: list[tuple[int, int]] = []
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
     rows = run_sweep(
@@ -91,6 +96,7 @@ def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> Non
 
 
 def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> None:
+    """The runs that measured the time of a sweep are among its results."""
     sweep = plan_quick_sweep(tmp_path)
     expected = estimate_sweep(sweep, jobs=1)
     assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
@@ -114,10 +120,9 @@ def test_an_estimate_counts_seeds_of_random_links(tmp_path: Path, judge: Judge) 
 def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
     over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
     sweep = plan_sweep("p_d_margin", over=over)
+    estimate = estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0)
     with pytest.raises(UsageError) as error:
-        refuse_oversized_sweep(
-            sweep, estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0), jobs=2
-        )
+        refuse_oversized_sweep(sweep, estimate, jobs=2)
     assert error.value.exit_code == 2
     for word in (
         "2000000 cells (10000 x 200)",
@@ -126,6 +131,7 @@ def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
         "with yes",
     ):
         assert word in str(error.value)
+
     many = DurationEstimate(1_000_001, 60.0, [])
     with pytest.raises(UsageError, match="would take about 60 s"):
         refuse_oversized_sweep(sweep, many)
@@ -162,11 +168,13 @@ def test_a_full_disk_names_the_finished_runs(tmp_path: Path, judge: Judge) -> No
             run_sweep(folder, 1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
     finished = len(folder.read_done())
     assert 0 < finished < 12
     assert f"{finished} of 12 runs had finished" in str(error.value)
     assert "make room, and continue with: trilat sweep --resume" in str(error.value)
     assert not (folder.path / RESULTS_FILE).exists()
+
     judge.texts.clear()
     results = run_sweep(folder, 1).results
     assert (len(results.rows), len(judge.texts)) == (12, 12 - finished)
@@ -206,9 +214,11 @@ def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
 def test_a_summary_counts_every_run_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The first line counts the runs of each verdict, and further lines say what stands out."""
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
     results = run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
+
     first, *others = summarize_sweep(results)
     assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")
     counts = [int(part.split()[0]) for part in first.partition(": ")[2].split(", ")]
@@ -216,6 +226,7 @@ def test_a_summary_counts_every_run_once(
         sum(row["verdict"] == verdict for row in results.rows) for verdict in RUN_CLASSES
     ]
     assert sum(counts) == len(results.rows)
+
     text = "\n".join(others)
     assert "undecided after 0.5 s and continued, the longest to 4 s" in text
     assert "in 1 cell nothing is random: one seed was run there" in text

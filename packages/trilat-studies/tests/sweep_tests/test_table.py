@@ -71,8 +71,10 @@ def test_the_read_runs_are_the_written_ones(
 def test_a_large_table_stays_in_its_file(
     finished_sweep: tuple[Path, SweepResults, Judge], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Rows that are read from the file on demand equal those in memory."""
     path, results, _ = finished_sweep
     monkeypatch.setattr(result_table, "ROWS_IN_MEMORY", 3)
+
     stored = read_results(path)
     assert isinstance(stored.rows, result_table.StoredRows)
     assert stored.rows == results.rows
@@ -81,6 +83,7 @@ def test_a_large_table_stays_in_its_file(
         results.rows[n] for n in range(-1, len(results.rows))
     ]
     assert stored.rows[2:5] == results.rows[2:5]
+
     assert stored.of_cell(3) == results.of_cell(3)
     assert list(stored.blocks()) == list(results.blocks())
     assert collect_grid_points(stored) == collect_grid_points(results)
@@ -91,6 +94,7 @@ def test_a_large_table_stays_in_its_file(
 def test_rows_are_ordered_by_cells_and_seeds(
     finished_sweep: tuple[Path, SweepResults, Judge],
 ) -> None:
+    """Rows follow the numbers of cells, with two seeds for cells that draw numbers."""
     _, results, _ = finished_sweep
     assert [(row["cell"], row["seed"]) for row in results.rows] == [
         (cell, seed) for cell in range(8) for seed in ((1, 2) if cell % 4 >= 2 else (1,))
@@ -178,28 +182,22 @@ def test_a_very_long_scenario_is_read_back(
 
 @pytest.mark.long
 def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
+    """Differences to the base keep the table of a large sweep below 10 MB."""
     sweep = plan_sweep("p_d_margin", over=["link.delay_ms=0:1980:20", "control.d=0.2:10.1:0.1"])
     base = sweep.base.text
     entries = []
     for number in range(sweep.cells):
         delay, damping = sweep.cell(number).values
-        text = base.replace("delay_ms = 200.0", f"delay_ms = {delay}").replace(
-            "1.1", f"{damping}"
-        )
-        entries.append(
-            CellRun(
-                number,
-                1,
-                False,
-                "p_d",
-                f"{number:064x}",
-                diff_lines(text, base),
-                outcome_of(text),
-            )
-        )
+        text = base.replace("delay_ms = 200.0", f"delay_ms = {delay}")
+        text = text.replace("1.1", f"{damping}")
+        digest = f"{number:064x}"
+        parts = diff_lines(text, base)
+        entries.append(CellRun(number, 1, False, "p_d", digest, parts, outcome_of(text)))
+
     table = encode_results(sweep, build_result_rows(sweep, entries))
     assert len(entries) == 10_000
     assert len(table) < 10e6
+
     (tmp_path / "results.csv").write_text(table)
     (tmp_path / "plan.json").write_text(json.dumps(sweep.facts()))
     assert read_results(tmp_path).rows[1234]["scenario"].count("delay_ms = 240.0") == 6
@@ -209,11 +207,11 @@ def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
     sweep = plan_quick_sweep(tmp_path, over=[DELAYS])
     outcomes = [outcome_of(str(n)) for n in range(100)]
     for outcome in outcomes:
-        lasts_s = reproduction_duration_s(sweep, outcome)
+        duration_s = reproduction_duration_s(sweep, outcome)
         if outcome.diverged_s is None:
-            assert lasts_s == outcome.ran_s
+            assert duration_s == outcome.ran_s
         else:
-            assert lasts_s == min(4.0, 0.5 * 2.0**outcome.extended) > outcome.diverged_s
+            assert duration_s == min(4.0, 0.5 * 2.0**outcome.extended) > outcome.diverged_s
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
@@ -257,6 +255,7 @@ def test_a_damaged_table_is_refused(
 
 @pytest.fixture
 def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
+    """The grid points of a sweep in which twelve seeds of random cells are judged by chance."""
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
     return collect_grid_points(

@@ -36,25 +36,26 @@ SHORT = {"duration_s": 2.5, "rate_hz": 500, "link.delay_ms": 20.0}
 
 
 def scenario(**changes: Any) -> Scenario:
+    """Returns a short run of `free`, with some settings replaced."""
     return load_scenario("free", {**SHORT, **changes})
 
 
 def agree(metrics: RunMetrics, other: RunMetrics) -> None:
     """Asserts that figures are equal but for the last bits of means."""
     for field in RunMetrics.__struct_fields__:
-        a, b = getattr(metrics, field), getattr(other, field)
+        value, expected = getattr(metrics, field), getattr(other, field)
         if field == "rms_error_rad":
-            assert a == pytest.approx(b, rel=1e-12)
+            assert value == pytest.approx(expected, rel=1e-12)
         elif field == "ages":
-            assert a.keys() == b.keys()
-            for link in a:
-                assert a[link].max_ms == b[link].max_ms
-                assert (a[link].mean_ms is None) == (b[link].mean_ms is None)
-                assert a[link].mean_ms is None or a[link].mean_ms == pytest.approx(
-                    b[link].mean_ms
+            assert value.keys() == expected.keys()
+            for link in value:
+                assert value[link].max_ms == expected[link].max_ms
+                assert (value[link].mean_ms is None) == (expected[link].mean_ms is None)
+                assert value[link].mean_ms is None or value[link].mean_ms == pytest.approx(
+                    expected[link].mean_ms
                 )
         else:
-            assert a == b, field
+            assert value == expected, field
 
 
 @pytest.mark.parametrize(
@@ -70,24 +71,29 @@ def agree(metrics: RunMetrics, other: RunMetrics) -> None:
 )
 def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None:
     assert scenario().ticks("m1") > BATCH_RECORDS
-    chosen = scenario(**changes)
-    agree(measure_virtual_run(chosen), measure_log(trilat_net.simulate(chosen)))
+    changed_scenario = scenario(**changes)
+    log = trilat_net.simulate(changed_scenario)
+    agree(measure_virtual_run(changed_scenario), measure_log(log))
 
 
 def test_figures_follow_their_definitions() -> None:
-    chosen = scenario(**{"expect.synchronised_rad": 0.3})
-    figures, log = measure_virtual_run(chosen), trilat_net.simulate(chosen)
+    """Errors, spread, poses and times of a run follow from the arrays of its log."""
+    chosen_scenario = scenario(**{"expect.synchronised_rad": 0.3})
+    figures, log = measure_virtual_run(chosen_scenario), trilat_net.simulate(chosen_scenario)
     errors = {name: np.abs(log[name].e) for name in log.sites}
     end = log["m1"].t_s > log["m1"].t_s[-1] - 1.0
     poses = np.array([log[name].q[end] for name in log.sites])
+
     assert figures.simulated_s == 2.5
     assert figures.peak_error_rad == max(e.max() for e in errors.values())
     assert figures.end_error_rad == max(e[end].max() for e in errors.values())
     assert figures.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
     assert figures.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
+
     times_s = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
     assert 0.0 < max(times_s) < 2.4
     assert figures.synchronised_at_s == max(times_s)
+
     assert figures.ages["m1->s"].mean_ms == figures.ages["m1->s"].max_ms == 20.0
     assert (figures.late_samples, figures.missing, figures.end.diverged_at_s) == (0, 0, None)
 
@@ -144,18 +150,20 @@ def records(seed: int) -> RecordBatch:
 
 
 def tallied(rows: RecordBatch, cuts: list[int]) -> SiteStats:
-    tally = SiteStats(HEARD, "s")
-    edges = [0, *sorted(cuts), TALLIED]
-    for first, last in pairwise(edges):
-        tally.add(RecordBatch(*(part[first:last] for part in rows)))
-    return tally
+    """Returns the statistics of a site over records that come in batches cut at some rows."""
+    site_stats = SiteStats(HEARD, "s")
+    batch_edges = [0, *sorted(cuts), TALLIED]
+    for first, last in pairwise(batch_edges):
+        site_stats.add(RecordBatch(*(column[first:last] for column in rows)))
+    return site_stats
 
 
 @given(seed=st.integers(0, 1000), cuts=st.lists(st.integers(0, TALLIED), max_size=12))
 def test_blocks_change_no_statistics_of_a_site(seed: int, cuts: list[int]) -> None:
+    """Statistics over batches of any sizes equal those over one batch."""
     rows = records(seed)
     cut, whole = tallied(rows, cuts), tallied(rows, [])
-    for figure in (
+    for name in (
         "records",
         "peak_error_rad",
         "peak_torque_nm",
@@ -163,34 +171,43 @@ def test_blocks_change_no_statistics_of_a_site(seed: int, cuts: list[int]) -> No
         "unsynchronised_ns",
         "last_ns",
     ):
-        assert getattr(cut, figure) == getattr(whole, figure)
+        assert getattr(cut, name) == getattr(whole, name)
+
     assert cut.age_max_ms.tolist() == whole.age_max_ms.tolist()
     assert cut.buckets.tolist() == whole.buckets.tolist()
     assert cut.rms_error_rad == pytest.approx(whole.rms_error_rad)
-    for one, other in zip(cut.link_ages, whole.link_ages, strict=True):
-        assert one.mean_ms == pytest.approx(other.mean_ms)
+    for age, age_of_whole in zip(cut.link_ages, whole.link_ages, strict=True):
+        assert age.mean_ms == pytest.approx(age_of_whole.mean_ms)
+
     end, end_of_whole = cut.end(cut.last_ns), whole.end(whole.last_ns)
-    assert all(np.array_equal(a, b) for a, b in zip(end, end_of_whole, strict=True))
+    assert all(
+        np.array_equal(column, column_of_whole)
+        for column, column_of_whole in zip(end, end_of_whole, strict=True)
+    )
 
 
 @given(seed=st.integers(0, 1000))
 def test_site_statistics_count_all_records(seed: int) -> None:
+    """Peaks, means, ages and the intervals of 50 ms follow from all records of a site."""
     rows = records(seed)
-    tally = tallied(rows, [37, 38, 290])
+    site_stats = tallied(rows, [37, 38, 290])
     error = np.abs(rows.e)
-    assert tally.peak_error_rad == error.max()
-    assert tally.peak_torque_nm == np.abs(rows.tau).max()
-    assert tally.peak_speed_rad_s == np.abs(rows.qd).max()
-    assert tally.rms_error_rad == pytest.approx(
+    assert site_stats.peak_error_rad == error.max()
+    assert site_stats.peak_torque_nm == np.abs(rows.tau).max()
+    assert site_stats.peak_speed_rad_s == np.abs(rows.qd).max()
+    assert site_stats.rms_error_rad == pytest.approx(
         max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1))
     )
+
     times_ns = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
-    assert tally.unsynchronised_ns == (times_ns[-1] if times_ns else -1)
-    assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
+    assert site_stats.unsynchronised_ns == (times_ns[-1] if times_ns else -1)
+    assert site_stats.end(site_stats.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
+
     ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
-    assert tally.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
-    assert tally.age_max_ms[1] == pytest.approx(max(ages))
-    for bucket, row in enumerate(tally.buckets):
+    assert site_stats.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
+    assert site_stats.age_max_ms[1] == pytest.approx(max(ages))
+
+    for bucket, row in enumerate(site_stats.buckets):
         inside = rows.t_ns // BUCKET_NS == bucket
         peaks = (
             error[inside].max(axis=0),
@@ -201,11 +218,11 @@ def test_site_statistics_count_all_records(seed: int) -> None:
 
 
 def test_memory_does_not_grow_with_the_records() -> None:
-    tally, block = SiteStats(HEARD, "s"), records(1)
+    site_stats, block = SiteStats(HEARD, "s"), records(1)
     for n in range(30):
-        tally.add(block._replace(t_ns=block.t_ns + n * TALLIED * PERIOD_NS))
-    assert len(tally.end(0).t_ns) <= 2 * TALLIED
-    assert len(tally.end(tally.last_ns).t_ns) == 100
+        site_stats.add(block._replace(t_ns=block.t_ns + n * TALLIED * PERIOD_NS))
+    assert len(site_stats.end(0).t_ns) <= 2 * TALLIED
+    assert len(site_stats.end(site_stats.last_ns).t_ns) == 100
 
 
 def test_site_link_without_samples_has_no_age() -> None:
@@ -218,9 +235,9 @@ def test_site_link_without_samples_has_no_age() -> None:
 def test_a_bucket_without_records_is_marked() -> None:
     rows = records(1)
     keep = (rows.t_ns // BUCKET_NS) != 7
-    tally = SiteStats(HEARD, "s")
-    tally.add(RecordBatch(*(part[keep] for part in rows)))
-    assert [n for n, row in enumerate(tally.buckets) if row[0] < 0] == [7]
+    site_stats = SiteStats(HEARD, "s")
+    site_stats.add(RecordBatch(*(column[keep] for column in rows)))
+    assert [n for n, row in enumerate(site_stats.buckets) if row[0] < 0] == [7]
 
 
 WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}
@@ -236,6 +253,7 @@ RECORDS = 200
 
 
 def windowed(**changes: Any) -> Scenario:
+    """Returns `contact` with a push against the wall, and with limits on a window of time."""
     window = {"from_s": 0.5, "to_s": 1.5, "site": "s", **ASKED}
     return load_scenario("contact", {**CHANGES, "expect": {"windows": [window]}, **changes})
 
@@ -256,6 +274,7 @@ def rows(seed: int) -> RecordBatch:
 
 
 def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
+    """Returns the ranges in a window over records that come in batches cut at some rows."""
     scenario = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100})
     window_stats = WindowStats(
         ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s"
@@ -298,8 +317,9 @@ def test_window_quantities_follow_their_definitions(log: Log) -> None:
     for k, q in enumerate(site.q):
         J = np.array(end_effector_jacobian(np.ones(2), q))
         force[k] = -np.linalg.solve(J.T, -site.tau_x[k])[0]
+
     push, force = -site.tau_x[inside], force[inside]
-    wanted = {
+    expected = {
         "error_peak_rad": np.abs(site.e[inside]).max(),
         "speed_peak_rad_s": np.abs(site.qd[inside]).max(),
         "torque_peak_nm": np.abs(site.tau[inside]).max(),
@@ -310,8 +330,9 @@ def test_window_quantities_follow_their_definitions(log: Log) -> None:
         "wall_peak_n": force.max(),
         "wall_hits": np.sum((force[1:] > 1e-9) & (force[:-1] <= 1e-9)),
     }
-    assert wanted["wall_hits"] >= 1
-    assert {key: window[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
+
+    assert expected["wall_hits"] >= 1
+    assert {key: window[key].least for key in expected} == pytest.approx(expected, abs=1e-9)
     for joint, key in enumerate(("q1_rad", "q2_rad")):
         assert window[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
 
@@ -331,6 +352,7 @@ def test_a_window_of_all_sites_has_the_largest(log: Log) -> None:
         "torque_peak_nm": [0.0, 1.0],
     }
     (window,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
+
     inside = {name: (log[name].t_s >= 0.5) & (log[name].t_s < 1.5) for name in log.sites}
     assert window["error_peak_rad"].most == max(
         np.abs(log[n].e[k]).max() for n, k in inside.items()
@@ -355,22 +377,21 @@ def test_a_run_that_ended_before_has_no_window() -> None:
     ids=["plain", "random", "rates", "diverged"],
 )
 def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> None:
+    """The compiled loop records the same bits as ticks that are executed one by one."""
     varied = scenario(**changes)
-    ticked: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
-    looped: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
+    by_tick: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
+    compiled: dict[str, list[RecordBatch]] = {name: [] for name in varied.names}
     diverged_at_s, _ = run_in_batches(
-        varied, {name: taken.append for name, taken in ticked.items()}
+        varied, {name: batches.append for name, batches in by_tick.items()}
     )
-    assert (
-        run_compiled_in_batches(
-            varied, {n: taken.append for n, taken in looped.items()}
-        ).diverged_s
-        == diverged_at_s
+    run = run_compiled_in_batches(
+        varied, {name: batches.append for name, batches in compiled.items()}
     )
+    assert run.diverged_s == diverged_at_s
     for name in varied.names:
-        one, other = join_batches(ticked[name]), join_batches(looped[name])
+        records, expected = join_batches(compiled[name]), join_batches(by_tick[name])
         for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
-            np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+            np.testing.assert_array_equal(getattr(records, field), getattr(expected, field))
 
 
 def test_any_metric_may_be_expected() -> None:
@@ -383,10 +404,12 @@ def test_any_metric_may_be_expected() -> None:
         "theta_error_last": [0.0, 1.0],
     }
     scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": expectations}})
+
     log = trilat_net.simulate(scenario)
     compared = trilat_net.compare(log, log).metrics
     run, logged = measure_virtual_run(scenario), measure_log(log)
     assert run.metrics == logged.metrics
+
     outcomes = {
         expectation.key: expectation
         for expectation in evaluate_expectations(scenario.expect, run)

@@ -40,6 +40,7 @@ TOLERANCES = {"synchronised_rad", "end_pose_within_rad"}
 
 
 def only(expect: Expect, **changes: Any) -> ExpectationResult:
+    """Returns the single outcome, for the calm run with some facts replaced."""
     outcomes = evaluate_expectations(expect, figures(**changes))
     assert len(outcomes) == 1
     return outcomes[0]
@@ -126,6 +127,7 @@ def test_diverged_runs_fail_unless_divergence_was_expected(stable: bool | None) 
 
 @given(off=st.floats(-0.1, 0.1), within=st.floats(1e-3, 0.05))
 def test_pose_must_match_each_joint_within_tolerance(off: float, within: float) -> None:
+    """An expectation of a pose holds if no joint is farther away than the tolerance."""
     for wanted in ((0.1 + off, 0.2), (0.1, 0.2 - off)):
         outcome = only(Expect(end_pose_rad={"s": wanted}, end_pose_within_rad=within))
         assert outcome.margin is not None
@@ -159,11 +161,13 @@ SPANS = {
 
 
 def window(**limits: Any) -> Expect:
+    """Returns an expectation on the slave from 9 to 15.5 s."""
     return Expect(windows=(ExpectWindow(from_s=9.0, to_s=15.5, site="s", **limits),))
 
 
 @given(least=st.floats(-1.0, 1.0), width=st.one_of(st.just(0.0), st.floats(1e-6, 1.0)))
 def test_window_quantities_must_hold_throughout(least: float, width: float) -> None:
+    """An expectation of a window holds if the whole range is within the limits."""
     most = least + width
     for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
         outcome = only(window(**{key: (least, most)}), windows=(SPANS,))

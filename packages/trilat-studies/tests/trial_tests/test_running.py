@@ -18,6 +18,7 @@ from .results import TOO_MUCH, quick
 
 
 def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], float]]:
+    """Returns seeds, measured values and simulated times of results."""
     return [
         (r.trial.scenario.seed, [(o.key, o.measured) for o in r.outcomes], r.simulated_s)
         for r in results
@@ -63,6 +64,7 @@ def test_trials_work_in_an_unguarded_script(quick_file: Path, tmp_path: Path) ->
 
 
 def run_script(script: Path, *arguments: str | Path, cwd: Path) -> str:
+    """Runs a script with this program, and returns what it prints."""
     done = subprocess.run(
         [sys.executable, str(script), *map(str, arguments)],
         cwd=cwd,
@@ -111,14 +113,13 @@ RECIPE = textwrap.dedent(
 def test_pytest_recipe_gives_one_test_per_seed(quick_file: Path, tmp_path: Path) -> None:
     """The same lines are run on a scenario that holds, and on one that does not."""
     assert len(RECIPE.strip().splitlines()) <= 10
-    for good in (True, False):
-        source = tmp_path / f"scenario_{good}.toml"
-        source.write_text(
-            quick_file.read_text().replace(
-                "max_ms = 100.0", f"max_ms = {100.0 if good else 1.0}"
-            )
-        )
-        (tmp_path / f"test_{good}.py").write_text(RECIPE.replace('"jitter"', repr(str(source))))
+    for holds, limit_ms in ((True, 100.0), (False, 1.0)):
+        source = tmp_path / f"scenario_{holds}.toml"
+        text = quick_file.read_text().replace("max_ms = 100.0", f"max_ms = {limit_ms}")
+        source.write_text(text)
+        recipe = RECIPE.replace('"jitter"', repr(str(source)))
+        (tmp_path / f"test_{holds}.py").write_text(recipe)
+
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml=out.xml"],
         cwd=tmp_path,
@@ -128,6 +129,7 @@ def test_pytest_recipe_gives_one_test_per_seed(quick_file: Path, tmp_path: Path)
         timeout=120,
     )
     assert done.returncode == 1, done.stdout + done.stderr
+
     cases = list(Xml.parse(tmp_path / "out.xml").iter("testcase"))
     failed = {
         (case.get("classname"), case.get("name"))

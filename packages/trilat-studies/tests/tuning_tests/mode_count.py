@@ -22,31 +22,42 @@ def count_growing(M: Array, K: Array, d: Array, delay_ticks: int, h_s: float) ->
     0.5 tau_{k-1}.
     """
     n = len(M)
-    zero, one = np.zeros((n, n)), np.eye(n)
-    held = np.block([[zero, one, zero], [zero, zero, np.linalg.inv(M)], [np.zeros((n, 3 * n))]])
-    whole = expm(held * h_s)
-    Phi, Gamma, F = (
-        whole[: 2 * n, : 2 * n],
-        whole[: 2 * n, 2 * n :],
-        np.hstack([-np.diag(K), -np.diag(d)]),
-    )
-    P = np.block([[Phi + 1.5 * Gamma @ F, -0.5 * Gamma], [F, zero]])
-    Q, S = np.vstack([1.5 * Gamma @ np.diag(K), np.diag(K)]), np.eye(n, 3 * n)
+    zero = np.zeros((n, n))
+    identity = np.eye(n)
 
-    def values(angle: Array) -> NDArray[np.complex128]:
+    # the motion of an arm over a tick in which the torque is held
+    rates = np.block(
+        [[zero, identity, zero], [zero, zero, np.linalg.inv(M)], [np.zeros((n, 3 * n))]]
+    )
+    transition = expm(rates * h_s)
+    Phi = transition[: 2 * n, : 2 * n]
+    Gamma = transition[: 2 * n, 2 * n :]
+
+    # the arm with its own feedback, its input from the other arm, and its position
+    F = np.hstack([-np.diag(K), -np.diag(d)])
+    P = np.block([[Phi + 1.5 * Gamma @ F, -0.5 * Gamma], [F, zero]])
+    Q = np.vstack([1.5 * Gamma @ np.diag(K), np.diag(K)])
+    S = np.eye(n, 3 * n)
+    signs = np.array([1.0, -1.0]).reshape(2, 1, 1)
+
+    def compute_determinants(angle: Array) -> NDArray[np.complex128]:
+        """Returns det(1 - a z^-n S (z - P)^-1 Q) for both signs a, at angles of z."""
         z = (1.0 + _GROWTH) * np.exp(1j * angle)[:, np.newaxis, np.newaxis]
         G = z**-delay_ticks * (S @ np.linalg.solve(z * np.eye(3 * n) - P, Q + 0.0 * z))
-        return np.linalg.det(one - np.array([1.0, -1.0]).reshape(2, 1, 1) * G[:, np.newaxis])
+        return np.linalg.det(identity - signs * G[:, np.newaxis])
 
+    # angles are added until no step turns a determinant far enough to miss a turn
     angle = np.geomspace(1e-3 * _GROWTH, np.pi, 500)
-    determinants = values(angle)
+    determinants = compute_determinants(angle)
     while True:
         turns = np.angle(determinants[1:] / determinants[:-1])
         wide = np.flatnonzero(np.abs(turns).max(axis=1) > 0.8)
         if not len(wide):
             break
         between = np.sqrt(angle[wide] * angle[wide + 1])
-        determinants = np.insert(determinants, wide + 1, values(between), axis=0)
+        new_determinants = compute_determinants(between)
+        determinants = np.insert(determinants, wide + 1, new_determinants, axis=0)
         angle = np.insert(angle, wide + 1, between)
-    alone = int((np.abs(np.linalg.eigvals(P)) > 1.0 + _GROWTH).sum())
-    return 2 * alone - round(float(turns.sum()) / np.pi)
+
+    growing_alone = int((np.abs(np.linalg.eigvals(P)) > 1.0 + _GROWTH).sum())
+    return 2 * growing_alone - round(float(turns.sum()) / np.pi)

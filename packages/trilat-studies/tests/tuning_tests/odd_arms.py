@@ -19,18 +19,18 @@ def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
     """Returns the URDF of a chain; `payload` is the text of a body at its end."""
     parts = ['<robot name="odd"><link name="base"/>']
     before, end = "base", "0 0 0"
-    for n, one in enumerate(pieces, 1):
-        across = one.mass * one.length**2 / 12.0
-        limits = "-0.4 0.4" if one.kind == "prismatic" else "-2 2"
+    for n, piece in enumerate(pieces, 1):
+        across = piece.mass * piece.length**2 / 12.0  # inertia of a rod about its middle
+        limits = "-0.4 0.4" if piece.kind == "prismatic" else "-2 2"
         low, high = limits.split()
         parts.append(f"""
-<link name="l{n}"><inertial><origin xyz="{0.5 * one.length} 0 0"/><mass value="{one.mass}"/>
+<link name="l{n}"><inertial><origin xyz="{0.5 * piece.length} 0 0"/><mass value="{piece.mass}"/>
 <inertia ixx="{0.2 * across}" ixy="0" ixz="0" iyy="{across}" iyz="0" izz="{across}"/></inertial></link>
-<joint name="j{n}" type="{one.kind}"><parent link="{before}"/><child link="l{n}"/>
-<origin xyz="{one.offset or end}"/><axis xyz="{one.axis}"/>
+<joint name="j{n}" type="{piece.kind}"><parent link="{before}"/><child link="l{n}"/>
+<origin xyz="{piece.offset or end}"/><axis xyz="{piece.axis}"/>
 <limit lower="{low}" upper="{high}" effort="50" velocity="5"/>
 <dynamics damping="0.3" friction="0.2"/></joint>""")
-        before, end = f"l{n}", f"{one.length} 0 0"
+        before, end = f"l{n}", f"{piece.length} 0 0"
     if payload:
         parts.append(f'<link name="tool">{payload}</link><joint name="fixed" type="fixed">')
         parts.append(

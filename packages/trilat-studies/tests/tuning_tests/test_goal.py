@@ -34,6 +34,7 @@ def hand(
     start: float = 0.0,
     end: float = 9.0,
 ) -> str:
+    """Returns the override that lets an operator pull an arm to a pose by springs."""
     return (
         f'sites.{site}.hands=[{{kind = "spring", to_rad = {list(to)}, stiffness_nm_rad = {list(K)}, '
         f"start_s = {start}, end_s = {end}}}]"
@@ -41,6 +42,7 @@ def hand(
 
 
 def at_end(scenario: Scenario) -> np.ndarray:
+    """Returns the pose at which the arms should rest at the end of a scenario."""
     return compute_consensus_pose(scenario, np.array([0.0, scenario.duration_s]))[-1]
 
 
@@ -160,24 +162,25 @@ FIRM = (
 
 
 def scored(scenario: Scenario, alone: Scenario | None = None) -> CandidateScore:
+    """Returns the score of a scenario, compared with its copy without disturbances if given."""
     return measure_candidate(scenario.text, None if alone is None else alone.text)
 
 
 def test_error_and_effort_are_the_documented_sums() -> None:
+    """Errors refer to the weighted mean of the starts, and the effort leaves out gravity."""
     scenario = trio(*FIRM)
     score = scored(scenario)
     run = trajectories(scenario)
     q, tau = run.stack("q"), run.stack("tau")
+
     # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
-    a, b, c = (
-        0.2,
-        0.5,
-        0.6,
-    )
+    a, b, c = 0.2, 0.5, 0.6
     beta = np.array([1.0 - (1.0 - b) * (1.0 - c), 1.0 - (1.0 - a) * c, 1.0 - a * b])
     pose = beta @ q[:, 0] / beta.sum()
+
     inner, outer = 2.0 * 9.81 * np.cos(q[..., 0]), 9.81 * np.cos(q[..., 0] + q[..., 1])
     gravity = np.stack([inner + outer, outer], axis=-1)
+
     assert score.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
     assert score.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
     assert score.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
@@ -242,6 +245,7 @@ def test_sites_of_different_rates_are_compared_simultaneously() -> None:
 
 
 def test_with_a_twin_the_goal_is_its_pose() -> None:
+    """With a push, the pose of the run without the push is the goal, and so is its error."""
     push = (
         'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 1.2, peak_nm = [20.0, 0.0]}]'
     )

@@ -53,7 +53,7 @@ def test_class_combines_judgement_and_pose(
 
 
 def test_judgements_that_decide_a_class_name_it() -> None:
-    words = {one: one.word for one in CandidateClass}
+    words = {outcome: outcome.word for outcome in CandidateClass}
     assert words[CandidateClass.SETTLED] == Stability.STABLE
     assert words[CandidateClass.OSCILLATED] == Stability.NOT_STABLE
     assert words[CandidateClass.OPEN] == Stability.OPEN

@@ -24,6 +24,7 @@ def make_run(outside_nm: Array, laws: list[LawSettings], start_rad: float = 0.0)
 
 
 def push(user_nm: float = 0.0, slave_nm: float = 0.0) -> Array:
+    """Returns constant torques from outside on the first user and on the slave."""
     outside_nm = np.zeros((3, len(T_S), 1))
     outside_nm[0] = user_nm
     outside_nm[2] = slave_nm

@@ -34,6 +34,7 @@ HELD = ("tdpa", "tanks", "wave")
 @pytest.mark.parametrize("law", sorted(SEARCH_SPACES))
 @pytest.mark.parametrize("scenario", ["contact", "free"])
 def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> None:
+    """A candidate has its law and the told gravity at each site, and changes nothing else."""
     if law == "p_f" and scenario == "free":
         return
     scheme = ["scheme=digital"] if law in HELD else []
@@ -41,6 +42,7 @@ def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> N
     candidate = experiment.with_gains(
         SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]
     ).scenario
+
     for name, site in candidate.sites.items():
         assert site.control.__struct_config__.tag == ("adaptive" if law == "known" else law)
         assert site.limits == experiment.scenario.sites[name].limits
@@ -49,8 +51,9 @@ def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> N
             assert getattr(site.control, "gravity", 0.95) == 0.95
             continue
         known = site.control.gains(candidate.arms[name].theta)
-        first = known.known if np.any(known.known) else known.theta_hat0
-        assert first[3:] == pytest.approx(0.95 * candidate.arms[name].theta[3:])
+        estimate = known.known if np.any(known.known) else known.theta_hat0
+        assert estimate[3:] == pytest.approx(0.95 * candidate.arms[name].theta[3:])
+
     with_same_control = {name: site.control for name, site in candidate.sites.items()}
     assert candidate.links == experiment.scenario.links
     assert len(with_same_control) == len(experiment.scenario.names)
@@ -88,18 +91,20 @@ def test_equal_quantities_have_equal_ranges_in_laws() -> None:
 def six(state: ChainState, **overrides: object) -> TuningScenario:
     """Returns `six_joints` with two equal start poses."""
     start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
-    given = {"arm.stops": False, **start, **overrides}
+    settings = {"arm.stops": False, **start, **overrides}
     return load_tuning_scenario(
-        "six_joints", [f"{key}={format_toml_value(value)}" for key, value in given.items()]
+        "six_joints", [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
     )
 
 
 def test_joints_share_gains_by_inertia_from_pinocchio() -> None:
+    """Gains of joints are in the ratio of inertias that Pinocchio computes for the pose."""
     armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     for state in chain_references()["arm6"].states:
         inertia = 1.0 / np.diag(np.linalg.inv(state.inertia + np.diag(armature)))
         weights = weigh_joints(six(state).scenario)
         assert weights == pytest.approx(inertia / inertia.max(), rel=0.05)  # two digits
+
         gains = {"Lambda": 2.0, "Kp": 30.0, "Kd": 4.0, "Gamma": 0.5}
         candidate = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
         control = candidate.scenario.sites["m1"].control

@@ -50,37 +50,39 @@ def test_laws_use_their_budget_and_runs_end_once(tuning_result: TuningResult) ->
 
 
 def test_candidates_differ_only_in_their_law(tuning_result: TuningResult) -> None:
-    shared = set()
-    for one in tuning_result.found:
-        for place in range(len(one.tried)):
-            scenario = tuning_result.candidate(one, place).scenario
+    """All candidates have the same limits, starts, seed, duration and links."""
+    settings_of_candidates = set()
+    for search in tuning_result.found:
+        for place in range(len(search.tried)):
+            scenario = tuning_result.candidate(search, place).scenario
             limits = tuple(site.limits for site in scenario.sites.values())
             starts = tuple(
                 (site.q0_rad, repr(site.arm), site.rate_hz, site.hands)
                 for site in scenario.sites.values()
             )
-            shared.add(
+            settings_of_candidates.add(
                 (limits, starts, scenario.seed, scenario.duration_s, repr(scenario.links))
             )
-    assert len(shared) == 1
-    assert next(iter(shared))[0][0].tau_limit_nm == 60.0
+    assert len(settings_of_candidates) == 1
+    assert next(iter(settings_of_candidates))[0][0].tau_limit_nm == 60.0
 
 
 def test_a_front_is_dominated_by_no_law(tuning_result: TuningResult) -> None:
+    """A point of a law's front is on the front of all laws if no law has a better point."""
     points = {
-        one.space.law: [tuning_result.plan.objective.point(score) for score in one.scores]
-        for one in tuning_result.found
+        search.space.law: [tuning_result.plan.objective.point(score) for score in search.scores]
+        for search in tuning_result.found
     }
     all_points = [point for law in points.values() for point in law if point is not None]
-    for one in tuning_result.found:
-        own_points = points[one.space.law]
-        assert one.front == find_pareto_front(own_points)
-        shared = tuning_result.list_overall_front(one)
-        assert set(shared) <= set(one.front)
-        for place in one.front:
+    for search in tuning_result.found:
+        own_points = points[search.space.law]
+        assert search.front == find_pareto_front(own_points)
+        overall_front = tuning_result.list_overall_front(search)
+        assert set(overall_front) <= set(search.front)
+        for place in search.front:
             point = own_points[place]
             assert point is not None
-            assert (place in shared) == (
+            assert (place in overall_front) == (
                 not any(dominates(other, point) for other in all_points)
             )
 

@@ -189,10 +189,10 @@ def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
-    """Collects the numbers of a panel, by which its cells are coloured.
+    """Collects the numbers of the panel of one task, by which its fields are coloured.
 
     Args:
-        results: The results of the suite.
+        results: The results of the benchmark.
         task: The task of the panel.
         quantity: The quantity. Empty for the judgement.
 
@@ -214,11 +214,12 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
 
 
 def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
-    """Computes the number of a cell: the mean of a quantity, or the place of its judgement.
+    """Returns the number by which a field of a figure is coloured: a mean or a judgement.
 
     Args:
-        result: Result of the cell.
-        quantity: The quantity. Empty for the judgement, whose place in `JUDGEMENTS` counts.
+        result: Result of one law in one task over one link.
+        quantity: Quantity of which the mean is returned. Empty for the judgement, of which the
+            index in `JUDGEMENTS` is returned.
 
     Returns:
         The number. None if the runs lack the quantity.

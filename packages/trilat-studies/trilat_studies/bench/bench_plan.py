@@ -117,9 +117,10 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
         follows.
     """
     names = ("m1", "m2", "s")
+    matrix = complementary_shares(a).tolist()
     dominance = {}
-    for name, row in zip(names, complementary_shares(a).tolist(), strict=True):
-        factors_by_peer = zip(names, row, strict=True)
+    for name, factors in zip(names, matrix, strict=True):
+        factors_by_peer = zip(names, factors, strict=True)
         dominance[name] = {peer: factor for peer, factor in factors_by_peer if factor}
     return dominance
 
@@ -193,22 +194,23 @@ TASKS = {
 
 
 def _build_constant_links() -> dict[str, Settings]:
-    """Returns the links with a constant delay, with and without losses.
+    """Returns the links of the benchmark with a constant delay, with and without losses.
 
     Returns:
-        The keys of each link, by a name such as "rtt68-loss50": a round trip of 68 ms, in which
-        half of the samples are lost.
+        The scenario keys of each link, by a name such as "rtt68-loss50": a round trip of 68 ms,
+        in which half of the samples are lost.
     """
     links: dict[str, Settings] = {}
     for percent in GRID_LOSSES_PERCENT:
         for rtt_ms in GRID_ROUND_TRIPS_MS:
             name = f"rtt{rtt_ms}"
-            keys: dict[str, Any] = {"model": "constant", "delay_ms": rtt_ms / 2}
+            # the delay of one direction is half of the round trip
+            link_keys: dict[str, Any] = {"model": "constant", "delay_ms": rtt_ms / 2}
             if percent:
                 name += f"-loss{percent}"
                 # at 1 kHz a single lost sample costs a site only one tick
-                keys |= {"loss": percent / 100, "loss_burst": _BURST_SAMPLES}
-            links[name] = keys
+                link_keys |= {"loss": percent / 100, "loss_burst": _BURST_SAMPLES}
+            links[name] = link_keys
     return links
 
 
@@ -446,21 +448,23 @@ Since the second procedure, a law may define its own objective.
 
 
 def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
-    """Returns the error and the effort of a law in a tuning task, with gains that never change.
+    """Runs a law in a tuning task with fixed gains, and returns its error and effort as a text.
 
-    They tell whether the law still moves the arms as it did when its gains were tuned. The text
-    of its source code would not do: it also changes when a sentence, a name or an import does.
+    The text tells whether the law still moves the arms as it did when its gains were tuned. A
+    digest of its source code would not do: it also changes when a sentence, a name or an import
+    does.
 
     Args:
         task: The task in which the law was tuned.
         space: The law and the ranges of its gains. Each gain has the middle of its range, on a
             logarithmic scale if the range does not begin at zero.
     """
-    gains = {
-        knob.name: math.sqrt(knob.low * knob.high) if knob.low > 0 else 0.5 * knob.high
-        for knob in space.knobs
-    }
-    score = measure_candidate(*task.with_gains(space, KNOWLEDGE, gains).texts)
+    gains = {}
+    for gain in space.knobs:
+        geometric_mean = math.sqrt(gain.low * gain.high)
+        gains[gain.name] = geometric_mean if gain.low > 0 else 0.5 * gain.high
+    candidate = task.with_gains(space, KNOWLEDGE, gains)
+    score = measure_candidate(*candidate.texts)
     if score.error_rad is None or score.effort_nm is None:  # the run diverged
         return f"{score.outcome.name} at {score.diverged_s} s"
     return f"{score.outcome.name}: {score.error_rad:.9g} rad, {score.effort_nm:.9g} N m"
@@ -545,15 +549,16 @@ def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidat
         search: The search that tried the candidate.
         candidate: Index of the candidate in the search. Its gains are used unchanged.
     """
-    base = load_tuning_task(form, search.space.law, round_trip_ms)
-    controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[candidate])
+    task = load_tuning_task(form, search.space.law, round_trip_ms)
+    control_tables = search.space.controls(task.scenario, KNOWLEDGE, search.tried[candidate])
     longer_delays = {
         "link.delay_ms": 0.5 * TUNING_MARGIN * round_trip_ms,
-        "duration_s": MARGIN_LENGTHS * base.scenario.duration_s,
+        "duration_s": MARGIN_LENGTHS * task.scenario.duration_s,
     }
-    overrides = (*base.overrides, *format_settings(longer_delays))
-    experiment = load_tuning_scenario(base.source, overrides).with_controls(controls)
-    score = measure_candidate(*experiment.texts)
+    overrides = (*task.overrides, *format_settings(longer_delays))
+    longer_task = load_tuning_scenario(task.source, overrides)
+    candidate_task = longer_task.with_controls(control_tables)
+    score = measure_candidate(*candidate_task.texts)
     return score.outcome is CandidateClass.SETTLED
 
 
@@ -605,7 +610,7 @@ def tune_laws(
 def _tune_law(
     form: str, law: str, round_trip_ms: int, jobs: int | None, on: Workers, budget: int
 ) -> TunedGains:
-    """Tunes a law at one round trip.
+    """Tunes the gains of one control law for one round trip of the network.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -628,7 +633,7 @@ def _tune_law(
 
 
 def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
-    """Selects the gains of a search: the smallest error among the candidates with the margin.
+    """Selects the candidate with the smallest error that stays stable if delays grow.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -637,18 +642,21 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
     """
     law = search.space.law
     scores = search.scores
-    settled = [n for n, score in enumerate(scores) if score.outcome is CandidateClass.SETTLED]
-    settled.sort(key=lambda n: scores[n].error_rad or 0.0)
+    settled = []
+    for index, score in enumerate(scores):
+        if score.outcome is CandidateClass.SETTLED:
+            settled.append(index)
+    settled.sort(key=lambda index: scores[index].error_rad or 0.0)
 
     # The margin costs another run, so it is checked in the order of the errors until a
     # candidate has it.
     selected = None
-    passed = 0
+    rejected = 0
     for candidate in settled:
         if _has_margin(form, round_trip_ms, search, candidate):
             selected = candidate
             break
-        passed += 1
+        rejected += 1
 
     return TunedGains(
         form=form,
@@ -657,7 +665,7 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
         gains={} if selected is None else search.tried[selected],
         settled=len(settled),
         tried=len(search.tried),
-        passed=passed,
+        passed=rejected,
         error_rad=None if selected is None else scores[selected].error_rad,
         effort_nm=None if selected is None else scores[selected].effort_nm,
         fingerprint=fingerprint_tuning(form, law, round_trip_ms),
@@ -802,13 +810,13 @@ class BenchPlan(NamedTuple):
 
 @cache
 def _load_base_text(form: str) -> str:
-    """Returns the TOML text of a form's scenario, with all defaults written out.
+    """Returns the TOML text of a shipped scenario of the benchmark, with all defaults.
 
-    A form is the kind of shipped scenario on which tasks are based. Its text enters the
-    fingerprint of the gains, because other defaults would need another tuning.
+    The text enters the fingerprint of tuned gains, because gains that were tuned with other
+    defaults are out of date.
 
     Args:
-        form: A key of `BASES`.
+        form: Kind of scenario, a key of `BASES`.
     """
     return load_tuning_scenario(BASES[form]).scenario.text
 
@@ -923,7 +931,9 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
 
 @cache
 def _gets_gravity(form: str, law: str) -> bool:
-    """Returns True if the settings of a law depend on the gravity parameters that it gets.
+    """Returns True if a law uses the gravity parameters that the benchmark gives to it.
+
+    A law that takes the exact model of the arm cannot run in a task with wrong parameters.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -931,9 +941,10 @@ def _gets_gravity(form: str, law: str) -> bool:
     """
     space = SEARCH_SPACES[law]
     scenario = load_tuning_scenario(BASES[form]).scenario
-    gains = {knob.name: knob.low for knob in space.knobs}
-    exact = space.controls(scenario, KNOWLEDGE, gains)
-    return space.controls(scenario, ModelInformation(0.9), gains) != exact
+    least_gains = {knob.name: knob.low for knob in space.knobs}
+    with_exact_gravity = space.controls(scenario, KNOWLEDGE, least_gains)
+    with_wrong_gravity = space.controls(scenario, ModelInformation(0.9), least_gains)
+    return with_wrong_gravity != with_exact_gravity
 
 
 def _list_cells(
@@ -943,9 +954,9 @@ def _list_cells(
     links: Sequence[str],
     seeds: int,
 ) -> Iterator[BenchCell]:
-    """Yields the cells of the selected tasks, laws and links, with or without gains.
+    """Yields a cell, one law in one task over one link, for all selected names.
 
-    Tasks that a law does not fit are left out.
+    Tasks that a law does not fit are left out. Cells whose tuning found no gains are included.
 
     Args:
         study: The study.
@@ -967,6 +978,7 @@ def _list_cells(
                 if explain_no_cell(law, form, task) != NO_GAINS:
                     continue
                 for link, (is_random, mean_ms) in link_properties.items():
+                    # Without drawn delays or losses, further seeds would repeat the same run.
                     run_count = seeds if is_random else 1
                     yield BenchCell(
                         task=task,
@@ -981,7 +993,7 @@ def _list_cells(
 def _find_gains(
     gains: Mapping[tuple[str, str, int], TunedGains], form: str, law: str, delay_ms: float
 ) -> TunedGains:
-    """Returns the gains of a law for a link.
+    """Returns the tuned gains with which a law runs over a link.
 
     Args:
         gains: All tuned gains, by form, law and round trip in ms.
@@ -1003,13 +1015,14 @@ def _find_gains(
 
 
 def _analyse_link(link: str) -> tuple[bool, float]:
-    """Determines if a link draws random numbers, and how long its delay is.
+    """Determines whether a link of the benchmark is random, and how long its delay is.
 
     Args:
         link: A key of `LINKS`.
 
     Returns:
-        True if its delays or losses are random, and its mean one-way delay in ms.
+        True if its delays or losses are random.
+        Its mean one-way delay, in ms.
     """
     settings = format_settings({"link": dict(LINKS[link])})
     scenario = load_tuning_scenario(BASES["two"], settings).scenario
@@ -1041,7 +1054,7 @@ def _select_names(
 
 
 def _check_name(option: str, name: str, known: Sequence[str]) -> str:
-    """Returns the name from an option if it is known.
+    """Returns a name that the user gave to an option, after a check that it is known.
 
     Raises:
         UsageError: The name is unknown. The message suggests a similar name.

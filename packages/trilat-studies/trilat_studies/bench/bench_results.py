@@ -229,9 +229,9 @@ class BenchCellResult(NamedTuple):
         otherwise open if a run could not be decided, otherwise settled if a run only came to
         rest, otherwise stable.
         """
-        from_worst = (Stability.NOT_STABLE, Stability.OPEN, Stability.SETTLED)
-        present = [stability for stability in from_worst if self.count(stability)]
-        return present[0] if present else Stability.STABLE
+        worst_first = (Stability.NOT_STABLE, Stability.OPEN, Stability.SETTLED)
+        occurring = [stability for stability in worst_first if self.count(stability)]
+        return occurring[0] if occurring else Stability.STABLE
 
     @property
     def masked(self) -> bool:
@@ -391,17 +391,21 @@ class BenchResults(Result):
 
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the tuned gains of all cells. Gains that several cells share occur once."""
-    return list({str(cell.tuned): cell.tuned for cell in results.plan.cells}.values())
+    """Returns the tuned gains with which the laws ran, each once.
+
+    Several tasks and links may share the same gains.
+    """
+    gains_by_name = {str(cell.tuned): cell.tuned for cell in results.plan.cells}
+    return list(gains_by_name.values())
 
 
 def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
-    """Returns a run of a cell, or its repetition over twice its length if there is one.
+    """Returns a run, or its repetition over twice its length if there is one.
 
     A run that is not stable is repeated. The longer run decides, and its numbers count.
 
     Args:
-        runs: All runs by name of their cell in the journal, and by seed.
+        runs: All finished runs, by the name of the cell in the journal and by seed.
         cell: The law, task, link and gains of the runs.
         seed: Seed of the run.
     """
@@ -485,22 +489,21 @@ def _tabulate_verdicts(results: BenchResults) -> TextTable:
 
 
 def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> str:
-    """Returns the numbers of links by verdict as an entry of the table of verdicts.
+    """Returns over how many links a law is stable, settled, open and not stable, for a table.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the benchmark or of a part of it.
         law: Name of the control law.
-        form: Form in which the law runs.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
         task: Name of the task.
 
     Returns:
-        A text such as "12 / 0 / 1 / 3" for stable, settled, open and not stable links. If the
-        law did not run in the task, the reason.
+        A text such as "12 / 0 / 1 / 3". If the law did not run in the task, the reason.
     """
-    verdicts = [result.judgement for result in results.select(task, law)]
-    if not verdicts:
+    judgements = [result.judgement for result in results.select(task, law)]
+    if not judgements:
         return explain_no_cell(law, form, task)
-    return " / ".join(str(verdicts.count(judgement)) for judgement in _JUDGEMENTS)
+    return " / ".join(str(judgements.count(judgement)) for judgement in _JUDGEMENTS)
 
 
 def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
@@ -523,6 +526,7 @@ def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
         "stable",
         "no contact",
     )
+
     rows = []
     for law, form in results.plan.laws:
         name = name_law(law, form)
@@ -545,12 +549,14 @@ def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
     converged = 0
     stable = 0
     masked = 0
+
     for result in law_results:
         bounded += all(run.bounded for run in result.runs)
         passive += result.is_passive
         converged += all(run.settled_s is not None for run in result.runs)
         stable += result.judgement is Stability.STABLE
         masked += result.masked
+
     link_count = len(law_results)
     return [
         f"{bounded}/{link_count}",
@@ -668,9 +674,9 @@ def _tabulate_round_trips(results: BenchResults) -> TextTable:
 
 
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
-    """Returns the mean error of a cell, in rad, for comparisons between links.
+    """Returns the mean error of a law in a task over a link, in rad.
 
-    None if the cell did not run, or if a run of it diverged or missed its wall.
+    None if the law did not run there, or if a run diverged or missed its wall.
     """
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
@@ -770,16 +776,21 @@ def build_bench_page(
         f"{OPEN_MARK}: some run is open. {UNSTABLE_MARK}: some run is not stable. "
         "+-: 95 % interval over the seeds of a link.",
     ]
+
     parts += [f"![{text}]({name})" for name, text in pictures.items()]
+
     for task in results.plan.tasks:
         parts.append(f"## {task}: properties")
         parts.append(_tabulate_properties(results, task).markdown())
+
     for task, quantity in _list_quantities(results):
         parts.append(f"## {task}: {QUANTITIES[quantity]}")
         parts.append(_tabulate_quantity(results, task, quantity).markdown())
+
     if results.plan.study == "round-trips":
         parts.append("## Delay against loss")
         parts.append(_tabulate_round_trips(results).markdown())
+
     parts.append("## Gains")
     parts.append(_tabulate_gains(results).markdown())
     return "\n\n".join(parts) + "\n"

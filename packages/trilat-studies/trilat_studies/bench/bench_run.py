@@ -259,6 +259,7 @@ def lengthen_run(judged: JudgedRun) -> JudgedRun:
         judged = judge_bench_run(judged.scenario, longer_s)
     if required_s <= limit_s or judged.diverged:
         return judged
+
     limit_text = (
         f"ended after {judged.scenario.duration_s:.4g} s by the safety limit of "
         f"{MAX_RUN_TICKS} ticks, but {TIME_CONSTANTS:g} of its slowest time constants are "
@@ -310,9 +311,9 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
         The run with the numbers, see `BenchRun`.
     """
     scenario = judged.scenario
-    whole = judged.records
+    all_records = judged.records
     task_end_ns = round(duration_s * NS_PER_S)
-    records = {name: batch.between(0, task_end_ns) for name, batch in whole.items()}
+    records = {name: batch.between(0, task_end_ns) for name, batch in all_records.items()}
 
     squared_efforts = []
     squared_hand_torques = []
@@ -321,6 +322,7 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
         spec = scenario.sites[name]
         arm = build_arm_rows(scenario, name)
 
+        # the torque that holds the arm against gravity is no effort of the law
         effort = record.tau - arm.gravity_torque(record.q)
         squared_efforts.append(np.mean(effort**2))
         if spec.hands:
@@ -342,9 +344,9 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
     hand_nm = np.sqrt(np.mean(squared_hand_torques))
     return msgspec.structs.replace(
         run,
-        bounded=_is_bounded(scenario, whole),
-        energy_j=find_least_energy(whole),
-        settled_s=_find_settled_s(whole),
+        bounded=_is_bounded(scenario, all_records),
+        energy_j=find_least_energy(all_records),
+        settled_s=_find_settled_s(all_records),
         error_rad=_measure_error_rad(scenario, records),
         effort_nm=float(effort_nm),
         hand_nm=float(hand_nm),
@@ -388,12 +390,12 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
     Returns:
         The torque in N m, shape (records, joints).
     """
-    torque: Array = -record.tau_x
+    operator_torque: Array = -record.tau_x
     for source in scenario.sites[name].environment:
         if isinstance(source, ViscousEnvironment):
             damping = np.array(source.damping_nm_s_rad)
-            torque = torque + damping * record.qd
-    return torque
+            operator_torque = operator_torque + damping * record.qd
+    return operator_torque
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
@@ -441,30 +443,31 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
     for record in records.values():
         from_end_rad = np.abs(record.q - record.q[-1])
         distance_rad = from_end_rad.max(axis=1)
-        moving = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
-        if len(moving):
-            last_moving_s = record.t_ns[moving[-1]] / NS_PER_S
+        rows_away = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
+        if len(rows_away):
+            last_moving_s = record.t_ns[rows_away[-1]] / NS_PER_S
             settled_s = max(settled_s, last_moving_s)
     end_s = records[SLAVE].t_ns[-1] / NS_PER_S
-    return float(settled_s) if settled_s <= end_s - REST_S else None
+    rests_long_enough = settled_s <= end_s - REST_S
+    return float(settled_s) if rests_long_enough else None
 
 
-def _measure_contact(run: BenchRun, item: BenchRunItem, far: JudgedRun) -> BenchRun:
-    """Measures what the user feels of the wall: a stiffness and an impedance.
+def _measure_contact(run: BenchRun, item: BenchRunItem, judged: JudgedRun) -> BenchRun:
+    """Measures how stiff and how heavy the wall feels to the user, over the coupled arms.
 
     Args:
         run: The run without these numbers.
         item: The run of the task `contact`, as it was executed.
-        far: The same run with its records.
+        judged: The same run with its records. "Far" is the full reach of the user.
 
     Returns:
         The run with the numbers that could be measured.
     """
-    contact_s = _find_contact_s(far.scenario, far.records)
+    contact_s = _find_contact_s(judged.scenario, judged.records)
     if contact_s is None:
         return run
-    stiffness_n_m = _estimate_stiffness(item, far, contact_s)
-    impedances = _estimate_impedance(item, far, contact_s)
+    stiffness_n_m = _estimate_stiffness(item, judged, contact_s)
+    impedances = _estimate_impedance(item, judged, contact_s)
     if impedances is None:
         return msgspec.structs.replace(run, stiffness_n_m=stiffness_n_m)
     in_contact, in_free_motion = impedances
@@ -520,7 +523,9 @@ def _run_variant(
     return None if end.diverged_at_s is not None else (scenario, records)
 
 
-def _estimate_stiffness(item: BenchRunItem, far: JudgedRun, contact_s: float) -> float | None:
+def _estimate_stiffness(
+    item: BenchRunItem, judged: JudgedRun, contact_s: float
+) -> float | None:
     """Estimates the stiffness that the user feels along the normal of the wall.
 
     The same run is executed with a shorter reach of the user. The stiffness is the difference
@@ -529,25 +534,25 @@ def _estimate_stiffness(item: BenchRunItem, far: JudgedRun, contact_s: float) ->
 
     Args:
         item: The run with the longer reach.
-        far: The same run with its records.
+        judged: The same run with its records.
         contact_s: Time of the first contact of the longer reach, in s.
 
     Returns:
         The stiffness in N/m. None if one of the runs has no contact for so long.
     """
-    variant = _run_variant(item, SHORTER_REACH, TASKS[item.cell.task].duration_s)
-    if variant is None:
+    shorter_run = _run_variant(item, SHORTER_REACH, TASKS[item.cell.task].duration_s)
+    if shorter_run is None:
         return None
-    near_scenario, near_records = variant
-    near_contact_s = _find_contact_s(near_scenario, near_records)
-    if near_contact_s is None:
+    shorter_scenario, shorter_records = shorter_run
+    shorter_contact_s = _find_contact_s(shorter_scenario, shorter_records)
+    if shorter_contact_s is None:
         return None
-    near = _measure_push(near_scenario, near_records, near_contact_s + STIFFNESS_S)
-    longer = _measure_push(far.scenario, far.records, contact_s + STIFFNESS_S)
-    if near is None or longer is None:
+    shorter = _measure_push(shorter_scenario, shorter_records, shorter_contact_s + STIFFNESS_S)
+    longer = _measure_push(judged.scenario, judged.records, contact_s + STIFFNESS_S)
+    if shorter is None or longer is None:
         return None
-    distance_m = longer.position_m - near.position_m
-    force_n = longer.force_n - near.force_n
+    distance_m = longer.position_m - shorter.position_m
+    force_n = longer.force_n - shorter.force_n
     return float(force_n / distance_m) if distance_m else None
 
 
@@ -566,7 +571,7 @@ class _Push(NamedTuple):
 def _measure_push(
     scenario: Scenario, records: dict[str, RecordBatch], time_s: float
 ) -> _Push | None:
-    """Measures how far and how hard the user pushes at a time.
+    """Measures where the user's end effector is and how hard the user pushes, at a given time.
 
     Args:
         scenario: The scenario.
@@ -577,10 +582,10 @@ def _measure_push(
         The position and the force. None if the run ends before.
     """
     window_s = (time_s - 0.5 * STIFFNESS_WINDOW_S, time_s + 0.5 * STIFFNESS_WINDOW_S)
-    motion = _measure_tip(scenario, records, window_s)
-    if motion is None:
+    tip_motion = _measure_tip(scenario, records, window_s)
+    if tip_motion is None:
         return None
-    return _Push(float(motion.position_m.mean()), float(motion.force_n.mean()))
+    return _Push(float(tip_motion.position_m.mean()), float(tip_motion.force_n.mean()))
 
 
 class _TipMotion(NamedTuple):
@@ -619,8 +624,10 @@ def _measure_tip(
     if records[USER].t_ns[-1] < end_ns - NS_PER_S // scenario.sites[USER].rate_hz:
         return None
     record = records[USER].between(start_ns, end_ns)
+
     arm = build_arm_rows(scenario, USER)
     tip = arm.place_end_effector(record.q, record.qd)
+
     torque = _compute_hand_torque(scenario, USER, record)
     J_transposed = np.swapaxes(tip.J, 1, 2)
     torque_columns = torque[:, :, np.newaxis]
@@ -634,7 +641,7 @@ def _measure_tip(
 
 
 def _estimate_impedance(
-    item: BenchRunItem, far: JudgedRun, contact_s: float
+    item: BenchRunItem, judged: JudgedRun, contact_s: float
 ) -> tuple[float, float] | None:
     """Estimates the impedance |Z| at `IMPEDANCE_HZ` that the user feels, with and without wall.
 
@@ -647,7 +654,7 @@ def _estimate_impedance(
 
     Args:
         item: The run of the task `contact`.
-        far: The same run with its records.
+        judged: The same run with its records.
         contact_s: Time of the first contact, in s.
 
     Returns:
@@ -656,13 +663,14 @@ def _estimate_impedance(
     start_s = contact_s + STIFFNESS_S
     end_s = start_s + IMPEDANCE_PERIODS / IMPEDANCE_HZ
     window_s = (start_s, end_s)
-    still = _measure_tip(far.scenario, far.records, window_s)
-    if still is None:
+    without_sine = _measure_tip(judged.scenario, judged.records, window_s)
+    if without_sine is None:
         return None
 
-    pose_rad = still.q.mean(axis=0)
+    # a sine of force along the normal of the wall, as torques of the joints
+    pose_rad = without_sine.q.mean(axis=0)
     no_motion = np.zeros_like(pose_rad)
-    arm = build_arm_rows(far.scenario, USER)
+    arm = build_arm_rows(judged.scenario, USER)
     J = arm.place_end_effector(pose_rad[np.newaxis], no_motion[np.newaxis]).J[0]
     shaking = {
         "kind": "multisine",
@@ -672,14 +680,16 @@ def _estimate_impedance(
     (hand,) = TASKS[item.cell.task].settings[f"sites.{USER}.hands"]
     hand_to_pose = {**hand, "to_rad": pose_rad.tolist()}
     no_wall: dict[str, Any] = {f"sites.{SLAVE}.environment": []}
-    in_contact = _run_window(item, {f"sites.{USER}.hands": [hand, shaking]}, window_s)
+    contact_with_sine = _run_window(item, {f"sites.{USER}.hands": [hand, shaking]}, window_s)
     free_hands = {f"sites.{USER}.hands": [hand_to_pose]}
     free_shaken_hands = {f"sites.{USER}.hands": [hand_to_pose, shaking]}
-    free = _run_window(item, no_wall | free_hands, window_s)
-    free_shaken = _run_window(item, no_wall | free_shaken_hands, window_s)
-    if in_contact is None or free is None or free_shaken is None:
+    free_without_sine = _run_window(item, no_wall | free_hands, window_s)
+    free_with_sine = _run_window(item, no_wall | free_shaken_hands, window_s)
+    if contact_with_sine is None or free_without_sine is None or free_with_sine is None:
         return None
-    return _compute_impedance(in_contact, still), _compute_impedance(free_shaken, free)
+    in_contact = _compute_impedance(contact_with_sine, without_sine)
+    in_free_motion = _compute_impedance(free_with_sine, free_without_sine)
+    return in_contact, in_free_motion
 
 
 def _run_window(
@@ -706,11 +716,12 @@ def _compute_impedance(shaken: _TipMotion, still: _TipMotion) -> float:
         shaken: Motion of and force on the user's end effector in the run with the sine.
         still: The same in the run without the sine.
     """
-    count = len(shaken.force_n)
-    turns = IMPEDANCE_PERIODS * np.arange(count) / count
-    wave = np.exp(-2j * np.pi * turns)
-    force = np.dot(wave, shaken.force_n - still.force_n)
-    speed = np.dot(wave, shaken.speed_m_s - still.speed_m_s)
+    records = len(shaken.force_n)
+    turns = IMPEDANCE_PERIODS * np.arange(records) / records
+    # the product with this wave extracts the phasor at the frequency of the sine
+    conjugate_wave = np.exp(-2j * np.pi * turns)
+    force = np.dot(conjugate_wave, shaken.force_n - still.force_n)
+    speed = np.dot(conjugate_wave, shaken.speed_m_s - still.speed_m_s)
     return float(np.abs(force) / np.abs(speed))
 
 
@@ -758,6 +769,8 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
     if path is None:
         path = Path("runs") / f"bench-{plan.study}"
         refuse_link(path)
+
+    # A later call continues in the folder only with the same program and the same rounding.
     arithmetic, versions = describe_program()
     facts = {"arithmetic": arithmetic, **versions}
     origin = json.dumps(facts, indent=2) + "\n"
@@ -767,6 +780,7 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
     else:
         make_results_folder(path, "", force=None)
         write_whole(origin_file, origin)
+
     remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(path))
     journal_file = path / JOURNAL_NAME
     return StudyFolder(
@@ -847,10 +861,10 @@ def _run_pending(
     on: Workers,
     progress: Progress,
 ) -> None:
-    """Executes the runs that the journal lacks, and adds each to the journal when it ends.
+    """Executes the runs that the journal lacks, and stores each run when it ends.
 
-    An interrupted suite therefore continues where it was. Nothing happens if all runs are
-    there.
+    An interrupted benchmark therefore continues where it was. Nothing happens if the journal
+    contains all runs.
 
     Args:
         journal: The finished runs.

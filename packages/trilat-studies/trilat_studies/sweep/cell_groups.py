@@ -62,13 +62,16 @@ class CellGroups(NamedTuple):
         )
 
     def iterate_cells(self, shape: Sequence[int]) -> Iterator[int]:
-        """Yields the numbers of all cells in the order in which they are run, group by group.
+        """Yields the numbers of all cells (grid points) in the order of their runs.
+
+        The cells of a group follow each other.
 
         Args:
-            shape: Size of the grid.
+            shape: Number of values in each dimension of the grid.
         """
-        for group in product(*self.parts):
-            for indices in product(*group):
+        for index_ranges in product(*self.parts):
+            for indices in product(*index_ranges):
+                # cells are numbered row by row
                 number = 0
                 for count, index in zip(shape, indices, strict=True):
                     number = number * count + index
@@ -90,23 +93,26 @@ def find_cell_groups(plan: SweepPlan) -> CellGroups:
     parts: list[tuple[Sequence[int], ...]] = []
     for dimension, (name, count) in enumerate(zip(names, plan.shape, strict=True)):
         checked = spread_indices(count)
-        indices_of: dict[Hashable, list[int]] = {}
+        indices_by_structure: dict[Hashable, list[int]] = {}
         for index in checked:
             structure = _find_structure(plan, dimension, index) if count > 1 else None
-            indices_of.setdefault(structure, []).append(index)
-        if len(indices_of) == 1:
+            indices_by_structure.setdefault(structure, []).append(index)
+
+        if len(indices_by_structure) == 1:
             parts.append((range(count),))
             continue
+
         keys.append(name)
         if len(checked) == count:
-            parts.append(tuple(map(tuple, indices_of.values())))
+            parts.append(tuple(map(tuple, indices_by_structure.values())))
         else:
+            # the structure of values that were not checked is unknown
             parts.append(tuple((index,) for index in range(count)))
     return CellGroups(tuple(keys), tuple(parts))
 
 
 def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
-    """Returns the structure of the first cell with a given value on one axis.
+    """Returns the structure of the scenario of a cell: the first cell with a value on one axis.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -114,8 +120,8 @@ def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
         index: Index of its value.
 
     Returns:
-        The structure. It is the obstacle to running side by side if there is one, and None if
-        the cell is not a valid scenario.
+        The structure. If the run cannot share vector instructions with others, it is the
+        reason. None if the cell is not a valid scenario.
     """
     stride = prod(plan.shape[dimension + 1 :])
     cell = plan.cell(index * stride)

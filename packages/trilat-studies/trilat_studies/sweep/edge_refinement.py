@@ -75,23 +75,23 @@ class EdgeRefinement:
         for number, side in sides.items():
             self._sides[number] = side
         while self._level <= self._halvings:
-            wanted = np.zeros(self._shape, bool)
+            is_needed = np.zeros(self._shape, bool)
             for panel in self._iterate_panels():
-                wanted[panel] = self._mark_panel(panel)
-            missing = np.flatnonzero(wanted.reshape(-1) & ~self._chosen)
-            if len(missing):
-                self._chosen[missing] = True
-                numbers: list[int] = missing.tolist()
+                is_needed[panel] = self._mark_panel(panel)
+            new_cells = np.flatnonzero(is_needed.reshape(-1) & ~self._chosen)
+            if len(new_cells):
+                self._chosen[new_cells] = True
+                numbers: list[int] = new_cells.tolist()
                 return numbers
             self._level += 1
         return []
 
     def list_coarse_cells(self) -> list[int]:
         """Returns the numbers of the cells of the coarse grid, with which the sweep begins."""
-        wanted = np.zeros(self._shape, bool)
+        is_needed = np.zeros(self._shape, bool)
         for panel in self._iterate_panels():
-            wanted[panel] = self._mark_lattice()
-        numbers: list[int] = np.flatnonzero(wanted).tolist()
+            is_needed[panel] = self._mark_lattice()
+        numbers: list[int] = np.flatnonzero(is_needed).tolist()
         return numbers
 
     def count_most_cells(self) -> int:
@@ -108,7 +108,10 @@ class EdgeRefinement:
         return min(math.prod(self._shape), cells)
 
     def _iterate_panels(self) -> Iterator[tuple[int | slice, ...]]:
-        """Yields the index of each panel: a setting of the law and of the other axes."""
+        """Yields an index of the grid for each panel, which has all values of the refined axes.
+
+        A panel is one setting of the control law and of the axes that are not refined.
+        """
         indices: list[list[int | slice]] = []
         for dimension, count in enumerate(self._shape):
             is_refined = dimension in self._dimensions
@@ -116,20 +119,25 @@ class EdgeRefinement:
         yield from itertools.product(*indices)
 
     def _find_lines(self, dimension: int, level: int) -> NDArray[np.int64]:
-        """Returns the indices of one axis between which the boxes of a level lie."""
+        """Returns the indices along one axis at which the boxes of a level have their corners.
+
+        Level 0 is the coarse grid. Each further level halves the boxes.
+        """
         last = self._shape[dimension] - 1
         stride = 1 << (self._halvings - level)
         return np.unique([*range(0, last, stride), last])
 
     def _mark_lattice(self) -> NDArray[np.bool_]:
-        """Returns a panel in which all corners of the boxes of level 0 are marked."""
-        wanted = np.zeros([self._shape[dimension] for dimension in self._dimensions], bool)
+        """Marks the corners of the boxes of the coarse grid in an empty panel."""
+        is_needed = np.zeros([self._shape[dimension] for dimension in self._dimensions], bool)
         lines = [self._find_lines(dimension, 0) for dimension in self._dimensions]
-        wanted[np.ix_(*lines)] = True
-        return wanted
+        is_needed[np.ix_(*lines)] = True
+        return is_needed
 
     def _mark_panel(self, panel: tuple[int | slice, ...]) -> NDArray[np.bool_]:
-        """Returns a panel in which the cells are marked that the present level needs.
+        """Marks the cells of a panel that must run at the present level of resolution.
+
+        They are the points that halve the boxes which the edge crosses.
 
         Args:
             panel: Index of the panel.
@@ -137,24 +145,26 @@ class EdgeRefinement:
         if self._level == 0:
             return self._mark_lattice()
         sides = self._sides.reshape(self._shape)[panel]
-        chosen = self._chosen.reshape(self._shape)[panel]
-        wanted = np.zeros(sides.shape, bool)
-        coarse = [self._find_lines(n, self._level - 1) for n in self._dimensions]
-        fine = [self._find_lines(n, self._level) for n in self._dimensions]
+        is_chosen = self._chosen.reshape(self._shape)[panel]
+        is_needed = np.zeros(sides.shape, bool)
+        coarse_lines = [self._find_lines(n, self._level - 1) for n in self._dimensions]
+        fine_lines = [self._find_lines(n, self._level) for n in self._dimensions]
 
-        has_corners = chosen[np.ix_(*coarse)]
-        for axis in range(len(coarse)):
+        # boxes of the level before all of whose corners have run
+        has_corners = is_chosen[np.ix_(*coarse_lines)]
+        for axis in range(len(coarse_lines)):
             # A box needs both of its corners along each axis.
             has_corners = np.delete(has_corners, -1, axis) & np.delete(has_corners, 0, axis)
         for box in np.argwhere(has_corners):
-            inside = []
-            for index, corners, lines in zip(box, coarse, fine, strict=True):
+            lines_in_box = []
+            for index, corners, lines in zip(box, coarse_lines, fine_lines, strict=True):
                 low, high = corners[index : index + 2]
-                inside.append(lines[(lines >= low) & (lines <= high)])
-            points = np.ix_(*inside)
-            # A point between two corners may be known from the box beside this one.
+                lines_in_box.append(lines[(lines >= low) & (lines <= high)])
+            points = np.ix_(*lines_in_box)
+            # The edge crosses the box if its known points lie on different sides. A point
+            # between two corners may be known from the box beside this one.
             known = sides[points]
             known = known[known != NOT_KNOWN]
             if len(known) and (known != known[0]).any():
-                wanted[points] = True
-        return wanted
+                is_needed[points] = True
+        return is_needed

@@ -56,6 +56,7 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
         gains = ", ".join(gain_texts) or "none"
         sites = sites_of_law.setdefault((law, gains), [])
         sites.append(site)
+
     for (law, gains), sites in sites_of_law.items():
         owner = law
         if len(sites) < len(scenario.sites):
@@ -106,14 +107,14 @@ def _read_default_settings(law: ImportedLaw) -> dict[str, Any]:
         return {}
     tree = ast.parse(source.content)
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    kind = classes.get(law.code.partition(":")[2])
-    while kind is not None:
-        for member in kind.body:
+    law_class = classes.get(law.code.partition(":")[2])
+    while law_class is not None:
+        for member in law_class.body:
             if isinstance(member, ast.FunctionDef) and member.name == "__init__":
                 return _list_defaults(member.args)
         # The class may have the arguments of a base class, which stands before it in the file.
-        bases = [base.id for base in kind.bases if isinstance(base, ast.Name)]
-        kind = classes.pop(bases[0], None) if bases else None
+        bases = [base.id for base in law_class.bases if isinstance(base, ast.Name)]
+        law_class = classes.pop(bases[0], None) if bases else None
     return {}
 
 
@@ -126,10 +127,12 @@ def _list_defaults(arguments: ast.arguments) -> dict[str, Any]:
     positional = [*arguments.posonlyargs, *arguments.args]
     # Only the last of the positional arguments have defaults.
     first = len(positional) - len(arguments.defaults)
+
     pairs = [
         *zip(positional[first:], arguments.defaults, strict=True),
         *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
     ]
+
     defaults = {}
     for argument, value in pairs:
         if value is None:  # an argument without a default

@@ -269,9 +269,11 @@ def _write_caption(
     reserved = top
     if shares_labels:
         reserved += _SHARED_LABEL_IN / height_in
+
     panel_rectangle = (0.0, reserved, 1.0, 1.0 - reserved)
     engine: Any = figure.get_layout_engine()
     engine.set(rect=panel_rectangle)
+
     figure.text(
         x=0.01,
         y=0.02 / height_in,
@@ -620,6 +622,7 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     panel_height_pt = 72.0 * extent.height / dpi
     cell_width_pt = panel_width_pt / len(plane.x.values)
     cell_height_pt = panel_height_pt / len(plane.y.values)
+
     digits = len(str(plane.seeds))
     letters = 2 * digits + 1
     text_width_pt = letters * _DIGIT_WIDTH * _COUNT_PT
@@ -762,10 +765,12 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
         f"![map]({picture})",
         class_table.markdown(),
     ]
+
     notes = _list_notes(chart)
     if notes:
         note_lines = [f"- {note}" for note in notes]
         parts.append("\n".join(note_lines))
+
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
         table = tabulate_edges(chart.plane, panel, lines)
         if table.rows:
@@ -786,6 +791,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
             origin = f"{line.text}: {line.about}"
             origins.append(origin)
     notes = [*dict.fromkeys(origins), *chart.remarks]
+
     plane = chart.plane
     if plane.halvings:
         notes.append(
@@ -795,6 +801,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
     if plane.refused:
         refused = count_nouns(plane.refused, "cell")
         notes.append(f"refused, and without runs: {refused}, not valid as scenarios")
+
     notes += [f"gains that were not swept: {text}" for text in chart.fixed]
     if chart.fixed:
         command = "trilat compare --tune"

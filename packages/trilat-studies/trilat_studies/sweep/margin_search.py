@@ -116,10 +116,10 @@ def search_key_margin(
             results[value] = stable(value)
         return results[value]
 
-    scan = np.linspace(low, high, SCAN_POINTS)
+    scanned_values = np.linspace(low, high, SCAN_POINTS)
     if whole:
-        scan = np.round(scan)
-    values = list(dict.fromkeys(scan.tolist()))
+        scanned_values = np.round(scanned_values)
+    values = list(dict.fromkeys(scanned_values.tolist()))
     decided = [value for value in values if classify(value) is not None]
 
     spans = list[StabilityEdge]()
@@ -155,13 +155,13 @@ def _narrow_edge(
     def is_not_high_side(value: float) -> bool:
         return classify(value) is not high_stable
 
-    low, above = _bisect(is_low_side, low, high, tolerance=tolerance, whole=whole)
-    is_sharp = classify(above) is not None
+    low, first_above = _bisect(is_low_side, low, high, tolerance=tolerance, whole=whole)
+    is_sharp = classify(first_above) is not None
     if is_sharp:
-        high = above
+        high = first_above
     else:
-        # `above` lies in an undecided zone, whose upper end is searched separately.
-        _, high = _bisect(is_not_high_side, above, high, tolerance=tolerance, whole=whole)
+        # This value lies in an undecided zone, whose upper end is searched separately.
+        _, high = _bisect(is_not_high_side, first_above, high, tolerance=tolerance, whole=whole)
     return StabilityEdge(low, high, low_stable is True, is_sharp)
 
 
@@ -274,11 +274,13 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
         raise UsageError(
             f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
         ) from None
+
     if not 0.0 < tolerance < 1.0:
         raise UsageError(
             f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
             f"not {tolerance:g}"
         )
+
     is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
     if not colon or not search_range.key or not is_rising:
         form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
@@ -408,9 +410,9 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the edge that is nearest to a value, to show theory beside a measured edge.
+    """Returns the edge that is nearest to a value. None if there are no edges.
 
-    None if there are no edges.
+    The table shows the edge of theory that is nearest to the measured one.
     """
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
@@ -564,6 +566,7 @@ class SweepMargins(Result):
         base = self.plan.base
         parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]
         parts.append(self.table().markdown())
+
         remarks = dict.fromkeys(point.remark for point in self.found if point.remark)
         parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
         islands = sum(len(point.margin.spans) > 1 for point in self.found)
@@ -572,6 +575,7 @@ class SweepMargins(Result):
             parts.append(
                 f"Stability is not monotone at {islands} of {points}: several edges each."
             )
+
         fixed = "; ".join(describe_fixed_gains(self.plan))
         advice = FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")
         parts.append(f"Gains that were not swept: {fixed}. {advice[0].upper()}{advice[1:]}.")
@@ -594,11 +598,11 @@ class SweepMargins(Result):
 
 
 def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
-    """Returns the table cells of an edge, as in "40 to 41", and of its stable side.
+    """Returns two table cells: a measured edge, as in "40 to 41", and its stable side.
 
     Args:
         margin: The edges of the grid point.
-        span: The edge. None if the grid point has no edges: the cell then says whether all
+        span: The edge. None if the grid point has no edges. The cell then says whether all
             values were stable or none.
     """
     if span is None:
@@ -616,11 +620,11 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
 
 def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
-    """Returns the table cells of an edge from theory and of its relative difference.
+    """Returns two table cells: an edge from theory, and its difference from the measured edge.
 
     Args:
-        span: The measured edge, from which the difference is counted, or None.
-        value: The edge from theory, or None. Then both cells are "-".
+        span: The measured edge. None if there is no edge, and thus no difference.
+        value: The edge from theory. None if there is no edge: both cells are then "-".
     """
     if value is None:
         return ["-", "-"]

@@ -87,7 +87,7 @@ class ResultTable:
         yield from iterate_csv(map(self._format_row, rows), self.columns)
 
     def _format_row(self, row: ResultRow) -> dict[str, str]:
-        """Returns the texts of a row, by column."""
+        """Returns the texts of a run's row in the CSV table, by column."""
         line = {name: format_table_cell(row[name], kind) for name, kind in self._kinds.items()}
         changes = diff_lines(row["scenario"], self._plan.base.text)
         line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
@@ -129,6 +129,7 @@ class StoredRows(Sequence[ResultRow]):
         self._file = file
         self._table = table
         self._offsets = array("q")
+
         offset = 0
         quotes = 0
         with self._explaining_errors():
@@ -142,6 +143,7 @@ class StoredRows(Sequence[ResultRow]):
             self._offsets.append(offset)
             with file.open(encoding="utf-8", newline="") as stream:
                 self._names = _read_next(csv.reader(stream, strict=True)) or []
+
         for name in table.columns:
             if name not in self._names:
                 raise UsageError(
@@ -160,8 +162,8 @@ class StoredRows(Sequence[ResultRow]):
     def __getitem__(self, index: int | slice) -> ResultRow | list[ResultRow]:
         if isinstance(index, slice):
             return [self[n] for n in range(len(self))[index]]
-        number = range(len(self))[index] + 1
-        first, stop = self._offsets[number : number + 2]
+        line_number = range(len(self))[index] + 1  # line 0 is the header
+        first, stop = self._offsets[line_number : line_number + 2]
         with self._explaining_errors():
             with self._file.open("rb") as stream:
                 stream.seek(first)
@@ -194,7 +196,7 @@ class StoredRows(Sequence[ResultRow]):
             return [self._table.parse(line) for line in lines]
 
     def _iterate_lines(self) -> Iterator[dict[str, str]]:
-        """Yields the texts of each row, by column."""
+        """Yields each row of the file as texts by column, without converting them to values."""
         with (
             self._explaining_errors(),
             self._file.open(encoding="utf-8", newline="") as stream,
@@ -206,7 +208,7 @@ class StoredRows(Sequence[ResultRow]):
                     yield self._name_fields(fields)
 
     def _name_fields(self, fields: Sequence[str]) -> dict[str, str]:
-        """Returns the texts of a row by column.
+        """Returns the texts of a row, in the order of the file, as texts by column.
 
         Raises:
             ValueError: The row has too few or too many fields.

@@ -211,23 +211,27 @@ def fill_panel(panel: MapPanel) -> MapPanel:
     from scipy.interpolate import griddata
     from scipy.ndimage import distance_transform_edt
 
-    def fill_nearest(is_missing: Any) -> Any:
-        """Returns the indices of the nearest grid point that is not missing."""
+    def find_nearest(is_missing: Any) -> Any:
+        """Returns for each grid point the indices of the nearest point that is not missing."""
         return distance_transform_edt(is_missing, return_distances=False, return_indices=True)
 
     if not panel.runs.any():
         return panel
-    rows, columns = fill_nearest(panel.runs == 0)
+    rows, columns = find_nearest(panel.runs == 0)
     exponents_per_s = panel.exponents_per_s
     if np.isfinite(exponents_per_s).any():
-        known = np.argwhere(np.isfinite(exponents_per_s))
-        places = np.indices(exponents_per_s.shape).reshape(2, -1).T
-        filled = exponents_per_s[tuple(fill_nearest(np.isnan(exponents_per_s)))]
-        has_area = min(np.ptp(known, axis=0)) > 0
+        known_points = np.argwhere(np.isfinite(exponents_per_s))
+        all_points = np.indices(exponents_per_s.shape).reshape(2, -1).T
+        nearest = find_nearest(np.isnan(exponents_per_s))
+        filled = exponents_per_s[tuple(nearest)]
+        # points on one line span no area in which to interpolate
+        has_area = min(np.ptp(known_points, axis=0)) > 0
         if has_area:
-            values = exponents_per_s[tuple(known.T)]
-            inside = griddata(known, values, places).reshape(exponents_per_s.shape)
-            filled = np.where(np.isfinite(inside), inside, filled)
+            values = exponents_per_s[tuple(known_points.T)]
+            interpolated = griddata(known_points, values, all_points).reshape(
+                exponents_per_s.shape
+            )
+            filled = np.where(np.isfinite(interpolated), interpolated, filled)
         exponents_per_s = filled
     return panel._replace(counts=panel.counts[rows, columns], exponents_per_s=exponents_per_s)
 
@@ -334,12 +338,13 @@ class _PanelRuns:
         Args:
             run: A row for `build_plane`.
         """
-        i = self._row_of_y[run[self._y_key]] if self._y_key else 0
-        j = self._column_of_x[run[self._x_key]]
-        self.counts[i, j, _CLASS_INDEX[run["verdict"]]] += 1
+        row = self._row_of_y[run[self._y_key]] if self._y_key else 0
+        column = self._column_of_x[run[self._x_key]]
+        run_class = _CLASS_INDEX[run["verdict"]]
+        self.counts[row, column, run_class] += 1
         exponent = run.get("exponent_per_s")
         # A run without an exponent makes the mean of its grid point NaN.
-        self._sums_per_s[i, j] += np.nan if exponent is None else exponent
+        self._sums_per_s[row, column] += np.nan if exponent is None else exponent
 
     def compute_exponents(self) -> Array:
         """Returns the mean growth exponent of each grid point, see `MapPanel`."""
@@ -420,13 +425,13 @@ def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, Stabil
 
         # Compare each decided grid point with the next decided one.
         is_change = is_stable[1:] != is_stable[:-1]
-        for n in np.flatnonzero(is_change):
-            below, above = decided[n : n + 2].tolist()
+        for position in np.flatnonzero(is_change):
+            lower_index, upper_index = decided[position : position + 2].tolist()
             edge = StabilityEdge(
-                low=y[below],
-                high=y[above],
-                stable_below=bool(is_stable[n]),
-                sharp=above == below + 1,  # no undecided grid point lies between
+                low=y[lower_index],
+                high=y[upper_index],
+                stable_below=bool(is_stable[position]),
+                sharp=upper_index == lower_index + 1,  # no undecided grid point lies between
             )
             edges.append((x, edge))
     return edges
@@ -688,9 +693,11 @@ def _compute_pair_excess(
     d_1, d_2 = d
     damping_1 = np.maximum(d_1 - K_1 * lag / frequency_per_s, 0.0)
     damping_2 = np.maximum(d_2 - K_2 * lag / frequency_per_s, 0.0)
+
     delay_angle = mean_delay_ticks * phi
     coupling = np.sin(delay_angle) + lag * np.cos(delay_angle)
     mean_delay_s = np.abs(coupling) / frequency_per_s
+
     mean_stiffness = math.sqrt(K_1 * K_2)
     half_excess = np.sqrt(damping_1 * damping_2) - mean_stiffness * mean_delay_s
     return float(2.0 * np.min(half_excess))  # doubled, because the delay is the mean of two
@@ -706,8 +713,8 @@ def _bound_least_inertia(arm: ArmModel) -> float:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
     poses = np.array([[0.0, 0.0], [0.0, np.pi]])
     extreme_poses = PlacedArm(0.0, arm.lengths_m, poses)
-    inertia_kg_m2 = extreme_poses.inertia_matrix(arm.theta).T
-    eigenvalues = np.linalg.eigvalsh(inertia_kg_m2)
+    inertia_matrices = extreme_poses.inertia_matrix(arm.theta).T
+    eigenvalues = np.linalg.eigvalsh(inertia_matrices)
     return float(eigenvalues.min())
 
 
@@ -837,7 +844,7 @@ class _FineColumns(NamedTuple):
 
 
 def _keep_columns(axis: PlaneAxis) -> _FineColumns:
-    """Returns the columns of the map alone, with none between them.
+    """Returns the columns of a map alone, for lines that are not computed between them.
 
     Args:
         axis: Horizontal axis of the map.
@@ -859,23 +866,30 @@ def refine_columns(axis: PlaneAxis) -> _FineColumns:
     values = np.array(axis.values)
     positions = axis.positions
     intervals = len(values) - 1
-    parts = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
-    if intervals < 1 or parts == 1:
+    steps_per_interval = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
+    if intervals < 1 or steps_per_interval == 1:
         return _keep_columns(axis)
-    indices = np.arange(intervals * parts + 1) / parts
+
+    indices = np.arange(intervals * steps_per_interval + 1) / steps_per_interval
     fine_values = np.interp(indices, np.arange(len(values)), values)
     fine_positions = np.interp(indices, np.arange(len(values)), positions)
-    fine_values[::parts] = values
-    on_grid = np.arange(len(values)) * parts
+
+    # Interpolation would round the values of the grid.
+    fine_values[::steps_per_interval] = values
+    on_grid = np.arange(len(values)) * steps_per_interval
+
+    # The first and last cells extend past their values, so the lines do too.
     if axis.is_evenly_spaced:
         borders = compute_borders(axis)
-        half = max(1, parts // 2)  # the borders are half a cell away
-        before = np.linspace(borders[0], values[0], half, endpoint=False)
-        after = np.linspace(borders[-1], values[-1], half, endpoint=False)[::-1]
-        before = before[before < values[0]]
-        fine_values = np.concatenate([before, fine_values, after])
-        fine_positions = np.concatenate([before, fine_positions, after])
-        on_grid = on_grid + len(before)
+        half_cell_steps = max(1, steps_per_interval // 2)  # the borders are half a cell away
+        left_of_map = np.linspace(borders[0], values[0], half_cell_steps, endpoint=False)
+        right_of_map = np.linspace(borders[-1], values[-1], half_cell_steps, endpoint=False)
+        right_of_map = right_of_map[::-1]
+        left_of_map = left_of_map[left_of_map < values[0]]
+        fine_values = np.concatenate([left_of_map, fine_values, right_of_map])
+        fine_positions = np.concatenate([left_of_map, fine_positions, right_of_map])
+        on_grid = on_grid + len(left_of_map)
+
     return _FineColumns(
         tuple(fine_values.tolist()), tuple(fine_positions.tolist()), tuple(on_grid.tolist())
     )
@@ -945,6 +959,7 @@ class MapLine(NamedTuple):
         upper_left = upper[:, :-1]
         upper_right = upper[:, 1:]
         corners = np.array([lower_left, lower_right, upper_left, upper_right])
+
         has_values = np.isfinite(corners).all(axis=0)
         stable = (corners > 0.0).sum(axis=0)
         some_are_stable = (stable > 0) & (stable < len(corners))
@@ -1185,6 +1200,7 @@ def find_criterion_edge(
     from scipy.optimize import brentq
 
     def excess(value: float) -> float:
+        """Returns by how much a value satisfies the condition; negative if it does not."""
         evaluated = criterion(value)
         if evaluated is None:
             raise ScenarioError("no criterion covers it")
@@ -1308,7 +1324,7 @@ def build_stability_map(
 
 
 def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
-    """Arranges the runs of a sweep, with the values of its axes that its plan has.
+    """Arranges the runs of a sweep for a map, over all values that the plan gives to its axes.
 
     Args:
         results: The sweep.
@@ -1318,13 +1334,14 @@ def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
     if len(plan.laws) > 1:
         grid[LAW_AXIS] = list(plan.laws)
     for axis in plan.axes:
-        grid[axis.key] = [axis.value(n) for n in range(len(axis.texts))]
+        value_count = len(axis.texts)
+        grid[axis.key] = [axis.value(n) for n in range(value_count)]
     plane = build_plane(results.rows, list(grid), plan.base, grid)
     return plane._replace(halvings=plan.refine, is_linear=plan.judge == "linear")
 
 
 def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
-    """Returns a map with the measured limits of stability of another sweep.
+    """Adds the measured limits of stability of another sweep to a map, for comparison.
 
     Args:
         plane: The map.
@@ -1337,36 +1354,44 @@ def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
         panel.settings: tuple(find_map_edges(simulated, panel)) for panel in simulated.panels
     }
     has_panels = all(panel.settings in edges_of for panel in plane.panels)
-    if (plane.x.key, plane.y.key) != (simulated.x.key, simulated.y.key) or not has_panels:
+    has_axes = (plane.x.key, plane.y.key) == (simulated.x.key, simulated.y.key)
+    if not (has_axes and has_panels):
         raise UsageError(
             f"the other sweep has the axes {simulated.x.key}, {simulated.y.key}: a map shows "
             f"its edge only over the same axes, {plane.x.key}, {plane.y.key}"
         )
-    panels = [panel._replace(simulated=edges_of[panel.settings]) for panel in plane.panels]
+    panels = []
+    for panel in plane.panels:
+        edges = edges_of[panel.settings]
+        panels.append(panel._replace(simulated=edges))
     return plane._replace(panels=tuple(panels))
 
 
 def thin_axis(axis: PlaneAxis, halvings: int) -> PlaneAxis:
-    """Returns every so many values of an axis: the coarse grid of a refined sweep.
+    """Returns the values of an axis that belong to the coarse grid of a refined sweep.
+
+    Such a sweep begins with this grid, and then halves it along the edge of stability.
 
     Args:
         axis: The axis.
         halvings: Number of halvings of the refined sweep. 0 returns the whole axis.
     """
+    stride = 2**halvings
     last = len(axis.values) - 1
-    indices = sorted({*range(0, last, 1 << halvings), last})
+    # the last value is kept even if no whole number of strides leads to it
+    indices = [*range(0, last, stride), last]
     return axis._replace(values=tuple(axis.values[n] for n in indices))
 
 
 def _spread_line(
     line: MapLine | None, x: PlaneAxis, y: PlaneAxis, fine: _FineColumns, plane: MapPlane
 ) -> MapLine | None:
-    """Interpolates the quantity of a line from a coarse grid to the grid points of a map.
+    """Interpolates a line from the coarse grid of a refined sweep to all grid points of a map.
 
     Lines of theory are smooth, and the limit in each column of the coarse grid is exact.
 
     Args:
-        line: The line over the coarse grid.
+        line: The line over the coarse grid. None is returned as None.
         x: Horizontal axis of the coarse grid.
         y: Vertical axis of the coarse grid.
         fine: Columns at which the line was computed.
@@ -1376,18 +1401,20 @@ def _spread_line(
         return None
 
     def spread_rows(excess: Array) -> Array:
+        """Interpolates each column at the y values of the map."""
         columns = [np.interp(plane.y.values, y.values, column) for column in excess.T]
         return np.array(columns).T
 
-    at_columns = spread_rows(line.excess)
-    excess = np.array([np.interp(plane.x.values, x.values, row) for row in at_columns])
-    drawn = spread_rows(line.drawn_excess)
+    # first along y, then along x
+    at_coarse_columns = spread_rows(line.excess)
+    excess = np.array([np.interp(plane.x.values, x.values, row) for row in at_coarse_columns])
+    drawn_excess = spread_rows(line.drawn_excess)
     values = np.array(fine.values)
     positions = values
     if not plane.x.is_evenly_spaced:
         positions = np.interp(values, plane.x.values, plane.x.positions)
     return line._replace(
-        excess=excess, fine_positions=tuple(positions.tolist()), fine_excess=drawn
+        excess=excess, fine_positions=tuple(positions.tolist()), fine_excess=drawn_excess
     )
 
 

@@ -273,14 +273,14 @@ class _CellInProgress:
         A lasting motion under a user's law may be a decay that is too slow to show. The roots
         of the loop, which take longer than the measurement, are computed in this case only.
         """
-        trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
-        end = trace.classify_end(self._scenario)
-        self._outcome = _build_result(self.run, end, self._totals, self._extended)
+        run_trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
+        run_end = run_trace.classify_end(self._scenario)
+        self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
         self._is_finished = is_conclusive(self._outcome)
         has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
-        if self._is_finished and has_own_law and end.stability is Stability.NOT_STABLE:
+        if self._is_finished and has_own_law and run_end.stability is Stability.NOT_STABLE:
             roots = find_run_roots(self._scenario, self.run)
-            self._is_finished = roots.measure_decay_misfit(end) > 1.0
+            self._is_finished = roots.measure_decay_misfit(run_end) > 1.0
 
 
 def classify_cell(text: str, longest_s: float) -> CellResult:
@@ -356,22 +356,24 @@ def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:
         group: Group of the runs of some cells. They have the same duration.
         cells: All cells.
     """
-    members = [cells[index] for index in group.members]
-    group.advance_to(members[0].duration_s)
-    for cell in members:
+    running_cells = [cells[index] for index in group.members]
+    group.advance_to(running_cells[0].duration_s)
+    for cell in running_cells:
         cell.note_first_end()
     while True:
-        ends_s = [cell.find_next_end() for cell in members]
-        chosen = [position for position, end_s in enumerate(ends_s) if end_s is not None]
-        if not chosen:
+        next_ends_s = [cell.find_next_end() for cell in running_cells]
+        unfinished = [
+            position for position, end_s in enumerate(next_ends_s) if end_s is not None
+        ]
+        if not unfinished:
             return
-        group.keep(chosen)
-        members = [members[position] for position in chosen]
+        group.keep(unfinished)
+        running_cells = [running_cells[position] for position in unfinished]
         # Cells with the same duration are extended to the same times.
-        end_s = members[0].find_next_end()
+        end_s = running_cells[0].find_next_end()
         assert end_s is not None
         group.advance_to(end_s)
-        for cell in members:
+        for cell in running_cells:
             cell.note_extension(end_s)
 
 
@@ -412,6 +414,7 @@ def judge_linearly(scenario: Scenario) -> CellResult:
         return build_unsimulated_result(CellClass.UNDECIDED, remarks)
     if math.isinf(rate_per_s):
         return build_unsimulated_result(CellClass.UNDECIDED, "nothing moves in the linear loop")
+
     verdict = CellClass.DIVERGED if rate_per_s > 0.0 else CellClass.CONVERGED
     basis = "Floquet multipliers" if column.is_sampled else "characteristic roots"
     reasons = [f"{basis} of the linear loop", *column.remarks]
@@ -499,7 +502,7 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 def _build_result(
     run: FusedRun, end: RunEnd, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
-    """Returns the result of a run up to the time that the run has reached.
+    """Returns the result of a cell, as far as its run has been simulated so far.
 
     Args:
         run: The run.
@@ -545,13 +548,14 @@ def diff_lines(text: str, base: str) -> LineDiff:
     # In reversed order the first occurrence of a line is entered last, and so it is kept.
     first_index = {line: index for index, line in reversed(list(enumerate(base_lines)))}
     parts: list[str | tuple[int, int]] = []
-    expected = 0  # index in the base if the text continues line by line
+    next_index = 0  # index of the line in the base that follows the line before
     for line in text.split("\n"):
-        continues = expected < len(base_lines) and base_lines[expected] == line
-        index = expected if continues else first_index.get(line)
+        # most lines stand behind the line before in the base, too
+        follows_base = next_index < len(base_lines) and base_lines[next_index] == line
+        index = next_index if follows_base else first_index.get(line)
         if index is None:
             parts.append(line)
-            expected += 1
+            next_index += 1
             continue
 
         previous = parts[-1] if parts else None
@@ -559,7 +563,7 @@ def diff_lines(text: str, base: str) -> LineDiff:
             parts[-1] = (previous[0], index)  # the line extends the previous range
         else:
             parts.append((index, index))
-        expected = index + 1
+        next_index = index + 1
     return tuple(parts)
 
 

@@ -145,6 +145,7 @@ def parse_axis(description: str) -> _SweepAxis:
         raise ScenarioError(
             f"the values must have a form such as {example}, not {text!r}", path=key
         )
+
     texts: tuple[str, ...] | _Steps
     if len(parts) == 1:
         texts = _parse_list(key, text)
@@ -230,6 +231,7 @@ def _parse_decimal(key: str, text: str) -> Decimal:
             "list words as in KEY=first,second"
         )
         raise ScenarioError(problem, path=key) from None
+
     if not number.is_finite():
         raise ScenarioError(f"a range must consist of finite numbers, not {text!r}", path=key)
     size = abs(number)
@@ -270,17 +272,17 @@ def _split_outside_brackets(text: str, separator: str) -> list[str]:
     A value of a list may itself be a list or a text that contains the separator.
     """
     parts = [""]
-    depth = 0  # number of brackets that are open
-    quote = ""  # quotation mark that is open; empty outside of quotation marks
+    open_brackets = 0
+    open_quote = ""  # the quotation mark that is open; empty outside of quotation marks
     for letter in text:
-        if quote:
-            quote = "" if letter == quote else quote
+        if open_quote:
+            open_quote = "" if letter == open_quote else open_quote
         elif letter in "\"'":
-            quote = letter
-        if not quote:
-            depth += (letter in "[{") - (letter in "]}")
+            open_quote = letter
+        if not open_quote:
+            open_brackets += (letter in "[{") - (letter in "]}")
 
-        is_separator = letter == separator and not depth and not quote
+        is_separator = letter == separator and not open_brackets and not open_quote
         if is_separator:
             parts.append("")
         else:
@@ -409,10 +411,10 @@ class SweepPlan(NamedTuple):
             )
 
         # The number has one digit per dimension of the grid, and the last one changes fastest.
-        rest = number
+        remaining_number = number
         indices = list[int]()
         for count in reversed(self.shape):
-            rest, index = divmod(rest, count)
+            remaining_number, index = divmod(remaining_number, count)
             indices.insert(0, index)
         law_index, *axis_indices = indices
 
@@ -559,12 +561,14 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
         ScenarioError: The plan cannot run on this machine.
     """
     folder = None if facts["folder"] is None else Path(facts["folder"])
+
     written = ExperimentText(facts["source"], facts["text"], folder)
     texts = tuple(facts["overrides"])
     axes = tuple(map(parse_axis, facts["over"]))
     loaded = _load_base(written, texts, axes, facts["laws"])
     base = allow_own_code(loaded.scenario)
     laws = {law: _list_law_overrides(written, texts, loaded, law) for law in facts["laws"]}
+
     return SweepPlan(
         written=written,
         overrides=texts,
@@ -786,9 +790,10 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
             try:
                 digest = _load_cell(plan, indices).sha256
             except ScenarioError as error:
-                others = last_cell.copy()
-                others[dimension] = index
-                if not _is_valid(plan, others):
+                # the value may be valid only with other values of the other axes
+                opposite_cell = last_cell.copy()
+                opposite_cell[dimension] = index
+                if not _is_valid(plan, opposite_cell):
                     raise error from None
                 continue
             text = axis.texts[index]
@@ -823,17 +828,17 @@ def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
 
 
 def spread_indices(count: int) -> list[int]:
-    """Returns the indices of the values that are checked before a sweep, at most a few.
+    """Returns the indices of the values of an axis that are checked before a sweep runs.
 
-    They are evenly spread over `count` values, and include the first and the last one. A grid
-    may be too large to check every cell.
+    They are evenly spread over `count` values, include the first and the last one, and are at
+    most `_CHECKED_VALUES`. A grid may be too large to check every cell.
 
     Args:
         count: Number of values.
     """
     checked = min(count, _CHECKED_VALUES)
     intervals = max(1, checked - 1)
-    return [k * (count - 1) // intervals for k in range(checked)]
+    return [index * (count - 1) // intervals for index in range(checked)]
 
 
 def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
@@ -849,8 +854,8 @@ def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
     """
     # The number of a cell has one digit per dimension of the grid, see `SweepPlan.cell`.
     number = 0
-    for count, index in zip(plan.shape, indices, strict=True):
-        number = number * count + index
+    for dimension_size, index in zip(plan.shape, indices, strict=True):
+        number = number * dimension_size + index
     cell = plan.cell(number)
 
     try:
@@ -919,17 +924,17 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
     Returns:
         The name in words, such as "K of s", and the unit, which is empty if there is none.
     """
-    *tables, last = key.split(".")
-    element = ""
-    if last.isdigit() and tables:  # an element of a list over joints or parameters
-        element = f"[{last}]"
-        last = tables.pop()
-    quantity, unit = split_unit(last)
-    is_symbol = not unit and len(last) <= 3
+    *tables, name = key.split(".")
+    subscript = ""
+    if name.isdigit() and tables:  # an element of a list over joints or parameters
+        subscript = f"[{name}]"
+        name = tables.pop()
+    quantity, unit = split_unit(name)
+    is_symbol = not unit and len(name) <= 3
     if is_symbol:
-        quantity = last  # symbols such as Kp keep their capital letters
+        quantity = name  # symbols such as Kp keep their capital letters
     owner = _describe_owner(tables, scenario)
-    return f"{quantity}{element}{owner}", _GAINS.get(last) or unit.replace("^2", "²")
+    return f"{quantity}{subscript}{owner}", _GAINS.get(name) or unit.replace("^2", "²")
 
 
 def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:

@@ -149,7 +149,9 @@ def iterate_cells(
         plan: The sweep: its scenario, axes, control laws and seeds.
         done: The finished runs, by cell and seed.
     """
-    cells = {cell for cell, _ in done} if len(plan.seeds) > 1 else (cell for cell, _ in done)
+    cells: Iterable[int] = (cell for cell, _ in done)
+    if len(plan.seeds) > 1:
+        cells = set(cells)  # a cell has an entry for each seed
     for cell in sorted(cells):
         yield [done[cell, seed] for seed in plan.seeds if (cell, seed) in done]
 
@@ -183,8 +185,10 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
         duration_s=reproduction_duration_s(plan, entry.outcome),
         log=log,
     )
+
     axis_keys = [axis.key for axis in plan.axes]
     axis_values = dict(zip(axis_keys, cell.values, strict=True))
+
     scenario_text = apply_diff(entry.scenario, plan.base.text)
     return {
         "cell": cell.number,
@@ -534,7 +538,7 @@ GROWTH_EXPONENTS = "growth exponents of small pushes"
 
 
 def _list_quantities(plan: SweepPlan) -> dict[str, tuple[str, str]]:
-    """Returns the name and unit of each quantity whose range is printed, by its key.
+    """Returns the quantities whose ranges a summary prints: name and unit, by key.
 
     Args:
         plan: The sweep, whose requested metrics come first.
@@ -600,7 +604,7 @@ class _RowTally:
 
 
 def _tally_rows(results: SweepResults) -> _RowTally:
-    """Collects the numbers of the summary of a sweep. Every row is read once.
+    """Collects the numbers of the summary of a sweep in one pass over its table of runs.
 
     Args:
         results: Results of the sweep: its plan and one row per run.
@@ -648,6 +652,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
     if doubtful:
         cells = count_nouns(doubtful_count, "cell")
         yield f"stable with some seeds and not with others, {cells}:"
+
     for point in doubtful:
         setting = [point.law] if results.plan.laws else []
         for axis, value in zip(results.plan.axes, point.values, strict=True):
@@ -658,6 +663,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
             f"{point.stable} of {point.decided} stable, "
             f"95 % interval {low:.0f} to {high:.0f} %"
         )
+
     if doubtful_count > _MAX_CELLS_SHOWN:
         hidden = doubtful_count - _MAX_CELLS_SHOWN
         yield f"  and {hidden} more, all in {GRID_POINTS_FILE}"
@@ -697,6 +703,7 @@ def build_reproduce_command(
     plan = results.plan
     source = plan.written.label
     overrides = plan.cell(row["cell"]).overrides
+
     try:
         text, source_folder = read_source(source)
         written = plan.written._replace(text=text, folder=source_folder)

@@ -95,20 +95,20 @@ SweepFolder = StudyFolder[SweepPlan, CellRun]
 
 
 def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolder:
-    """Returns the object for the folder of a sweep.
+    """Returns the object with which the folder of a sweep is read and continued.
 
-    The journal is tied to the digest of the plan, so that runs of another plan are ignored.
+    Its journal is tied to the digest of the plan, so that runs of another plan are ignored.
 
     Args:
         path: Path of the folder.
         plan: The sweep: its scenario, axes, control laws and seeds.
         facts: The plan as plain values, with the arithmetic and the versions of the program.
     """
-    study = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
+    plan_digest = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
     remedy = build_resume_hint("sweep", "--resume", str(path))
 
     def open_journal() -> RunJournal[CellRun]:
-        return RunJournal(path / JOURNAL_FILE, study, CellRun, remedy)
+        return RunJournal(path / JOURNAL_FILE, plan_digest, CellRun, remedy)
 
     return SweepFolder(path, plan, facts, remedy, open_journal)
 
@@ -230,7 +230,7 @@ def _list_facts(plan: SweepPlan) -> dict[str, Any]:
 
 
 def _encode_plan(facts: Mapping[str, Any]) -> str:
-    """Returns the text of the plan file. Equal plans have equal bytes."""
+    """Returns the text of the file with the plan of a sweep. Equal plans have equal bytes."""
     return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
 
 
@@ -330,11 +330,11 @@ def run_cell(task: CellItem) -> CellRun:
 
 
 def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
-    """Returns the result of a cell that is not a valid scenario, or that cannot run.
+    """Returns the result of a run that was refused, with the reason in place of numbers.
 
     Args:
         task: The run.
-        error: The reason.
+        error: The reason: the cell is not a valid scenario, or cannot run.
     """
     cell = task.cell
     setting = ", ".join(cell.overrides)
@@ -361,14 +361,14 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
         The finished runs in the order of the tasks, equal to those of `run_cell`.
     """
     scenarios: dict[int, Scenario] = {}
-    refused: dict[int, CellRun] = {}
+    refused_runs: dict[int, CellRun] = {}
     for index, task in enumerate(tasks):
         try:
             scenarios[index] = _build_scenario(task)
         except CodeWithheld:
             raise
         except ScenarioError as error:
-            refused[index] = _refuse_cell(task, error)
+            refused_runs[index] = _refuse_cell(task, error)
     texts = [scenario.text for scenario in scenarios.values()]
     try:
         judged_cells = iter(list(sweep_cell.classify_cells(texts, tasks[0].plan.longest_s)))
@@ -377,16 +377,16 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
         yield from map(run_cell, tasks)
         return
     for index, task in enumerate(tasks):
-        if index in refused:
-            yield refused[index]
+        if index in refused_runs:
+            yield refused_runs[index]
             continue
-        judged = next(judged_cells)
-        run = _complete_run(task, scenarios[index], judged.result)
-        yield msgspec.structs.replace(run, alone=judged.obstacle)
+        judged_cell = next(judged_cells)
+        run = _complete_run(task, scenarios[index], judged_cell.result)
+        yield msgspec.structs.replace(run, alone=judged_cell.obstacle)
 
 
 def _build_scenario(task: CellItem) -> Scenario:
-    """Returns the scenario of a run of a sweep.
+    """Returns the scenario of one run of a sweep, with the values of its cell and its seed.
 
     Raises:
         ScenarioError: The scenario is not valid or cannot run.
@@ -440,7 +440,9 @@ site tick.
 
 
 def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Returns True if the runs of a sweep are to be computed side by side.
+    """Returns True if a sweep is large enough to compute several runs side by side (in lanes).
+
+    The code for these SIMD lanes must be compiled first, which takes some ten seconds.
 
     Args:
         plan: The sweep.
@@ -454,7 +456,7 @@ def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
 
 
 def _compile_lanes(plan: SweepPlan) -> None:
-    """Compiles the code for several runs side by side, once for all worker processes.
+    """Compiles the code for several runs side by side (in SIMD lanes), once for all workers.
 
     Args:
         plan: The sweep. The code is that of its first cell.
@@ -495,29 +497,30 @@ def estimate_sweep(
         done: Finished runs, as pairs of cell number and seed. They need not be run any more.
         jobs: Number of worker processes of the sweep. None stands for all cores.
     """
-    finished = set(done)
+    finished_runs = set(done)
     refinement = EdgeRefinement(plan) if plan.refine else None
     # A refined sweep must not run other cells than those that it chooses.
     cells = refinement.list_coarse_cells() if refinement else range(plan.cells)
     cell_count = refinement.count_most_cells() if refinement else plan.cells
     last_cell = len(cells) - 1
-    numbers = dict.fromkeys(cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES))
+    # evenly spread cells, each once
+    probe_cells = dict.fromkeys(cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES))
     seed = plan.seeds[0]
     probes = [
         CellItem(plan, plan.cell(number), seed)
-        for number in numbers
-        if (number, seed) not in finished
+        for number in probe_cells
+        if (number, seed) not in finished_runs
     ]
     if not probes:
-        runs = max(0, cell_count * len(plan.seeds) - len(finished))
+        runs = max(0, cell_count * len(plan.seeds) - len(finished_runs))
         return DurationEstimate(runs, 0.0, [])
 
     # A short run first: it compiles the simulation kernel, once for all processes.
-    brief_s = min(1.0, plan.base.duration_s)
+    warm_up_s = min(1.0, plan.base.duration_s)
     if plan.judge != "linear":
         with suppress(ScenarioError):
-            brief = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
-            sweep_cell.classify_cell(brief.text, brief_s)
+            warm_up = plan.scenario(*probes[0].cell.overrides, f"duration_s={warm_up_s!r}")
+            sweep_cell.classify_cell(warm_up.text, warm_up_s)
 
     clock = SystemClock()
     started_ns = clock.monotonic_ns()
@@ -531,7 +534,7 @@ def estimate_sweep(
 
     # If nothing is random, a cell is run with one seed only.
     seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
-    runs = max(len(entries), cell_count * seeds - len(finished))
+    runs = max(len(entries), cell_count * seeds - len(finished_runs))
     workers = min(jobs or count_cores(), runs)
     seconds = elapsed_s / len(entries) * runs / workers
     return DurationEstimate(runs, seconds, entries)
@@ -630,7 +633,7 @@ class _NewRuns:
         self.simulated_s = 0.0
 
     def note(self, run: CellRun) -> None:
-        """Counts a run that has finished, for the numbers that are printed at the end."""
+        """Counts a finished run, for the numbers that are printed at the end of a sweep."""
         self.runs += 1
         self.simulated_s += run.outcome.ran_s
 
@@ -649,6 +652,7 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
+        """Yields the rows of all cells, and counts why runs were computed alone."""
         for runs in iterate_cells(plan, done):
             reasons.update(run.alone for run in runs if run.alone)
             yield from build_cell_rows(plan, runs)
@@ -658,7 +662,7 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
 
 
 def _write_lines(folder: SweepFolder, name: str, lines: Iterable[str]) -> None:
-    """Writes a file of a finished sweep line by line.
+    """Writes a file of a finished sweep, from lines that need not fit into memory.
 
     Args:
         folder: Folder of the sweep.
@@ -700,7 +704,11 @@ class _SweepWork:
         self._tally = tally
 
     def execute(self) -> None:
-        """Executes all runs, or in a refined sweep those along the stability edge."""
+        """Executes all runs, or in a refined sweep those along the stability edge.
+
+        A refined sweep proceeds in rounds. The runs of a round show on which side of the edge
+        their cells lie, and this determines the cells of the next round.
+        """
         plan = self._plan
         if not plan.refine:
             is_side_by_side = self._choose_lanes(plan.cells)
@@ -736,20 +744,25 @@ class _SweepWork:
 
     def _list_runs(self, cell: int) -> list[CellRun]:
         """Returns the finished runs of a cell, in the order of the seeds."""
-        done = self._journal.done
-        return [done[cell, seed] for seed in self._plan.seeds if (cell, seed) in done]
+        finished_runs = self._journal.done
+        return [
+            finished_runs[cell, seed]
+            for seed in self._plan.seeds
+            if (cell, seed) in finished_runs
+        ]
 
     def _execute_cells(
         self, cells: Iterable[int], count: int, runs_before: int, *, is_side_by_side: bool
     ) -> None:
-        """Executes cells with the first seed, and then the random ones with the other seeds.
+        """Executes all runs of some cells: one seed each, then other seeds of random cells.
 
-        Only the first run of a cell shows whether anything in the cell is random.
+        Only the first run of a cell shows whether anything in the cell is random. Otherwise
+        other seeds would give the same run.
 
         Args:
             cells: Numbers of the cells, which can be iterated once.
             count: Number of the cells.
-            runs_before: Number of runs of the cells before.
+            runs_before: Number of runs of the cells before, for the progress.
             is_side_by_side: True to compute several runs side by side.
         """
         first_seed, *other_seeds = self._plan.seeds
@@ -759,6 +772,7 @@ class _SweepWork:
             runs_before + count,
             is_side_by_side=is_side_by_side,
         )
+
         if not other_seeds:
             return
         random_cells = [

@@ -179,15 +179,15 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
 
     shape = (len(t_s), len(start_rad))
     stiffness = np.zeros(shape)
-    torque = np.zeros(shape)
+    weighted_target = np.zeros(shape)
     for spring in _list_springs(scenario, t_s):
         weight = weights[spring.site]
         weighted_stiffness = weight * spring.stiffness_nm_rad * spring.acts
         stiffness += weighted_stiffness
-        torque += weighted_stiffness * spring.target_rad
+        weighted_target += weighted_stiffness * spring.target_rad
     is_held = stiffness > 0.0
-    no_pose_rad = np.zeros_like(torque)
-    held_pose_rad = np.divide(torque, stiffness, where=is_held, out=no_pose_rad)
+    zeros = np.zeros_like(weighted_target)
+    held_pose_rad = np.divide(weighted_target, stiffness, where=is_held, out=zeros)
 
     # A joint keeps the pose of the last time at which a spring held it. Row 0 is the start
     # pose, for joints that no spring has held yet.
@@ -348,13 +348,15 @@ def check_final_posture(log: Log) -> list[str]:
     Raises:
         LogError: A record (the result of a control period) cannot be read.
     """
-    parts = {site: log[site] for site in log.sites if len(log[site])}
-    diverged = [site for site, part in parts.items() if part.record(-1).mode == "diverged"]
-    if diverged:
-        return [f"{', '.join(diverged)} diverged: its figures end there"]
+    site_logs = {site: log[site] for site in log.sites if len(log[site])}
+    diverged_sites = [
+        site for site, site_log in site_logs.items() if site_log.record(-1).mode == "diverged"
+    ]
+    if diverged_sites:
+        return [f"{', '.join(diverged_sites)} diverged: its figures end there"]
 
     warnings = []
-    end_times_s = [float(part.t_s[-1]) for part in parts.values()]
+    end_times_s = [float(site_log.t_s[-1]) for site_log in site_logs.values()]
     end_s = min(end_times_s, default=0.0)
     planned_s = log.scenario.duration_s
     if end_s <= planned_s - _SHORT_S:
@@ -363,9 +365,9 @@ def check_final_posture(log: Log) -> list[str]:
         )
 
     end_poses_rad = {}
-    for site, part in parts.items():
-        in_last_second = part.t_s > part.t_s[-1] - END_WINDOW_S
-        end_poses_rad[site] = part.q[in_last_second].mean(axis=0)
+    for site, site_log in site_logs.items():
+        in_last_second = site_log.t_s > site_log.t_s[-1] - END_WINDOW_S
+        end_poses_rad[site] = site_log.q[in_last_second].mean(axis=0)
     hanging = find_hanging_sites(log.scenario, end_poses_rad)
     if hanging:
         verb = "hangs" if len(hanging) == 1 else "hang"
@@ -477,6 +479,7 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
         interval = MeanInterval.of_values(values)
         intervals[field] = interval
         means[field] = None if interval is None else interval.mean
+
     error = intervals["error_rad"]
     effort = intervals["effort_nm"]
     return msgspec.structs.replace(
@@ -508,18 +511,19 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
 
 
 def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScore:
-    """Returns the score of a candidate.
+    """Combines what was measured in the runs of a candidate to its score.
 
     Args:
         run: What was measured in its run.
-        twin: What was measured in the twin, or in the run itself if there is no twin.
+        twin: What was measured in the same run without walls and pushes (twin), or in the run
+            itself if there is no twin.
     """
     ends = (run.end, twin.end)
     outcome = classify_candidate(ends, twin.fall_rad, twin.apart_rad)
 
     # The numbers of a run that ended early cannot be compared with those of other runs.
-    diverged_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
-    if diverged_s:
+    divergence_times_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
+    if divergence_times_s:
         return CandidateScore(
             outcome=outcome,
             error_rad=None,
@@ -528,7 +532,7 @@ def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScor
             effort_nm=None,
             settled_s=None,
             saturated=run.saturated,
-            diverged_s=diverged_s[0],
+            diverged_s=divergence_times_s[0],
         )
 
     # The distance between the arms is measured in the run, and the pose in its twin.
@@ -571,10 +575,7 @@ class _RunMeasures(NamedTuple):
 
 
 def _measure_run(scenario: Scenario) -> _RunMeasures:
-    """Runs a scenario in virtual time, and measures the distances that the score combines.
-
-    The arms are compared with the consensus pose, or with the motion that their law promises,
-    at times that all sites have in common.
+    """Runs a scenario in virtual time, and measures the quantities that its score combines.
 
     Args:
         scenario: Scenario of the candidate, with its gains.
@@ -583,7 +584,10 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
 
 
 def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
-    """Measures the records of a run, see `_measure_run`.
+    """Measures effort, torque limits and distances of the arms in a finished run.
+
+    The arms are compared with the consensus pose q*, or with the motion that their law
+    promises, at times that all sites have in common.
 
     Args:
         scenario: Scenario of the candidate, with its gains.
@@ -594,6 +598,7 @@ def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
     t_s, q, e, tau_x = _sample_at_common_times(records)
     mean_rad = q.mean(axis=0)
     from_pose_rad = mean_rad - compute_consensus_pose(scenario, t_s)
+
     promised_rad = _compute_promised_motion(scenario, t_s, q, tau_x)
     if promised_rad is None:
         from_target_rad = q - mean_rad
@@ -601,6 +606,7 @@ def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
     else:
         from_target_rad = q - promised_rad
         from_end_rad = mean_rad - promised_rad.mean(axis=0)
+
     in_last_second = t_s > t_s[-1] - END_WINDOW_S
     final_distance_rad = np.abs(from_target_rad[:, in_last_second])
 
@@ -686,8 +692,8 @@ def _find_settling_time(t_s: Array, e: Array) -> float | None:
     is_settled = largest_rad[-1] < SETTLED_ERROR_RAD
     if not is_settled:
         return None
-    unsettled_s = t_s[largest_rad >= SETTLED_ERROR_RAD]
-    return float(unsettled_s.max(initial=0.0))
+    unsettled_times_s = t_s[largest_rad >= SETTLED_ERROR_RAD]
+    return float(unsettled_times_s.max(initial=0.0))
 
 
 def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tuple[float, float]:
@@ -704,11 +710,14 @@ def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tupl
     saturated_shares = []
     for record, site in zip(records, scenario.names, strict=True):
         arm = build_arm_rows(scenario, site)
+
         effort_nm = record.tau - arm.gravity_torque(record.q)
         mean_squares.append(np.mean(effort_nm**2))
+
         limits = scenario.sites[site].limits
         is_saturated = np.abs(record.tau) >= limits.tau_limit_nm
         saturated_shares.append(np.mean(is_saturated))
+
     rms_effort_nm = np.sqrt(np.mean(mean_squares))
     saturated_share = np.mean(saturated_shares)
     return float(rms_effort_nm), float(saturated_share)
@@ -732,6 +741,7 @@ def _sample_at_common_times(
     end_ns = min(record.t_ns[-1] for record in records)
     slowest_ns = min((record.t_ns for record in records), key=len)
     times_ns = slowest_ns[slowest_ns <= end_ns]
+
     q = []
     e = []
     tau_x = []
@@ -886,28 +896,33 @@ def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[Candidat
     Yields:
         The average scores in the order of the candidates, equal to `measure_candidate_task`.
     """
-    texts = [text for task in tasks for texts in task.runs for text in texts if text]
-    scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
-    measured = {}
-    chosen = list(scenarios)
+    # Each different scenario is run once. Candidates may share a scenario without walls.
+    scenarios: dict[str, Scenario] = {}
+    for task in tasks:
+        for run_texts in task.runs:
+            for text in run_texts:
+                if text and text not in scenarios:
+                    scenarios[text] = parse_scenario(text)
+    all_texts = list(scenarios)
+
+    measures: dict[str, _RunMeasures] = {}
     try:
-        for first in range(0, len(chosen), LANE_RUNS):
-            part = chosen[first : first + LANE_RUNS]
-            for index, run, _ in run_whole_together([scenarios[text] for text in part]):
-                text = part[index]
-                measured[text] = _measure_records(scenarios[text], run)
+        for first in range(0, len(all_texts), LANE_RUNS):
+            batch = all_texts[first : first + LANE_RUNS]
+            batch_scenarios = [scenarios[text] for text in batch]
+            for index, run, _ in run_whole_together(batch_scenarios):
+                measures[batch[index]] = _measure_records(batch_scenarios[index], run)
     except CodeFailed:
         # One by one, the candidates before the one whose code fails are kept.
         for task in tasks:
             yield measure_candidate_task(task)
         return
+
     for task in tasks:
-        yield average_scores(
-            [
-                _score_candidate(measured[text], measured[twin_text or text])
-                for text, twin_text in task.runs
-            ]
-        )
+        scores = []
+        for text, twin_text in task.runs:
+            scores.append(_score_candidate(measures[text], measures[twin_text or text]))
+        yield average_scores(scores)
 
 
 def load_tuning_scenario(

@@ -271,7 +271,9 @@ _TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
 
 
 def _spread_over_joints(table: dict[str, Any], weights: Sequence[float]) -> None:
-    """Replaces each gain of a table that produces a torque by a list with a value per joint.
+    """Replaces each gain that produces a torque by a list with a value per joint.
+
+    The joints of a chain have different inertias, and need gains in proportion to them.
 
     Args:
         table: Table [control] of a site, which is changed in place.
@@ -311,17 +313,23 @@ def weigh_joints(scenario: Scenario) -> list[float]:
     ]
     if not chains:
         return []
-    inverses = [np.linalg.inv(model.inertia(np.array(site.q0_rad))) for site, model in chains]
-    inertia = np.min([1.0 / np.diag(inverse) for inverse in inverses], axis=0)
-    weights = inertia / inertia.max()
 
+    inverses = []
+    for site, model in chains:
+        start_inertia = model.inertia(np.array(site.q0_rad))
+        inverses.append(np.linalg.inv(start_inertia))
+    free_inertia = np.min([1.0 / np.diag(inverse) for inverse in inverses], axis=0)
+    weights = free_inertia / free_inertia.max()
+
+    # reduce the weights until the largest damping of the ranges suits every tick rate
     limit = 1.0 if scenario.scheme == "second_order" else 2.0
     largest_damping = DAMPING[1] + ERROR_DAMPING[1]
     for (site, _), inverse in zip(chains, inverses, strict=True):
         # M^-1 D has the eigenvalues of the symmetric matrix D^(1/2) M^-1 D^(1/2).
-        root = np.sqrt(weights)
-        fastest = np.linalg.eigvalsh(root * inverse * root[:, None])[-1] / site.rate_hz
-        weights *= min(1.0, _STABLE_SHARE * limit / (largest_damping * fastest))
+        root_weights = np.sqrt(weights)
+        scaled_inverse = root_weights * inverse * root_weights[:, None]
+        largest_rate = np.linalg.eigvalsh(scaled_inverse)[-1] / site.rate_hz
+        weights *= min(1.0, _STABLE_SHARE * limit / (largest_damping * largest_rate))
     return [float(f"{weight:.2g}") for weight in weights]
 
 
@@ -416,11 +424,13 @@ def build_user_search_space(code: str) -> SearchSpace:
     key = CodeKey(code, sha256, "{}")
     allowed_code[key] = CodeConsent(None, sha256)
     kind = import_class(key, "--law")
+
     ranges = getattr(kind, "tune", None)
     if not isinstance(ranges, Mapping) or not ranges:
         raise UsageError(
             f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}'
         )
+
     knobs = tuple(_parse_user_range(code, name, entry) for name, entry in ranges.items())
     takes_gravity = "gravity" in inspect.signature(kind).parameters
     facts = _GRAVITY_ONLY if takes_gravity else "what it reads from its argument now"

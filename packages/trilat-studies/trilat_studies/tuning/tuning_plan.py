@@ -191,15 +191,18 @@ class CandidateSearch:
         self.scores: list[CandidateScore] = []
         self._objective = objective
         self._rng = np.random.default_rng(seed)
+
         log_bounds = np.log([[knob.low, knob.high] for knob in space.knobs])
         self._log_low = log_bounds[:, 0]
         self._log_range = log_bounds[:, 1] - log_bounds[:, 0]
+
         sampled = (budget + 1) // 2
         refinements = len(REFINEMENT_STEPS)
-        share, remainder = divmod(budget - sampled, refinements)
+        per_round, remainder = divmod(budget - sampled, refinements)
         self.rounds = [sampled]
         for n in range(refinements):
-            self.rounds.append(share + (n < remainder))  # the first rounds take the remainder
+            takes_one_more = n < remainder  # the first rounds take the remainder
+            self.rounds.append(per_round + takes_one_more)
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
@@ -295,10 +298,12 @@ class CandidateSearch:
         """
         best, ranked = self._rank_candidates(count)
         parents = []
-        for n in range(count):
+        for parent_number in range(count):
             index = best
-            if n % 2 == 1:
-                index = ranked[n // 2 % len(ranked)]
+            if parent_number % 2 == 1:
+                # the ranking starts anew when it is used up
+                rank = parent_number // 2 % len(ranked)
+                index = ranked[rank]
             gains = self.tried[index]
             parents.append([gains[knob.name] for knob in self.space.knobs])
 
@@ -536,19 +541,21 @@ class TuningPlan(NamedTuple):
             printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
         return TuningResult(self, searches, printed)
 
-    def _uses_lanes(self, firsts: Sequence[CandidateItem]) -> bool:
-        """Returns True if the runs of all laws are to be computed side by side.
+    def _uses_lanes(self, first_candidates: Sequence[CandidateItem]) -> bool:
+        """Returns True if the runs of every law can be simulated side by side (in SIMD lanes).
 
         Args:
-            firsts: One candidate of each law.
+            first_candidates: One candidate of each law.
         """
         # imported here, because the code of lanes takes long to load
         from trilat_net.execution import prepare_lanes
 
-        return all(
-            prepare_lanes(parse_scenario(first.runs[0][0]), self.budget * len(first.runs))
-            for first in firsts
-        )
+        for candidate in first_candidates:
+            text, _ = candidate.runs[0]
+            run_count = self.budget * len(candidate.runs)
+            if not prepare_lanes(parse_scenario(text), run_count):
+                return False
+        return True
 
     def _build_items(
         self,
@@ -556,7 +563,7 @@ class TuningPlan(NamedTuple):
         space: SearchSpace,
         candidates: Sequence[CandidateGains],
     ) -> list[CandidateItem]:
-        """Returns the work that measures candidates of one law.
+        """Packs the candidates of one law as work for worker processes.
 
         Args:
             bases: Scenario with each seed.
@@ -565,8 +572,8 @@ class TuningPlan(NamedTuple):
         """
         items = []
         for gains in candidates:
-            seeds = [base.with_gains(space, self.knowledge, gains) for base in bases]
-            items.append(build_candidate_item(seeds))
+            seed_scenarios = [base.with_gains(space, self.knowledge, gains) for base in bases]
+            items.append(build_candidate_item(seed_scenarios))
         return items
 
 
@@ -663,6 +670,7 @@ class TuningResult(Result):
             "knowledge": plan.knowledge.text,
             "box": plan.knowledge.box,
         }
+
         weights = weigh_joints(plan.base.scenario)
         if weights:
             procedure["joint_weights"] = weights
@@ -757,14 +765,15 @@ class TuningResult(Result):
             Indices of the gains in `search.tried`. Empty if other laws are better everywhere.
         """
         points = []
-        owners = []
+        candidates = []
         for other in self.found:
             other_points = other.points
             for index in other.front:
                 points.append(other_points[index])
-                owners.append((other.space.law, index))
-        overall_front = [owners[n] for n in find_pareto_front(points)]
-        return [index for law, index in overall_front if law == search.space.law]
+                candidates.append((other.space.law, index))
+        overall_front = [candidates[position] for position in find_pareto_front(points)]
+        own_law = search.space.law
+        return [index for law, index in overall_front if law == own_law]
 
 
 def plan_tuning(

@@ -109,6 +109,7 @@ def tabulate_laws(tuned: "TuningResult") -> TextTable:
     objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
     heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
     heads += (f"least {objective}", "at effort N m", "least effort N m", f"at {objective}")
+
     rows = []
     for search in tuned.found:
         outcomes = search.outcomes
@@ -175,18 +176,21 @@ def tabulate_front(
     """
     count = len(search.front)
     shown = count if most is None else min(most, count)
-    row_indices = {round(n) for n in np.linspace(0, count - 1, shown)}
+    # evenly spread, with the first and the last point
+    row_indices = {round(place) for place in np.linspace(0, count - 1, shown)}
     overall_front = tuned.list_overall_front(search)
-    knobs = search.space.knobs
+    tuned_gains = search.space.knobs
+
     rows = []
-    for n, index in enumerate(search.front):
-        if n not in row_indices:
+    for row_index, index in enumerate(search.front):
+        if row_index not in row_indices:
             continue
         mark = "*" if index in overall_front else ""
-        gains = [f"{search.tried[index][knob.name]:g}" for knob in knobs]
+        gains = [f"{search.tried[index][knob.name]:g}" for knob in tuned_gains]
         score = _format_score(search.scores[index])
-        rows.append((f"{search.space.law} {n + 1}{mark}", *gains, *score))
-    heads = [f"{knob.name} {knob.unit}".strip() for knob in knobs]
+        rows.append((f"{search.space.law} {row_index + 1}{mark}", *gains, *score))
+
+    heads = [f"{knob.name} {knob.unit}".strip() for knob in tuned_gains]
     return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
 
 
@@ -224,7 +228,7 @@ def _format_score(score: CandidateScore) -> tuple[str, ...]:
 
 
 def _format_mean(mean: float | None, half: float | None) -> str:
-    """Returns a mean as a string, with its interval if it has one.
+    """Returns a mean as text, with the half-width of its confidence interval if known.
 
     Args:
         mean: The mean, or None.
@@ -394,13 +398,17 @@ def _draw_front(tuned: "TuningResult") -> Figure:
         axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
         axes.set_ylabel(_LABELS[tuned.plan.objective], fontsize=_SIZE_PT)
         axes.tick_params(labelsize=_SIZE_PT)
-        drawn = [number for line in axes.lines for number in np.ravel(line.get_xydata())]
-        if not drawn:
+
+        drawn_numbers = [
+            number for line in axes.lines for number in np.ravel(line.get_xydata())
+        ]
+        if not drawn_numbers:
             style.annotate_empty_panel(axes, "no stable candidate at the pose")
-        elif min(drawn) > 0.0:
+        elif min(drawn_numbers) > 0.0:
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
                 style.set_plain_log_axis(axis)
+
         figure.legend(
             handles=handles,
             loc="outside upper center",
@@ -414,7 +422,7 @@ def _draw_front(tuned: "TuningResult") -> Figure:
 
 
 def _draw_law(axes: Axes, search: "CandidateSearch") -> Line2D:
-    """Draws all stable runs of a law faintly, and its front as a line of steps on top.
+    """Draws the stable runs of a law as faint points, and its Pareto front as steps on top.
 
     Returns:
         The legend entry of the law, with the numbers of stable and of all candidates.
@@ -448,12 +456,13 @@ def _draw_law(axes: Axes, search: "CandidateSearch") -> Line2D:
     efforts_nm = [effort_nm for _, effort_nm in front]
     values = [value for value, _ in front]
     axes.step(efforts_nm, values, where="post", **look)
+
     stable = search.outcomes[CandidateClass.SETTLED]
     return Line2D([], [], label=f"{law} ({stable}/{len(search.scores)})", **look)
 
 
 def _draw_paper_gains(axes: Axes, tuned: "TuningResult") -> list[Line2D]:
-    """Draws the gains that the paper prints as stars.
+    """Draws the scores of the gains that the paper prints as stars, for comparison.
 
     Returns:
         Their legend entries. If a variant has no point in the figure, its entry states why.

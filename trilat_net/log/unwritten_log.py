@@ -1,0 +1,98 @@
+"""A log whose records are arrays that were never encoded as messages.
+
+A simulated run can be judged by the same functions as a recorded one, because they read the
+columns of a log, such as the joint angles of all records. `UnwrittenLog` offers these columns
+for numbers that a simulation left in memory. To encode them as messages and to decode these
+again would take twenty times as long as the simulation.
+
+Invariant:
+    - A column that was not given raises an error when it is read.
+    - The log is complete: it has a record of every tick of the scenario, and no events.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..core import Array
+from ..errors import LogError
+from ..scenario import Scenario
+from .log_reader import Log
+from .mcap_reader import LogContents
+from .running_digest import DigestState, Integrity
+from .site_log import SiteLog, freeze
+
+_NAME = "run"
+"""Name of the log for error messages."""
+
+
+class _UnwrittenSiteLog(SiteLog):
+    """Records of one site as arrays, with one row per tick.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
+        columns: Fields of the records by name, with a row for each tick of the site.
+    """
+
+    def __init__(self, scenario: Scenario, site: str, columns: Mapping[str, Any]) -> None:
+        super().__init__(
+            name=site,
+            peers=scenario.peers(site),
+            rate_hz=scenario.sites[site].rate_hz,
+            payloads=(),
+            source=_NAME,
+            layout=scenario.layout(site),
+            channel=scenario.channel(site),
+            axes=scenario.arms[site].axes,
+        )
+        self.indexed = None
+        self.tick = freeze(np.arange(scenario.ticks(site), dtype=np.int64))
+        # The properties of a site log look up columns here before they decode messages.
+        self.__dict__.update(freeze(dict(columns)))
+        self.__dict__["_changes"] = {}
+
+    def __len__(self) -> int:
+        return len(self.tick)
+
+    @property
+    def diverged_s(self) -> float | None:
+        """None, because every tick of the scenario was executed."""
+        return None
+
+    def _read_from(self, *_: Any) -> Any:
+        raise LogError(f"{_NAME}: {self.name} has no such column, because no log was written")
+
+    def _read_vectors(self, *fields: str) -> dict[str, Array]:
+        lengths = self.layout.lengths()
+        for field in fields:
+            if lengths.get(field):
+                raise LogError(f"{_NAME}: {self.name} has no column {field}")
+        return {field: freeze(np.zeros((len(self), 0))) for field in fields}
+
+
+class UnwrittenLog(Log):
+    """Log of a simulated run that was completed in memory, without messages.
+
+    Args:
+        scenario: Scenario of the run.
+        columns: Fields of the records of each site, by name of the site and name of the field
+            (see `SiteLog`). Each has a row for every tick.
+    """
+
+    def __init__(self, scenario: Scenario, columns: Mapping[str, Mapping[str, Any]]) -> None:
+        contents = LogContents(
+            sources=(_NAME,),
+            session={"session": scenario.name, "driver": "virtual"},
+            scenario=scenario.text.encode(),
+            metadata={},
+            channels={},
+            complete=True,
+            ended=True,
+            damaged=[],
+            chain=Integrity(DigestState.INTACT, ""),
+        )
+        super().__init__(contents)
+        for site, site_columns in columns.items():
+            self._sites[site] = _UnwrittenSiteLog(scenario, site, site_columns)
