@@ -11,7 +11,7 @@ from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.resolve import PRESETS
+from trilat_net.scenario.link_presets import PRESETS
 
 DURATION_S = 10.0
 

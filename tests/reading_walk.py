@@ -1,11 +1,15 @@
-"""The walk of a reader from `certify` to the judgement, counted in the source: stays and
-returns.
+"""Two walks of a reader through the source, counted: stays, returns and climbs.
 
     python -m tests.reading_walk
 
-The reader begins in `certify` and, because it decides the exit code, in `Certificate.accepts`.
-The reader follows the calls of a body in their order, depth first, into the room `analysis`,
-and reads each function once.
+One walk leads from `certify` to the judgement. The reader begins in `certify` and, because it
+decides the exit code, in `Certificate.accepts`, and follows the calls into the folder `analysis`.
+The other walk leads from the tables of a scenario file to a complete scenario. The reader
+begins in `resolve_scenario`, and follows the calls into the modules that check and complete
+tables (`TABLE_MODULES`). Modules that read other files, word errors or check single values
+are passed by.
+
+The reader follows the calls of a body in their order, depth first, and reads each function once.
 
 - The reader passes by functions and properties that measure: their annotated results are
   numbers alone (arrays, floats, whole numbers, statements of a scenario or a log, or records
@@ -17,6 +21,7 @@ and reads each function once.
   that holds its result, stands in a condition (if, while, assert, and, or, filter of a
   comprehension). A table of functions (a tuple at the top of a module) counts as one return,
   however many functions it holds: the first that applies decides, or all are taken.
+- The reader CLIMBS to a stay that stands in its file above a stay that was read before.
 
 Methods and properties are those of the classes of an expression or of its elements, by the
 annotations of arguments, fields and results. Expressions of unknown class are not followed.
@@ -34,6 +39,7 @@ from . import house
 ROOMS = ("analysis",)
 NUMBERS = {
     "Array",
+    "RowArray",
     "Bools",
     "Ints",
     "Numbers",
@@ -48,6 +54,12 @@ NUMBERS = {
 }
 NUMBERS |= {"tuple", "list", "dict", "Sequence", "Mapping", "Iterator", "slice", "Rows"}
 CERTIFICATE = house.ROOT / "trilat_net/analysis/certificate/stability_certificate.py"
+SCENARIO = house.ROOT / "trilat_net/scenario"
+TABLE_MODULES = [
+    SCENARIO / f"{name}.py"
+    for name in ("resolve", "written_tables", "site_tables", "control_tables", "link_tables")
+]
+"""Modules that the tables of a scenario file pass on their way to a complete scenario."""
 
 
 class Place(NamedTuple):
@@ -64,6 +76,29 @@ class Walk(NamedTuple):
 
     stays: list[Place]
     returns: list[Place]
+
+    @property
+    def climbs(self) -> list[Place]:
+        """Functions that stand in their file above a function that was read before."""
+        climbs = []
+        deepest_lines: dict[Path, int] = {}
+        for place in self.stays:
+            definition = _definition(place)
+            assert definition is not None, place
+            deepest_line = deepest_lines.get(place.module, 0)
+            if definition.lineno < deepest_line:
+                climbs.append(place)
+            deepest_lines[place.module] = max(definition.lineno, deepest_line)
+        return climbs
+
+    def print(self) -> None:
+        """Prints the functions in the order of the walk, and how many there are."""
+        for place in self.stays:
+            mark = "<- " if place in self.returns else "   "
+            print(f"{mark}{place.module.stem}: {place.name}")
+        print(
+            f"{len(self.stays)} stays, {len(self.returns)} returns, {len(self.climbs)} climbs"
+        )
 
 
 @cache
@@ -146,7 +181,13 @@ def _is_numbers(path: Path, name: str) -> bool:
     """True for a type of numbers: one of `NUMBERS`, or a class all of whose fields have such
     types.
     """
-    places = [] if name in NUMBERS else _resolve(path, name)
+    if name in NUMBERS:
+        return True
+    alias = _module_names(path).get(name)
+    if isinstance(alias, ast.expr):
+        # a type that has a name of its own, such as the key of a mapping
+        return all(_is_numbers(path, inner) for inner in _names_in(alias) if inner != name)
+    places = _resolve(path, name)
     for place in places:
         node = _definition(place)
         if not _in_rooms(place):
@@ -158,7 +199,7 @@ def _is_numbers(path: Path, name: str) -> bool:
                 _is_numbers(place.module, inner) for inner in _names_in(field.annotation)
             ):
                 return False
-    return name in NUMBERS or bool(places)
+    return bool(places)
 
 
 @cache
@@ -288,7 +329,8 @@ class _Body:
 
 
 def _in_rooms(definition: Place) -> bool:
-    return definition.module.relative_to(house.ROOT).parts[1] in ROOMS
+    part = definition.module.relative_to(house.ROOT).parts[1]
+    return part in ROOMS or definition.module in TABLE_MODULES
 
 
 @cache
@@ -352,8 +394,11 @@ def walk_to_judgement() -> Walk:
     return walk(Place(CERTIFICATE, "certify"), Place(CERTIFICATE, "Certificate.accepts"))
 
 
+def walk_to_scenario() -> Walk:
+    """Returns the walk from the tables of a scenario file to the complete scenario."""
+    return walk(Place(SCENARIO / "resolve.py", "resolve_scenario"))
+
+
 if __name__ == "__main__":
-    found = walk_to_judgement()
-    for one in found.stays:
-        print(f"{'<- ' if one in found.returns else '   '}{one.module.stem}: {one.name}")
-    print(f"{len(found.stays)} stays, {len(found.returns)} returns")
+    walk_to_judgement().print()
+    walk_to_scenario().print()

@@ -56,7 +56,7 @@ from trilat_net.execution import twins, verification
 from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
-from trilat_net.scenario import laws, operators, resolve
+from trilat_net.scenario import laws, link_presets, operators, written_tables
 from trilat_net.work import dask_cluster, executor
 
 ROOT = Path(__file__).parents[1]
@@ -150,9 +150,9 @@ STATED: list[tuple[str, str, float, float]] = [
         "links.md",
         "round trips (8, 68, 136, 272, 544, 1088 ms)",
         1088,
-        resolve.GRID_ROUND_TRIPS_MS[-1],
+        link_presets.GRID_ROUND_TRIPS_MS[-1],
     ),
-    ("links.md", "losses (0, 10, 25, 50 %)", 50, resolve.GRID_LOSSES_PERCENT[-1]),
+    ("links.md", "losses (0, 10, 25, 50 %)", 50, link_presets.GRID_LOSSES_PERCENT[-1]),
     ("felt-forces.md", "faster than 2e-3 rad/s", 2e-3, run_end.STATIC_SPEED_RAD_S),
     (
         "felt-forces.md",
@@ -298,7 +298,7 @@ STATED: list[tuple[str, str, float, float]] = [
         mcap_reader.KEPT_BYTES / 2**20,
     ),
     ("data/reader-limits.csv", "300 x the file's size", 300, mcap_reader.KEPT_RATIO),
-    ("data/reader-limits.csv", "at most 32 sites", 32, resolve.MAX_SITES),
+    ("data/reader-limits.csv", "at most 32 sites", 32, written_tables.MAX_SITES),
     (
         "data/reader-limits.csv",
         "links of a site up to 64 MiB",

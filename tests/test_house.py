@@ -108,8 +108,17 @@ def test_readers_walk_straight_from_certify_to_judgement() -> None:
     found = reading_walk.walk_to_judgement()
     # Of these, `stability_decision` has a third: it weighs the end, the twins and the proofs,
     # and decides by the roots first, so that commands may save the twins.
-    assert len(found.stays) <= 83
-    assert len(found.returns) <= 29
+    assert len(found.stays) <= 80
+    assert len(found.returns) <= 28
+
+
+@pytest.mark.push
+def test_readers_walk_straight_from_file_to_scenario() -> None:
+    """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
+    found = reading_walk.walk_to_scenario()
+    assert len(found.stays) <= 15
+    assert len(found.returns) <= 5
+    assert len(found.climbs) <= 2
 
 
 @pytest.mark.push

@@ -16,7 +16,7 @@ from tests.chains import six_joints
 from tests.log_editing import edited, recorded
 from tests.task_arms import planar_task
 from trilat_net.presentation.terminal_output import TextConsole, print_json, print_line
-from trilat_net.scenario.resolve import SHIPPED_FOLDER
+from trilat_net.scenario.named_files import SHIPPED_FOLDER
 
 from .running import trilat
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from trilat_net.scenario.resolve import PRESETS
+from trilat_net.scenario.link_presets import PRESETS
 
 ms = st.floats(0.01, 900.0)
 share = st.floats(0.0, 1.0)

@@ -18,7 +18,7 @@ from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify
 from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.describe import list_arm_notes
-from trilat_net.scenario.resolve import SHIPPED_FOLDER
+from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.scenario_reader import reseed_scenario
 from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
 

@@ -194,7 +194,7 @@ def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
             "links.m2->m1.of",
             "the key file, which must name the log",
         ),
-        ('[link]\nmodel = "trace"\nfile = 5', "link.file", "No such file"),
+        ('[link]\nmodel = "trace"\nfile = 5', "link.file", "expected text"),
     ],
 )
 def test_a_traces_origin_is_named_once(

@@ -15,7 +15,7 @@ from trilat_net.scenario.describe import (
     describe_scenario,
     describe_value,
 )
-from trilat_net.scenario.resolve import SHIPPED_FOLDER
+from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.rest_bounds import find_rest_bounds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -147,17 +147,17 @@ def test_an_experiment_without_operators_stays_itself() -> None:
         (
             "sites.m1.q0_rad",
             {"normal": [0.1]},
-            "sites.m1.q0_rad[0]: must be { normal = [mean, deviation] }",
+            "sites.m1.q0_rad: must be { normal = [mean, deviation] }",
         ),
-        ("arm.m1_kg", {"normal": [1.0, -0.1]}, "sites.m1.arm.m1_kg: must be { normal"),
-        ("arm.m1_kg", {"uniform": [2.0, 1.0]}, "sites.m1.arm.m1_kg: must be { normal"),
+        ("arm.m1_kg", {"normal": [1.0, -0.1]}, "free: arm.m1_kg: must be { normal"),
+        ("arm.m1_kg", {"uniform": [2.0, 1.0]}, "free: arm.m1_kg: must be { normal"),
         (
             "arm.m1_kg",
             {"normal": [1.0, 0.1], "uniform": [0.0, 1.0]},
-            "sites.m1.arm.m1_kg: must be { normal",
+            "free: arm.m1_kg: must be { normal",
         ),
         ("sites.m1.arm.m1_kg", {"uniform": [-2.0, -1.0]}, "was drawn with seed 1"),
-        ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn: "),
+        ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn.sites.m1.q0_rad.0: must be a table"),
     ],
 )
 def test_invalid_distributions_are_refused_at_their_key(

@@ -8,7 +8,7 @@ from scipy import stats
 
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import HyperExponentialDelay
-from trilat_net.scenario.resolve import _PRESETS_FILE, PRESETS
+from trilat_net.scenario.link_presets import PRESETS, PRESETS_FILE
 
 ROUND_TRIPS_MS = {
     "frankfurt-bangalore": (144.88, 2.18),
@@ -82,7 +82,7 @@ def test_the_grid_follows_half_round_trips() -> None:
 
 
 def test_every_preset_has_a_sourced_comment() -> None:
-    text = _PRESETS_FILE.read_text(encoding="utf-8")
+    text = PRESETS_FILE.read_text(encoding="utf-8")
     for name in tomllib.loads(text):
         head = f'["{name}"]' if name[0].isdigit() else f"[{name}]"
         body = text.split(head, 1)[1].split("\n\n", 1)[0]

@@ -7,7 +7,7 @@ import pytest
 
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
-from trilat_net.scenario.resolve import SHIPPED_FOLDER
+from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.validate import check_outside_arms
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

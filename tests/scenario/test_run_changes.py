@@ -128,8 +128,8 @@ def test_traces_may_end_but_not_begin() -> None:
         ({**LINK, "to": {"delay": 1}}, "timeline[0].to.delay", "did you mean 'delay_ms'"),
         (
             {**LINK, "to": {"model": "gamma", "delay_ms": 5}},
-            "timeline[0].to",
-            "deviation_ms is missing",
+            "timeline[0].to.deviation_ms",
+            "is missing",
         ),
         ({**LINK, "to": {"order": "last"}}, "timeline[0].to.order", "'newest' or 'in_order'"),
         (

@@ -28,8 +28,8 @@ TEXT = planar_task()
         ),
         ({"task.axes": []}, "sites.m.task.axes", "has z, along which no joint moves"),
         ({"task.axes": ["x", "rx"]}, "sites.m.task.axes", "rx, which belongs to a pose"),
-        ({"task.axes": ["q"]}, "sites.m.task.axes[0]", "Invalid enum value 'q'"),
-        ({"task.space": "place"}, "sites.m.task.space", "Invalid enum value 'place'"),
+        ({"task.axes": ["q"]}, "task.axes[0]", "is 'q', but must be 'x' or 'y'"),
+        ({"task.space": "place"}, "task.space", "must be 'joints' or 'position'"),
         ({"task.scale": 0}, "task.scale", "> 0"),
         (
             {"task.posture_rad": [0, 0]},

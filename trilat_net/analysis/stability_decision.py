@@ -189,11 +189,6 @@ class RunFindings(NamedTuple):
     rises: bool = False
 
     @property
-    def has_pushes(self) -> bool:
-        """True if the run was repeated with small pushes (twins)."""
-        return self.twins is not None and bool(self.twins.pushes)
-
-    @property
     def all_proofs(self) -> list[str]:
         """Phrases for everything that proves the control loop stable, exact roots last.
 
@@ -352,13 +347,13 @@ def _agrees_with_proof(run: RunFindings) -> bool:
     A run that is shorter than the period of its delays contradicts nothing: it may show a beat.
     """
     end = run.end
-    if not run.has_pushes:
+    twins = run.twins
+    if twins is None or not twins.pushes:
         return end.stability is Stability.SETTLED
-    assert run.twins is not None
-    if run.twins.hides_period or run.twins.trend in _FALLING:
+    if twins.hides_period or twins.trend in _FALLING:
         return True
     is_calm = end.stability is Stability.SETTLED or end.behaviour is EndBehaviour.HARDLY
-    if is_calm and run.twins.trend is not EnvelopeTrend.GROWS:
+    if is_calm and twins.trend is not EnvelopeTrend.GROWS:
         return True
     return _confirms_slowest_root(run)
 
@@ -398,15 +393,15 @@ def _is_end_excused(run: RunFindings) -> bool:
     """
     if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
         return True
-    if not run.has_pushes:
+    twins = run.twins
+    if twins is None or not twins.pushes:
         return False
-    assert run.twins is not None
-    if run.twins.trend is EnvelopeTrend.DECAYS or run.twins.hides_period:
+    if twins.trend is EnvelopeTrend.DECAYS or twins.hides_period:
         return True
-    if run.twins.judged_bursts < LEAST_BURSTS and not run.twins.grows:
+    if twins.judged_bursts < LEAST_BURSTS and not twins.grows:
         return True
     end_grows = run.end.behaviour is EndBehaviour.GROWS
-    return end_grows and run.twins.trend is not EnvelopeTrend.GROWS and not run.rises
+    return end_grows and twins.trend is not EnvelopeTrend.GROWS and not run.rises
 
 
 def _has_settled(run: RunFindings) -> bool:
@@ -419,15 +414,13 @@ def _has_settled(run: RunFindings) -> bool:
         run: What the analyses found about the run.
     """
     end = run.end
-    if not run.has_pushes:
-        return False
-    assert run.twins is not None
-    if run.twins.trend is not EnvelopeTrend.DECAYS:
+    twins = run.twins
+    if twins is None or not twins.pushes or twins.trend is not EnvelopeTrend.DECAYS:
         return False
     if end.stability is Stability.SETTLED:
         return True
     # A run without a trend counts if its arms are too slow to get anywhere.
-    judged_s = run.twins.to_s - run.twins.from_s
+    judged_s = twins.to_s - twins.from_s
     travel_rad = end.end_speed_rad_s * judged_s
     return end.behaviour in _UNTREND_ENDS and travel_rad <= SETTLED_ERROR_RAD
 

@@ -135,6 +135,7 @@ if TYPE_CHECKING:
     from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect, ExpectWindow
     from .key_checks import check_finite, field_names, is_distribution, is_number
     from .laws import BUILT_IN, LAWS, identify_law
+    from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
     from .operators import ActorBase
     from .operators.kernel_operators import (
         Chirp,
@@ -157,7 +158,6 @@ if TYPE_CHECKING:
     from .override import apply_overrides, split_assignment
     from .own_plant import OwnPlant
     from .plant_player import PlantContext, PlantPlayer, make_plant_players
-    from .resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
     from .run_changes import (
         LinkTables,
         describe_change,
@@ -202,6 +202,7 @@ else:
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect ExpectWindow",
             "key_checks": "check_finite field_names is_distribution is_number",
             "laws": "BUILT_IN LAWS identify_law",
+            "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
             "operators": "ActorBase",
             "operators.kernel_operators": (
                 "Chirp DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
@@ -213,7 +214,6 @@ else:
             "override": "apply_overrides split_assignment",
             "own_plant": "OwnPlant",
             "plant_player": "PlantContext PlantPlayer make_plant_players",
-            "resolve": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
             "run_changes": (
                 "LinkTables describe_change find_owner find_requester make_site_order "
                 "parse_core_change resolve_change to_core_change"

@@ -18,10 +18,11 @@ Invariant:
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from .. import fields
 from ..core import (
@@ -131,7 +132,7 @@ class Arm(fields.Frozen, frozen=True):
     g_m_s2: fields.NotNegative = 9.81
     known: bool = True
     dead_man: bool = False
-    urdf: str = ""
+    urdf: Annotated[str, Meta(extra={"must_be": "a file's name"})] = ""
     base_xyz_m: ThreeReals = (0.0, 0.0, 0.0)
     base_rpy_rad: ThreeReals = (0.0, 0.0, 0.0)
     base: str = ""

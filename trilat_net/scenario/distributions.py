@@ -14,7 +14,7 @@ Invariant (L4):
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -30,7 +30,35 @@ _MAX_LIST_LENGTH = 64
 """Longest list in which numbers are drawn. Longer lists are recorded tables."""
 
 
-class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
+DISTRIBUTION_FORM = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
+"""What the table of a distribution must be, as the end of a sentence about its key."""
+
+
+class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
+    """The two kinds of random distribution that a number in a scenario may have.
+
+    Attributes:
+        normal: Mean and standard deviation of a normal distribution. None for other kinds.
+        uniform: Lower and upper limit of a uniform distribution. None for other kinds.
+    """
+
+    normal: tuple[Real, NotNegative] | None = None
+    uniform: tuple[Real, Real] | None = None
+
+
+class StatedDistribution(_DistributionKeys, frozen=True):
+    """Table that the author of a scenario wrote in place of a number, to draw it at random.
+
+    It states either a normal or a uniform distribution, see `_DistributionKeys`.
+    """
+
+    def __post_init__(self) -> None:
+        is_reversed = self.uniform is not None and self.uniform[1] < self.uniform[0]
+        if (self.normal is None) == (self.uniform is None) or is_reversed:
+            raise ValueError(DISTRIBUTION_FORM)
+
+
+class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=True):
     """Random distribution of a number in a scenario, together with the number drawn from it.
 
     The author of a scenario, the description of an experiment, may state a distribution in
@@ -38,13 +66,9 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
     random start pose of an arm. Then both distributions are None.
 
     Attributes:
-        normal: Mean and standard deviation of a normal distribution. None for other kinds.
-        uniform: Lower and upper limit of a uniform distribution. None for other kinds.
         value: The drawn number, or the copied pose.
     """
 
-    normal: tuple[Real, NotNegative] | None = None
-    uniform: tuple[Real, Real] | None = None
     value: float | Annotated[list[float], Meta(max_length=MAX_JOINTS)]
 
     def draw(self, seed: int, key: str) -> float:
@@ -86,6 +110,12 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
         return "as the start pose"
 
 
+def has_distribution(value: Any) -> bool:
+    """Returns True if a value of a scenario is a distribution, or a list that contains one."""
+    entries = value if isinstance(value, list) else [value]
+    return any(map(is_distribution, entries))
+
+
 def dotted_key(path: str) -> str:
     """Converts a path in an error message to a dotted key.
 
@@ -105,20 +135,17 @@ class Draws:
     distributions.
 
     Args:
-        seed: Seed of the scenario. If it is not an integer, 0 is used here; it is refused later
-            with the path of its key.
+        seed: Seed of the scenario.
         known: Table `drawn` of a scenario that was resolved before. Empty for a new scenario.
 
     Attributes:
+        seed: Seed of the scenario.
         drawn: Distribution of every number drawn so far, by its dotted key.
     """
 
-    def __init__(self, seed: Any, known: Any) -> None:
-        self._seed = seed if isinstance(seed, int) else 0
-        try:
-            self._known = msgspec.convert(known, dict[str, Distribution])
-        except msgspec.ValidationError as error:
-            raise ScenarioError(str(error).replace("`", ""), path="drawn") from None
+    def __init__(self, seed: int, known: Mapping[str, Distribution]) -> None:
+        self.seed = seed
+        self._known = known
         self.drawn: dict[str, Distribution] = {}
 
     def draw_numbers(self, table: TomlTable, path: str) -> TomlTable:
@@ -159,7 +186,7 @@ class Draws:
             origin = known
         else:
             return value
-        number = origin.draw(self._seed, key)
+        number = origin.draw(self.seed, key)
         self.drawn[key] = msgspec.structs.replace(origin, value=number)
         return number
 
@@ -188,22 +215,17 @@ class Draws:
         site = pose_key.partition(".hands.")[0]
         start_keys = (f"{site}.q0_rad", f"{site}.arm.l")
         if any(drawn_key.startswith(start_keys) for drawn_key in self.drawn):
-            self.drawn[pose_key] = Distribution(value=list(pose))
+            self.drawn[pose_key] = Distribution(value=[float(angle) for angle in pose])
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
-    """Returns the distribution that a table states.
+    """Returns the distribution that a table states. Its value is not drawn yet.
 
     Raises:
         ScenarioError: The table does not state a distribution.
     """
     try:
-        origin = msgspec.convert({**table, "value": 0.0}, Distribution)
+        stated = msgspec.convert(table, StatedDistribution)
     except msgspec.ValidationError:
-        origin = None
-    uniform = origin.uniform if origin else None
-    is_reversed = uniform is not None and uniform[1] < uniform[0]
-    if origin is None or len(table) != 1 or is_reversed:
-        problem = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
-        raise ScenarioError(f"{problem}, but is {table}", path=path)
-    return origin
+        raise ScenarioError(f"{DISTRIBUTION_FORM}, but is {table}", path=path) from None
+    return Distribution(normal=stated.normal, uniform=stated.uniform, value=0.0)

@@ -15,7 +15,7 @@ Invariant:
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 from msgspec import Meta
@@ -23,6 +23,7 @@ from msgspec import Meta
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, TomlTable
 from ..records import MAX_JOINTS
+from .arms import Arm, read_arm
 from .key_checks import check_keys, field_names
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
@@ -127,15 +128,40 @@ def window_quantities(joints: int) -> tuple[str, ...]:
     return tuple(quantities)
 
 
-def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]]) -> Any:
+def complete_expect(
+    written: TomlTable, sites: TomlTable, urdf_texts: Mapping[str, str]
+) -> TomlTable:
+    """Returns the table of expectations, with indices in place of names of joints.
+
+    An expectation states what a test of the scenario requires of a run. It may apply to a
+    window of time and to one joint. The author may name this joint as in the URDF file of the
+    arm; the result contains its index.
+
+    Args:
+        written: Table `expect` as its author wrote it.
+        sites: Complete tables of the sites, by name.
+        urdf_texts: Texts of the URDF files, by name.
+    """
+    if "windows" not in written:
+        return written
+    joint_names = {}
+    for name, site in sites.items():
+        if site["arm"].get("urdf"):
+            chain = read_arm(msgspec.convert(site["arm"], Arm), urdf_texts)
+            joint_names[name] = tuple(joint.name for joint in chain.joints)
+    return {**written, "windows": number_window_joints(written["windows"], joint_names)}
+
+
+def number_window_joints(
+    written: list[TomlTable], joint_names: Mapping[str, tuple[str, ...]]
+) -> list[TomlTable]:
     """Replaces the names of joints in expectations by their numbers.
 
     Expectations for a part of a run (a window) have keys such as q_elbow_rad. This key becomes
     q3_rad if the elbow is the third joint.
 
     Args:
-        written: Windows as their author wrote them. A value that is not a list of tables is
-            returned unchanged, and is refused later.
+        written: Windows as their author wrote them.
         joint_names: Names of the joints of each site's arm, in their order.
 
     Returns:
@@ -144,16 +170,11 @@ def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]
     Raises:
         ScenarioError: A window has an unknown key, or the same key twice.
     """
-    if not isinstance(written, list):
-        return written
     windows = []
     for n, table in enumerate(written):
         path = f"expect.windows[{n}]"
-        window = table
-        if isinstance(table, dict):
-            site = table.get("site", "")
-            names = joint_names.get(site, ()) if isinstance(site, str) else ()
-            window = _number_joints(table, names, path)
+        names = joint_names.get(str(table.get("site", "")), ())
+        window = _number_joints(table, names, path)
         windows.append(check_keys(window, _WINDOW_KEYS, path))
     return windows
 

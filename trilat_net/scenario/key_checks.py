@@ -12,14 +12,14 @@ Invariant:
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
-from typing import Any, NamedTuple, TypeGuard, get_type_hints
+from typing import Any, NamedTuple, TypeGuard, get_args, get_type_hints
 
 import msgspec
 from msgspec import Meta
 
 from ..core import LINK_PARAMETERS
 from ..errors import ScenarioError, count_nouns, suggest_nearest
-from ..fields import WITHOUT_QUOTES, KeyProblem, TomlTable
+from ..fields import KeyProblem, TomlTable
 from ..records import JOINTS, PARAMETERS
 
 StructType = type[msgspec.Struct]
@@ -81,11 +81,13 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
     """
     count_names = {}
     for key, hint in get_type_hints(kind, include_extras=True).items():
-        # Only a type of the form `Annotated[type, ...]` has this attribute.
-        for annotation in getattr(hint, "__metadata__", ()):
-            values = annotation.extra if isinstance(annotation, Meta) else None
-            if values is not None and extra in values:
-                count_names[key] = str(values[extra])
+        # A limit of a site is a union of a number and a vector.
+        for member in (hint, *get_args(hint)):
+            # Only a type of the form `Annotated[type, ...]` has this attribute.
+            for annotation in getattr(member, "__metadata__", ()):
+                values = annotation.extra if isinstance(annotation, Meta) else None
+                if values is not None and extra in values:
+                    count_names[key] = str(values[extra])
     return count_names
 
 
@@ -131,74 +133,39 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
     return expanded
 
 
-_OWNERS = {
-    **dict.fromkeys(("joints", "parameters"), "the arm has"),
-    "axes": "the space of the arm has",
-    "shared": "sites share",
+_COUNT_TEXTS = {
+    "joints": ("the arm has", "joint"),
+    "parameters": ("the arm has", "parameter"),
+    "axes": ("the space of the arm has", "axis"),
+    "shared": ("sites share", "coordinate"),
 }
-
-
-_SINGULAR = {
-    "joints": "joint",
-    "parameters": "parameter",
-    "axes": "axis",
-    "shared": "coordinate that the sites share",
-}
-
-
-def describe_wrong_type(value: Any, expected: str) -> str:
-    """Returns what is wrong with a value of a scenario that has another type than expected.
-
-    Args:
-        value: The value as it was read from TOML.
-        expected: What the value would have to be, such as "a number".
-
-    Returns:
-        The problem, such as "expected a number, got text", as the end of a sentence about the
-        key.
-    """
-    if isinstance(value, str):
-        return f"expected {expected}, got text{WITHOUT_QUOTES}"
-    if isinstance(value, bool):
-        return f"expected {expected}, got true or false"
-    if isinstance(value, dict):
-        return f"expected {expected}, got a table"
-    return f"expected {expected}, got {value!r}"
+"""Start and noun of a sentence about each count, as in "the arm has 2 joints"."""
 
 
 def find_count_problem(
     table: TomlTable, kind: StructType, counts: VectorCounts
 ) -> KeyProblem | None:
-    """Finds the first vector of a table that is no list, or has too few or too many numbers.
+    """Finds the first vector of a table that has too few or too many numbers.
 
-    The table is one that `expand_vectors` returned, in which a single number is a list already.
+    A single number that stands for a vector is not a problem.
 
     Args:
-        table: A table of a scenario.
+        table: A table of a scenario, whose values have the right types.
         kind: Type of the table.
         counts: Lengths of the vectors of the site.
 
     Returns:
         The key and the problem. None if all vectors have the right lengths.
     """
-    expandable = _vector_keys(kind, "per")
-    points = _vector_keys(kind, "point")
-    for key, per in {**expandable, **points}.items():
+    count_names = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
+    for key, per in count_names.items():
         required = getattr(counts, per)
         value = table.get(key)
-        if key not in table or value is None:
-            continue
-        noun = "coordinates" if per == "shared" else per
-        if not isinstance(value, list | tuple):
-            if key in expandable:
-                expected = f"a number, or a list with one for each {_SINGULAR[per]}"
-            else:
-                expected = f"a list with one number for each {_SINGULAR[per]}"
-            return KeyProblem(key, describe_wrong_type(value, expected))
-        if len(value) == required:
+        if not isinstance(value, list | tuple) or len(value) == required:
             continue
         numbers = count_nouns(len(value), "number")
-        return KeyProblem(key, f"has {numbers}, and {_OWNERS[per]} {required} {noun}")
+        owner, noun = _COUNT_TEXTS[per]
+        return KeyProblem(key, f"has {numbers}, and {owner} {count_nouns(required, noun)}")
     return None
 
 
@@ -248,15 +215,24 @@ def check_keys(
     if not isinstance(table, dict):
         raise ScenarioError("must be a table", path=path)
     for key in table:
-        if key in valid:
-            continue
-        key_path = f"{path}.{key}" if path else key
-        hint = hint_at_quotes(key) or suggest_nearest(key, valid, elsewhere)
-        if not hint:
-            choices = ", ".join(valid)
-            hint = f"; valid keys are {choices}"
-        raise ScenarioError(f"unknown key{hint}", path=key_path)
+        if key not in valid:
+            key_path = f"{path}.{key}" if path else key
+            raise ScenarioError(describe_unknown_key(key, valid, elsewhere), path=key_path)
     return table
+
+
+def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
+    """Returns the problem of a key that a table must not have, with the key that may be meant.
+
+    Args:
+        key: The unknown key.
+        valid: The keys that the table may have.
+        elsewhere: Dotted paths of keys in other tables, which the author may have meant.
+    """
+    hint = hint_at_quotes(key) or suggest_nearest(key, valid, elsewhere)
+    if not hint:
+        hint = f"; valid keys are {', '.join(valid)}"
+    return f"unknown key{hint}"
 
 
 def hint_at_quotes(text: str) -> str:

@@ -22,8 +22,9 @@ from ..own_code import ImportedLaw, name_law_classes
 from .delay_models import DELAY_MODELS
 from .key_checks import check_keys, field_names, hint_at_quotes
 from .laws import LAWS
-from .resolve import PRESETS, TRACE_KEYS
+from .link_presets import PRESETS
 from .scenario_types import SITE_GROUPS, Scenario
+from .written_tables import TRACE_KEYS
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
 """Groups in which other keys depend on a kind, and the keys that name this kind."""

@@ -108,15 +108,23 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
     else:
         samples = _sample_planar_arm(spec.arm, speed)
 
+    # Coriolis torques grow with the square of the speed, Eq. (7).
     beyond_gravity_nm = np.maximum(limit_nm - samples.G, 0.0)
-    shares = beyond_gravity_nm / np.maximum(samples.coriolis, _LEAST_NM)
+    torque_shares = beyond_gravity_nm / np.maximum(samples.coriolis, _LEAST_NM)
+    bearable_share = math.sqrt(float(torque_shares.min()))
+
+    # energies at the beginning of the stop, Eq. (5)
     velocities = speed * _list_patterns(joints)
     kinetic_j = max(float(0.5 * v @ M @ v) for M in samples.M for v in velocities)
     damping = np.broadcast_to(setup.rest.damping, joints)
-    blend_j = float((0.5 * limit_nm**2 / damping).sum()) / setup.rate_hz  # (5)
+    blend_j = float((0.5 * limit_nm**2 / damping).sum()) / setup.rate_hz
+    energy_j = kinetic_j + blend_j
+
+    # A joint is fastest if it has all of this energy, Eq. (6).
     inverse_inertias = np.linalg.inv(samples.M)
     mobility = inverse_inertias.diagonal(axis1=1, axis2=2).max(axis=0)
-    energy_j = kinetic_j + blend_j
+    peak_rad_s = np.sqrt(2.0 * mobility * energy_j)
+
     rest_s = _bound_rest_time(
         setup=setup,
         speed=speed,
@@ -126,10 +134,10 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
     )
     return _RestBounds(
         rest_s=rest_s,
-        bearable_share=math.sqrt(float(shares.min())),  # (7)
+        bearable_share=bearable_share,
         kinetic_j=kinetic_j,
         blend_j=blend_j,
-        peak_rad_s=np.sqrt(2.0 * mobility * energy_j),  # (6)
+        peak_rad_s=peak_rad_s,
     )
 
 

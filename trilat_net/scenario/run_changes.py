@@ -23,9 +23,11 @@ from ..core import CoreChange, LifeOrder
 from ..errors import ScenarioError
 from ..records import NS_PER_S
 from .delay_models import LinkBase
-from .resolve import resolve_dominance_row, resolve_target
+from .refusals import check_table
+from .resolve import complete_target, resolve_dominance_row
 from .scenario_types import Change, Scenario, SiteOrder
 from .validate import check_change, check_links_memory
+from .written_tables import WrittenChange
 
 
 class LinkTables(dict[str, dict[str, Any]]):
@@ -79,21 +81,19 @@ def resolve_change(
         ScenarioError: There is no such link or site, or a value is not valid.
     """
     change = {**written, "at_s": from_ns / NS_PER_S}
-    names_both_or_neither = ("link" in change) == ("dominance" in change)
+    request = check_table(change, WrittenChange, "change")
+    names_both_or_neither = bool(request.link) == bool(request.dominance)
     if names_both_or_neither:
         raise ScenarioError("a change must name either a link (link) or a site (dominance)")
-    change["to"] = resolve_target(change, current_links, list(scenario.names), "change")
+    change["to"] = complete_target(request, current_links, list(scenario.names), "change")
     # The table of a trace is too long for a record.
-    if "link" in change and change["to"]["model"] == "trace":
+    if request.link and change["to"]["model"] == "trace":
         raise ScenarioError(
             "a link with a trace can be changed only by setting another model",
             path="change.to",
         )
 
-    try:
-        complete = msgspec.convert(change, Change)
-    except msgspec.ValidationError as error:
-        raise ScenarioError(str(error), path="change") from None
+    complete = check_table(change, Change, "change")
     check_change(complete, "change")
 
     # A longer delay may need more memory at the receiver.

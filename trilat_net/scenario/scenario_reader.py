@@ -23,6 +23,7 @@ import tomli_w
 from ..errors import ScenarioError, suggest_nearest
 from ..files import open_regular
 from ..own_code import allow_own_code, name_law_classes
+from .named_files import SHIPPED_FOLDER
 from .override import (
     Override,
     apply_overrides,
@@ -32,7 +33,7 @@ from .override import (
     parse_overrides,
     split_entries,
 )
-from .resolve import SHIPPED_FOLDER, resolve_scenario
+from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
 

@@ -127,7 +127,14 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
 
 SpeedLimit = Annotated[float, Meta(gt=0.0, le=10_000.0)]
-SpeedLimits = Annotated[tuple[SpeedLimit, ...], Meta(min_length=1, max_length=MAX_JOINTS)]
+JointSpeedLimits = Annotated[
+    tuple[SpeedLimit, ...],
+    Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"}),
+]
+SharedSpeedLimits = Annotated[
+    tuple[SpeedLimit, ...],
+    Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "shared"}),
+]
 
 
 GLIDE_TAU_RATE_NM_S = 1000.0
@@ -165,9 +172,9 @@ class Limits(Frozen, frozen=True):
     """
 
     tau_limit_nm: Positive | PositiveJoints = 200.0
-    qd_limit_rad_s: SpeedLimit | SpeedLimits = 100.0
+    qd_limit_rad_s: SpeedLimit | JointSpeedLimits = 100.0
     tau_rate_limit_nm_s: Positive | PositiveJoints | None = None
-    qd_des_limit_rad_s: SpeedLimit | SpeedLimits | None = None
+    qd_des_limit_rad_s: SpeedLimit | SharedSpeedLimits | None = None
     q_min_rad: Real | Joints | None = None
     q_max_rad: Real | Joints | None = None
 
@@ -252,10 +259,6 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
     "task": Task,
 }
 """Groups of keys that may be written once for all sites and again for one site, by table."""
-
-
-TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
-"""Keys of a planned change in a scenario file."""
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):
@@ -349,6 +352,12 @@ def _join_number_list(match: re.Match[str]) -> str:
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 
+ScenarioName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
+Duration = Annotated[float, Meta(gt=0.0, le=86_400.0)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+SchemeName = Literal["second_order", "digital"]
+
+
 class Scenario(Frozen, frozen=True, dict=True):
     """Description of an experiment in which every value of every site and link is explicit.
 
@@ -376,10 +385,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         urdf: Texts of the files that describe arms, by file name.
     """
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
-    duration_s: Annotated[float, Meta(gt=0.0, le=86_400.0)]
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
-    scheme: Literal["second_order", "digital"]
+    name: ScenarioName
+    duration_s: Duration
+    seed: Seed
+    scheme: SchemeName
     sites: dict[str, SiteSpec]
     dominance: dict[str, dict[str, float]]
     links: dict[str, Link]

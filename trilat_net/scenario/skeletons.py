@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-from .resolve import SHIPPED_FOLDER
+from .named_files import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:

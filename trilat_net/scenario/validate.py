@@ -14,30 +14,36 @@ Invariant:
       runs, with the reason.
 """
 
-import functools
 import math
-import operator
 from collections.abc import Collection, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from ..core import MAX_LINKS_BYTES, is_irreducible, links_bytes, needed_pages
+from ..core import (
+    MAX_LINKS_BYTES,
+    ROW_SUM_TOLERANCE,
+    Array,
+    is_irreducible,
+    links_bytes,
+    needed_pages,
+)
 from ..errors import ScenarioError, count_nouns
-from ..fields import TomlTable, reword_problem, split_refusal
+from ..fields import TomlTable
 from ..files import find_page
 from ..laws import LawSettings
 from ..own_code import ImportedLaw, check_sends
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
-from .delay_models import LinkBase
-from .delay_models.kernel_delays import ConstantDelay, TraceDelay
+from .delay_models import Link
+from .delay_models.kernel_delays import ConstantDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
 from .operators import kernel_operators
 from .operators.program_hand import ProgramHand
-from .scenario_types import Change, Limits, OnStale, Scenario, SiteSpec
+from .refusals import convert_drawn, refuse
+from .scenario_types import Change, Limits, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
 """Ratio of a singular value to the largest one below which the direction counts as immobile."""
@@ -280,29 +286,6 @@ def _check_plant(path: str, site: SiteSpec) -> None:
             )
 
 
-def _list_literals(hint: Any) -> tuple[str, ...]:
-    """Returns the texts that a `Literal` type, or a union that contains one, permits."""
-    literals: tuple[str, ...] = ()
-    for argument in get_args(hint):
-        literals += (argument,) if isinstance(argument, str) else _list_literals(argument)
-    return literals
-
-
-_CHOICES = {
-    key: _list_literals(kind.__annotations__[key])
-    for kind, key in (
-        (Scenario, "scheme"),
-        (SiteSpec, "role"),
-        (SiteSpec, "plant"),
-        (LinkBase, "order"),
-        (TraceDelay, "at_end"),
-        (OnStale, "action"),
-        (OnStale, "on_lost"),
-    )
-}
-"""Permitted texts of the keys that have a fixed set of values, by the name of the key."""
-
-
 def build_scenario(resolved: TomlTable) -> Scenario:
     """Converts resolved tables to a scenario, and checks it completely.
 
@@ -315,7 +298,13 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         ScenarioError: A value has a wrong type or range, or values contradict each other. The
             error contains the path of the key.
     """
-    scenario = _convert_scenario(resolved)
+    scenario = convert_drawn(
+        table=resolved,
+        kind=Scenario,
+        path="",
+        drawn=resolved["drawn"],
+        seed=resolved["seed"],
+    )
     _check_joint_space(scenario)
     _check_damping(scenario)
     _check_start_poses(scenario)
@@ -347,25 +336,6 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
     timeline = tuple(_normalise_change(change) for change in scenario.timeline)
     return msgspec.structs.replace(scenario, timeline=timeline)
-
-
-def _convert_scenario(resolved: TomlTable) -> Scenario:
-    """Converts resolved tables to the struct of the scenario.
-
-    Raises:
-        ScenarioError: A value has a wrong type or range. If the value was drawn at random, the
-            error says so, because its author did not write this number.
-    """
-    try:
-        return msgspec.convert(resolved, Scenario)
-    except msgspec.ValidationError as error:
-        problem, path = split_refusal(error)
-        key_path = _name_key(resolved, path.strip("."))
-        problem = _reword(problem, key_path)
-        drawn = resolved.get("drawn", {}).get(dotted_key(key_path))
-        if drawn:
-            problem += f"; {drawn['value']:g} was drawn with seed {resolved['seed']}"
-        raise ScenarioError(problem, path=key_path) from None
 
 
 def _normalise_change(change: Change) -> Change:
@@ -662,6 +632,30 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
         )
 
 
+def find_row_problem(row: Array, site: int) -> str | None:
+    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
+
+    The row contains the weights with which one site follows the others. They must lie between 0
+    and 1 and sum to 1, and the site must not follow itself.
+
+    Args:
+        row: Dominance factors of one site, shape (N,).
+        site: Index of that site.
+
+    Returns:
+        A clause for an error message. None if the row is valid.
+    """
+    if not np.isfinite(row).all():
+        return "shares must be finite numbers"
+    if row[site] != 0.0:
+        return f"a site does not follow itself, yet its own share is {row[site]:g}"
+    if (row < 0.0).any() or (row > 1.0).any():
+        return "shares must lie between 0 and 1"
+    if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
+        return f"shares must sum to 1, Eq. (7), and sum to {row.sum():.12g}"
+    return None
+
+
 def _check_actors(
     actors: Sequence[operators.Operator | operators.Environment], path: str
 ) -> None:
@@ -845,55 +839,9 @@ def check_change(change: Change, path: str) -> None:
             "a link changes at once; only shares have a ramp", path=f"{path}.ramp_s"
         )
     try:
-        problem = change.after.find_problem()
+        link = change.after
     except msgspec.ValidationError as error:
-        refusal, key = split_refusal(error)
-        raise ScenarioError(_reword(refusal, key.strip(".")), path=f"{path}.to{key}") from None
+        raise refuse(error, change.to, Link, f"{path}.to") from None
+    problem = link.find_problem()
     if problem is not None:
         raise ScenarioError(problem.problem, path=f"{path}.to.{problem.key}")
-
-
-def _reword(problem: str, path: str) -> str:
-    """Translates an error message of msgspec to words that an author of scenarios understands.
-
-    Args:
-        problem: Message of msgspec.
-        path: Path of the refused key.
-    """
-    if problem.startswith("Invalid enum value"):
-        value = problem.removeprefix("Invalid enum value ")
-        choices = _CHOICES[path.rpartition(".")[2]]
-        return f"is {value}, but must be {' or '.join(map(repr, choices))}"
-    if problem.startswith("Object missing required field"):
-        return f"{problem.split()[-1].strip('`')} is missing"
-    return reword_problem(problem)
-
-
-def _name_key(resolved: TomlTable, path: str) -> str:
-    """Returns the path of a refused key, with a name in place of msgspec's `[...]`.
-
-    msgspec does not say which entry of a dictionary it refused: it writes
-    `sites[...].q0_rad[0]`. To find the entry, the conversion is repeated with each entry alone.
-    The first one that is refused at the same path is named.
-
-    Args:
-        resolved: Tables that msgspec refused. They are changed during the search, and restored.
-        path: Path from the message of msgspec.
-    """
-    before, placeholder, after = path.partition("[...]")
-    if not placeholder:
-        return path
-    *parent_keys, last_key = before.split(".")
-    parent = functools.reduce(operator.getitem, parent_keys, resolved)
-    entries = parent[last_key]
-    try:
-        for key, entry in entries.items():
-            parent[last_key] = {key: entry}
-            try:
-                msgspec.convert(resolved, Scenario)
-            except msgspec.ValidationError as error:
-                if str(error).endswith(f"`$.{path}`"):
-                    return f"{before}.{key}{after}"
-    finally:
-        parent[last_key] = entries
-    return before

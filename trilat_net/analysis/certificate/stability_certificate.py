@@ -313,11 +313,12 @@ class Certificate(Result):
             return False
         if "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED:
             return True
-        if "settled" in accepted and self.stability is Stability.SETTLED:
+        stability = self.decision.stability
+        if "settled" in accepted and stability is Stability.SETTLED:
             return True
-        if "open" in accepted and self.stability is Stability.OPEN:
+        if "open" in accepted and stability is Stability.OPEN:
             return True
-        return self.stability is Stability.STABLE
+        return stability is Stability.STABLE
 
 
 def certify(

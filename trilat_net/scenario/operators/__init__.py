@@ -33,6 +33,7 @@ from ..key_checks import (
     field_names,
     find_count_problem,
 )
+from ..refusals import MAX_QUOTED_LENGTH
 
 
 class HeldArm(NamedTuple):
@@ -239,12 +240,10 @@ else:
     # Built at run time from the classes in this folder.
     Operator = Union[tuple(OPERATORS.values())]  # noqa: UP007
     Environment = Union[tuple(ENVIRONMENTS.values())]  # noqa: UP007
-_MAX_QUOTED_LENGTH = 60
-"""Length up to which an error message quotes a value."""
 
 
 def resolve_operators(
-    written: Any,
+    written: list[fields.TomlTable],
     kinds: Mapping[str, type[ActorBase]],
     held_arm: HeldArm,
     path: str,
@@ -267,13 +266,9 @@ def resolve_operators(
     Raises:
         ScenarioError: A table is not valid.
     """
-    if not isinstance(written, list):
-        raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)
     tables = []
     for n, entry in enumerate(written):
         entry_path = f"{path}[{n}]"
-        if not isinstance(entry, dict):
-            raise ScenarioError("must be a table", path=entry_path)
         kind = _find_kind(entry, kinds, entry_path)
         check_keys(entry, ("kind", *field_names(kind)), entry_path)
         expanded = expand_vectors(entry, kind, held_arm.counts)
@@ -308,6 +303,21 @@ def _find_kind(
     return kinds[kind]
 
 
+class _RefusedKey(NamedTuple):
+    """Key of an operator's table whose value is missing or not valid.
+
+    Attributes:
+        key: The key.
+        indices: Indices of the wrong entry in a list, such as "[3][1]". Empty if the whole
+            value is wrong.
+        is_missing: True if the key is missing.
+    """
+
+    key: str
+    indices: str = ""
+    is_missing: bool = False
+
+
 def _check_values(
     table: fields.TomlTable,
     kind: type[ActorBase],
@@ -317,9 +327,6 @@ def _check_values(
 ) -> None:
     """Refuses a complete table if a value has a wrong type, range or length.
 
-    A value that the author did not write was copied from the arm. If it is wrong, it is refused
-    later, at the key of the arm.
-
     Args:
         table: Complete table.
         kind: Class of the table.
@@ -327,59 +334,67 @@ def _check_values(
         path: Path of the table, for error messages.
         counts: Lengths of the arm's vectors.
     """
+    refused = _find_refused_key(table, kind, counts)
+    if refused is None:
+        return
+    key_path = f"{path}.{refused.key}"
+    if refused.is_missing:
+        expected = _describe_values(refused, kind, counts)
+        raise ScenarioError(f"is missing; the value must be {expected}", path=key_path)
+    if refused.key not in entry:
+        # The value was copied from the arm, and is refused later at the key of the arm.
+        return
+
+    expected = _describe_values(refused, kind, counts)
+    if refused.key == "points":
+        raise ScenarioError(f"must be {expected}", path=f"{key_path}{refused.indices}")
+    value = repr(entry[refused.key])
+    quoted = f", but is {value}" if len(value) <= MAX_QUOTED_LENGTH else ""
+    raise ScenarioError(f"must be {expected}{quoted}", path=key_path)
+
+
+def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: VectorCounts) -> str:
+    """Returns what the author of a scenario may write as the value of a refused key.
+
+    For example "one torque for both joints or two, ON the arm, N m".
+
+    Args:
+        refused: The key.
+        kind: Class of the table.
+        counts: Lengths of the arm's vectors, which decide about words such as "both joints".
+    """
+    text = kind.value_texts.get(refused.key) or VALUE_TEXTS[refused.key]
+    if refused.key == "points" and refused.indices:
+        text = f"a row {POINTS_ROW_TEXT}"
     is_planar = counts == VectorCounts()
     placeholders = {
         name: planar_text if is_planar else chain_text
         for name, (planar_text, chain_text) in COUNT_TEXTS.items()
     }
-
-    def describe_values(key: str) -> str:
-        text = kind.value_texts.get(key) or VALUE_TEXTS[key]
-        return text.format(**placeholders)
-
-    refusal = _find_refusal(table, kind, counts)
-    if refusal is None:
-        return
-    problem, location = refusal
-    missing = re.search(r"missing required field `(\w+)`", problem)
-    if missing is not None:
-        key = missing[1]
-        raise ScenarioError(
-            f"is missing; the value must be {describe_values(key)}", path=f"{path}.{key}"
-        )
-
-    # The location is, for example, `$.points[3][1]`.
-    match = re.match(r"`\$\.(\w+)(.*)`", location)
-    key, index_text = (match[1], match[2]) if match else ("", location)
-    if key not in entry:
-        return
-    if key == "points":
-        expected = describe_values(key)
-        if index_text:
-            expected = f"a row {POINTS_ROW_TEXT.format(**placeholders)}"
-        raise ScenarioError(f"must be {expected}", path=f"{path}.{key}{index_text}")
-    value = repr(entry[key])
-    quoted = f", but is {value}" if len(value) <= _MAX_QUOTED_LENGTH else ""
-    raise ScenarioError(f"must be {describe_values(key)}{quoted}", path=f"{path}.{key}")
+    return text.format(**placeholders)
 
 
-def _find_refusal(
+def _find_refused_key(
     table: fields.TomlTable, kind: type[ActorBase], counts: VectorCounts
-) -> tuple[str, str] | None:
-    """Returns why a complete table is not valid, and the location of the wrong value.
+) -> _RefusedKey | None:
+    """Returns the first key of a complete table that is missing or not valid.
 
-    The location has the notation of msgspec, for example "`$.points[3]`". The result is None if
-    the table is valid.
+    None if the table is valid.
     """
     try:
         msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        problem, _, location = str(error).partition(" - at ")
-        return problem, location
+        problem, location = fields.split_refusal(error)
+        missing = re.search(r"missing required field `(\w+)`", problem)
+        if missing is not None:
+            return _RefusedKey(missing[1], is_missing=True)
+        # The location is, for example, ".points[3][1]".
+        key, bracket, indices = location.removeprefix(".").partition("[")
+        return _RefusedKey(key, bracket + indices)
     count_problem = find_count_problem(table, kind, counts)
     if count_problem is not None:
-        return count_problem.problem, f"`$.{count_problem.key}`"
+        return _RefusedKey(count_problem.key)
     for n, row in enumerate(table.get("points", ())):
         if len(row) != 1 + counts.joints:
-            return "of another arm", f"`$.points[{n}]`"
+            return _RefusedKey("points", f"[{n}]")
     return None

@@ -1,0 +1,45 @@
+"""Lists the presets of links: settings of typical networks that a scenario can choose by name.
+
+A scenario, the description of an experiment, connects its arms by links. A preset such as "4g"
+stands for the delay model of a link and its keys.
+
+Invariant:
+    - A preset is a table that an author could have written as well. The file
+      `scenarios/_presets.toml` contains the presets and their sources.
+"""
+
+import tomllib
+from typing import Any
+
+from .named_files import SHIPPED_FOLDER
+
+PRESETS_FILE = SHIPPED_FOLDER / "_presets.toml"
+
+GRID_ROUND_TRIPS_MS = (8, 68, 136, 272, 544, 1088)
+GRID_LOSSES_PERCENT = (0, 10, 25, 50)
+"""Round trips and losses of the grid of presets.
+
+The ranges are those of Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of Control
+Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips of 8 to
+1088 ms and losses of 0 to 50 %. The grid points are our choice; the points of that study are
+not known to us.
+"""
+
+_GRID: dict[str, dict[str, Any]] = {
+    f"rtt{rtt_ms}-loss{percent}": {
+        "model": "constant",
+        "delay_ms": rtt_ms / 2,
+        "loss": percent / 100,
+    }
+    for rtt_ms in GRID_ROUND_TRIPS_MS
+    for percent in GRID_LOSSES_PERCENT
+}
+PRESETS: dict[str, dict[str, Any]] = {
+    **tomllib.loads(PRESETS_FILE.read_text(encoding="utf-8")),
+    **_GRID,
+}
+"""The keys of a link that each preset stands for, by the name of the preset.
+
+The presets of the grid, such as `rtt68-loss10`, delay each direction by half of the round trip.
+They lose each sample independently of the others.
+"""

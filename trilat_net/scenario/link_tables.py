@@ -1,0 +1,167 @@
+"""Completes the tables of the links of a scenario: delay models, presets, recorded delays.
+
+A scenario is a TOML file that describes an experiment. A link is the one-way network connection
+between two sites, the processes of the arms. The table `link` holds for all links, and the
+table `links` contains the settings of single links, for example of "m1->s".
+
+Invariant:
+    - A complete link contains the keys of its preset, but not the preset's name, so that an
+      experiment does not change with a preset. It contains recorded delays, but no file.
+"""
+
+from ..errors import ScenarioError, suggest_nearest
+from ..fields import TomlTable
+from .delay_models import DELAY_MODELS
+from .key_checks import check_choice, check_keys, list_fields
+from .link_presets import PRESETS
+from .named_files import NamedFiles
+from .refusals import check_table
+from .suggestions import list_link_paths
+from .written_tables import TRACE_KEYS, check_link
+
+
+def complete_link_tables(
+    common: TomlTable, written: TomlTable, names: list[str], files: NamedFiles
+) -> TomlTable:
+    """Returns the complete table of every link, by the name of the link.
+
+    Args:
+        common: Settings of all links as their author wrote them, the table `link`.
+        written: Settings of single links, by the name of the link.
+        names: Names of all sites, between which there are links.
+        files: Files of delays that links may name.
+
+    Raises:
+        ScenarioError: There is no such link, or a table is not valid.
+    """
+    link_names = [f"{peer}->{site}" for site in names for peer in names if peer != site]
+    check_keys(written, link_names, "links", list_link_paths())
+    common_link = join_link(common, {}, "link")
+    return {
+        name: complete_link(
+            written=check_table(written.get(name, {}), TomlTable, f"links.{name}"),
+            common=common_link,
+            name=name,
+            files=files,
+            path=f"links.{name}",
+        )
+        for name in link_names
+    }
+
+
+def complete_link(
+    written: TomlTable, common: TomlTable, name: str, files: NamedFiles, path: str
+) -> TomlTable:
+    """Returns the complete table of a link, or of the delayed view of a site.
+
+    A view is the delay with which the user of a site sees the other arms. It has the keys of a
+    link, but inherits none.
+
+    Args:
+        written: Table of the link as its author wrote it.
+        common: Common settings of all links, joined with their defaults. Empty for a view.
+        name: Name of the link, by which a log stores its delays.
+        files: Files of delays that the link may name.
+        path: Path of the table, for error messages.
+
+    Raises:
+        ScenarioError: A key is unknown, missing or wrong, or a file cannot be used.
+    """
+    link = join_link(written, common, path)
+    kind = DELAY_MODELS[link["model"]]
+    if link["model"] == "trace":
+        is_common_file = "file" in common and "file" not in written
+        trace = files.read_trace(link, name, "link" if is_common_file else path)
+        link = {key: value for key, value in link.items() if key not in TRACE_KEYS}
+        link["trace"] = trace
+
+    link = {**kind.derive_keys(link), **link}
+    for field in list_fields(kind):
+        if field.required and field.name not in link:
+            advice = "; give it here or in [link]" if common else ""
+            raise ScenarioError(f"is missing{advice}", path=f"{path}.{field.name}")
+    return link
+
+
+def join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
+    """Returns the settings of a link, completed with the settings that the link inherits.
+
+    The source of settings that the author left out depends on what the author wrote:
+
+    - If the link names a preset, they are taken from the preset.
+    - If it names only a delay model, no other settings are taken over, because each model has
+      its own.
+    - Otherwise they are taken from the common settings of all links.
+
+    Files with recorded delays are not read here.
+
+    Args:
+        written: Settings of the link as the author wrote them.
+        common: Common settings of all links, completed.
+        path: Path of the settings in the scenario, for error messages.
+
+    Raises:
+        ScenarioError: There is no such preset, model or key, or the preset has another model.
+    """
+    defaults = {} if "model" in written else common
+    if "preset" in written:
+        check_choice(written["preset"], list(PRESETS), f"{path}.preset")
+        defaults = PRESETS[written["preset"]]
+    model = written.get("model", defaults.get("model", "constant"))
+    check_choice(model, list(DELAY_MODELS), f"{path}.model")
+    if model != defaults.get("model", model):
+        raise ScenarioError(
+            f"is {model!r}, but the preset {written['preset']!r} is {defaults['model']!r}: "
+            "give only one of the two",
+            path=f"{path}.model",
+        )
+    check_link(written, model, path)
+
+    # Delays that are written out replace the file of the defaults, and a file replaces delays.
+    replaced_keys: tuple[str, ...] = ("preset",)
+    if "trace" in written:
+        replaced_keys = ("preset", *TRACE_KEYS)
+    elif "file" in written:
+        replaced_keys = ("preset", "trace")
+    inherited = {key: value for key, value in defaults.items() if key not in replaced_keys}
+    link = {**inherited, **written, "model": model}
+    link.pop("preset", None)
+    return link
+
+
+def change_link(written: TomlTable, name: str, current: TomlTable, path: str) -> TomlTable:
+    """Returns the complete table of a link after a change during a run.
+
+    A change may neither read a file nor move the outages of the link. It may not replace one
+    table of recorded delays by another.
+
+    Args:
+        written: Table `to` of the change, with the keys that change.
+        name: Name of the link.
+        current: Complete tables of all links before the change, by name.
+        path: Path of the change, for error messages.
+
+    Raises:
+        ScenarioError: There is no such link, or the change is not possible.
+    """
+    if name not in current:
+        names = list(current)
+        hint = suggest_nearest(name, names) or f"; the links are {', '.join(names)}"
+        raise ScenarioError(f"there is no link {name!r}{hint}", path=f"{path}.link")
+
+    before = current[name]
+    after = join_link(written, before, f"{path}.to")
+    if any(key in after for key in TRACE_KEYS):
+        raise ScenarioError("no file can be named here", path=f"{path}.to.file")
+    if after["model"] == "trace" and after.get("trace") != before.get("trace"):
+        raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
+    if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
+        raise ScenarioError(
+            "belongs to [links]; outages cannot be changed during a run",
+            path=f"{path}.to.outages_s",
+        )
+
+    after = {**DELAY_MODELS[after["model"]].derive_keys(after), **after}
+    if "outages_s" in before:
+        after["outages_s"] = before["outages_s"]
+    return after

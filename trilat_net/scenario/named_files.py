@@ -1,0 +1,159 @@
+"""Reads the files that a scenario names: descriptions of robots, and recorded delays of links.
+
+A scenario is a TOML file that describes an experiment. It may name URDF files, which describe
+robot arms, and files with the delays of a network. A complete scenario contains the texts of
+these files instead of their names.
+
+Invariant:
+    - Without a folder, no file may be named: a scenario from a log or from another computer
+      reads nothing on this one.
+"""
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import ScenarioError
+from ..fields import TomlTable
+from ..files import open_regular
+from .delay_traces import read_trace
+from .urdf import MAX_CHARACTERS
+
+SHIPPED_FOLDER = resources.files("trilat_net") / "scenarios"
+
+
+class NamedFiles(NamedTuple):
+    """Files that a scenario names.
+
+    Attributes:
+        folder: Folder in which the files are searched. None refuses every file.
+        urdf_texts: Texts of the URDF files of the arms, by the name of the file.
+    """
+
+    folder: Path | None
+    urdf_texts: dict[str, str]
+
+    @classmethod
+    def of_arms(
+        cls, tables: TomlTable, embedded_texts: Mapping[str, str], folder: Path | None
+    ) -> "NamedFiles":
+        """Reads the text of every URDF file that an arm of a scenario names.
+
+        A text that the scenario itself contains has priority, then a file that the package
+        ships, then a file in `folder`.
+
+        Args:
+            tables: Tables of the scenario file.
+            embedded_texts: Table `urdf` of the scenario: texts by the name of their file.
+            folder: Folder in which the files are searched. None refuses every file.
+
+        Raises:
+            ScenarioError: A file cannot be read, or no file may be named.
+        """
+        arms = {"arm": tables.get("arm", {})}
+        arms |= {
+            f"sites.{name}.arm": site.get("arm", {}) for name, site in tables["sites"].items()
+        }
+        texts: dict[str, str] = {}
+        for path, arm in arms.items():
+            name = arm.get("urdf")
+            if not name or name in texts:
+                continue
+            text = embedded_texts.get(name)
+            if text is None:
+                text = _read_urdf(name, folder, f"{path}.urdf")
+            texts[name] = use_unix_line_ends(text)
+        return cls(folder, texts)
+
+    def list_used_texts(self, sites: TomlTable) -> dict[str, str]:
+        """Returns the texts of the URDF files that complete sites use, by the name of the file.
+
+        The file that `[arm]` names is not used if every site has an arm of its own.
+
+        Args:
+            sites: Complete tables of the sites, by name.
+        """
+        used_names = [site["arm"].get("urdf") for site in sites.values()]
+        return {name: text for name, text in self.urdf_texts.items() if name in used_names}
+
+    def read_trace(self, link: TomlTable, name: str, path: str) -> str:
+        """Returns the recorded delays of a link, from its table or from the file that it names.
+
+        The file is a table of times and delays, or a log. From a log, the delays of the link
+        `of` are taken, by default those of the link with the same name.
+
+        Args:
+            link: Table of a link with the delay model "trace".
+            name: Name of the link.
+            path: Path of the table that names the file, for error messages.
+
+        Raises:
+            ScenarioError: The keys contradict each other, or the file cannot be used.
+        """
+        file_path = f"{path}.file"
+        if "file" not in link:
+            if "trace" not in link:
+                raise ScenarioError(
+                    "is missing; name a table or a log of delays", path=file_path
+                )
+            if "of" in link:
+                raise ScenarioError(
+                    "needs the key file, which must name the log that contains this link",
+                    path=f"{path}.of",
+                )
+            return str(link["trace"])
+        if "trace" in link:
+            raise ScenarioError("give either trace or file, not both", path=file_path)
+        if self.folder is None:
+            raise ScenarioError("no file may be named here", path=file_path)
+        try:
+            return read_trace(_find_file(link["file"], self.folder), link.get("of", name))
+        except ScenarioError as error:
+            raise ScenarioError(error.problem, path=file_path) from None
+
+
+def _read_urdf(name: str, folder: Path | None, path: str) -> str:
+    """Returns the text of a URDF file.
+
+    At most one character more than allowed is read. The parser then refuses the text as too
+    long.
+
+    Args:
+        name: Name of the file, as the arm names it.
+        folder: Folder of the scenario. None refuses every file.
+        path: Path of the key that names the file, for error messages.
+
+    Raises:
+        ScenarioError: The file cannot be read, or no file may be named.
+    """
+    if folder is None:
+        raise ScenarioError("no file may be named here", path=path)
+    try:
+        with open_regular(_find_file(name, folder), encoding="utf-8") as stream:
+            text: str = stream.read(MAX_CHARACTERS + 1)
+        return text
+    # A ValueError is raised for text that is not UTF-8, and for a name with a null character.
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise ScenarioError(f"{name} cannot be read: {reason}", path=path) from None
+
+
+def _find_file(name: str, folder: Path) -> Path:
+    """Returns the shipped file of a name, or the file in `folder` if there is none.
+
+    Only a name without a folder can be that of a shipped file. The returned path need not
+    exist.
+    """
+    shipped = Path(str(SHIPPED_FOLDER / name))
+    is_plain_name = "/" not in name and "\\" not in name
+    return shipped if is_plain_name and shipped.is_file() else folder / name
+
+
+def use_unix_line_ends(text: str) -> str:
+    r"""Returns a text with "\n" at the end of each line.
+
+    TOML stores line ends in this form. Without the conversion, a file that was written on
+    Windows would be another experiment.
+    """
+    return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -1,0 +1,416 @@
+"""Words what is wrong with a table of a scenario, for the author of the scenario.
+
+A scenario is a TOML file that describes an experiment. The library msgspec compares its tables
+with types, and refuses the first value that does not fit. Its message is written for
+programmers: "Expected `float | object`, got `str` - at `$.sites[...].arm.l1_m`". This module
+turns the message into an error that names the key as it stands in the file, and states what
+the author may write there.
+
+A type may say in its own words what a value must be: `Meta(extra={"must_be": "a time in s"})`.
+
+Invariant:
+    - Every refusal of a scenario's table by msgspec is worded by `refuse`, except those of
+      operators and environments, whose keys have texts of their own (`operators.VALUE_TEXTS`).
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import msgspec
+from msgspec import Meta
+
+from ..errors import ScenarioError
+from ..fields import WITHOUT_QUOTES, TomlTable, reword_problem
+from .distributions import (
+    DISTRIBUTION_FORM,
+    Distribution,
+    StatedDistribution,
+    dotted_key,
+)
+from .key_checks import describe_unknown_key, field_names, is_distribution, list_fields
+
+_MESSAGE = re.compile(r"(?P<problem>.*) - at `\$(?P<location>.*)`", re.DOTALL)
+"""Matches a message of msgspec about a value inside a table."""
+_LOCATION_PART = re.compile(r"\.(?P<key>[^.\[]+)|\[(?P<index>\d+)\]|\[\.\.\.\]")
+"""Matches the next part of a location in a message of msgspec: `.arm`, `[0]` or `[...]`.
+
+`[...]` stands for a key of a dictionary, for example for the name of a site.
+"""
+_VECTOR_ENTRY = {
+    "joints": "joint",
+    "parameters": "parameter",
+    "axes": "axis",
+    "shared": "coordinate that the sites share",
+}
+"""What a vector has one number for, by the name of its length in `VectorCounts`."""
+
+MAX_QUOTED_LENGTH = 60
+"""Length up to which an error message quotes a value."""
+
+T = TypeVar("T")
+Location = list[str | int]
+"""Keys and indices that lead from a table to a value inside the table."""
+
+
+def refuse(
+    error: msgspec.ValidationError,
+    table: Any,
+    kind: Any,
+    path: str,
+    elsewhere: Sequence[str] = (),
+) -> ScenarioError:
+    """Returns the error for the author of a table that msgspec has refused.
+
+    Args:
+        error: Error that msgspec raised when it compared the table with its type.
+        table: The refused table.
+        kind: Type of the table.
+        path: Dotted path of the table in the scenario. Empty for the whole scenario.
+        elsewhere: Dotted paths of keys in other tables, which the author may have meant by an
+            unknown key.
+
+    Returns:
+        The error with the path of the wrong key. The caller raises it.
+    """
+    message, location = _split_message(str(error), table, kind)
+    number_location = _find_table_for_number(table, kind, location)
+    unknown_key = _quoted_key(message, "Object contains unknown field ")
+    missing_key = _quoted_key(message, "Object missing required field ")
+    if number_location is not None:
+        location = number_location
+        problem = _describe_table_for_number(_value_at(table, location), kind, location)
+    elif unknown_key is not None:
+        valid = [name for hint in _list_hints(kind, location) for name in _list_keys(hint)]
+        problem = describe_unknown_key(unknown_key, valid, () if location else elsewhere)
+        location.append(unknown_key)
+    elif missing_key is not None:
+        location.append(missing_key)
+        must_be = _find_extra(kind, location, "must_be")
+        problem = f"is missing; the value must be {must_be}" if must_be else "is missing"
+    else:
+        problem = _describe_wrong_value(message, table, kind, location, path)
+    return ScenarioError(problem, path=join_path(path, location))
+
+
+def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] = ()) -> T:
+    """Refuses one table of a scenario that has an unknown key, or a value of a wrong type.
+
+    Args:
+        table: The table as its author wrote it.
+        kind: Type of the table.
+        path: Dotted path of the table.
+        elsewhere: Dotted paths of keys in other tables, which the author may have meant.
+
+    Returns:
+        The table as a typed value.
+
+    Raises:
+        ScenarioError: The table is refused. The error contains the path of the key.
+    """
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        raise refuse(error, table, kind, path, elsewhere) from None
+
+
+def convert_drawn(
+    table: TomlTable, kind: type[T], path: str, drawn: Mapping[str, Distribution], seed: int
+) -> T:
+    """Converts a complete table, in which random numbers have been drawn, to its type.
+
+    Args:
+        table: The table.
+        kind: Type of the complete table.
+        path: Dotted path of the table. Empty for the whole scenario.
+        drawn: Distributions of the drawn numbers, by the dotted key of the number.
+        seed: Seed with which the numbers were drawn.
+
+    Raises:
+        ScenarioError: A value has a wrong type or range. If the value was drawn at random, the
+            error says so, because its author did not write this number.
+    """
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        refusal = refuse(error, table, kind, path)
+        origin = drawn.get(dotted_key(refusal.path))
+        if origin is None:
+            raise refusal from None
+        problem = f"{refusal.problem}; {origin.value:g} was drawn with seed {seed}"
+        raise ScenarioError(problem, path=refusal.path) from None
+
+
+def join_path(path: str, location: Location) -> str:
+    """Returns the dotted path of a value inside a table, as in `sites.m1.q0_rad[0]`.
+
+    Args:
+        path: Dotted path of the table. Empty for the whole scenario.
+        location: Keys and indices that lead from the table to the value.
+    """
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        else:
+            path += f".{part}" if path else part
+    return path
+
+
+def describe_wrong_type(value: Any, expected: str) -> str:
+    """Returns what is wrong with a value of a scenario that has another type than expected.
+
+    Args:
+        value: The value as it was read from TOML.
+        expected: What the value would have to be, such as "a number".
+
+    Returns:
+        The problem, such as "expected a number, got text", as the end of a sentence about the
+        key.
+    """
+    if isinstance(value, str):
+        return f"expected {expected}, got text{WITHOUT_QUOTES}"
+    if isinstance(value, bool):
+        return f"expected {expected}, got true or false"
+    if isinstance(value, dict):
+        return f"expected {expected}, got a table"
+    if isinstance(value, list):
+        return f"expected {expected}, got a list"
+    return f"expected {expected}, got {value!r}"
+
+
+def _describe_wrong_value(
+    message: str, table: Any, kind: Any, location: Location, path: str
+) -> str:
+    """Returns what is wrong with a value of a wrong type or range.
+
+    Args:
+        message: Message of msgspec without the location.
+        table: The refused table.
+        kind: Type of the table.
+        location: Location of the value in the table.
+        path: Dotted path of the table.
+    """
+    hints = _list_hints(kind, location)
+    value = _value_at(table, location)
+    if message.startswith("Invalid enum value "):
+        choices = [repr(word) for hint in hints for word in _list_choices(hint)]
+        return f"is {value!r}, but must be {' or '.join(choices)}"
+
+    is_wrong_type = message.startswith("Expected `") and ", got `" in message
+    if not is_wrong_type:
+        return reword_problem(message)
+    must_be = _find_extra(kind, location, "must_be")
+    if must_be is not None:
+        quoted = repr(value)
+        ending = f", but is {quoted}" if len(quoted) <= MAX_QUOTED_LENGTH else ""
+        return f"must be {must_be}{ending}"
+    if StatedDistribution in hints:
+        return _describe_wrong_number(value, kind, location)
+    if message.startswith("Expected `object`, got `"):
+        return "must be a table"
+    if message.startswith("Expected `array`, got `") and any(map(_is_list_of_tables, hints)):
+        return f"must be a list of tables [[{join_path(path, location)}]]"
+    return reword_problem(message)
+
+
+def _describe_table_for_number(table: TomlTable, kind: Any, location: Location) -> str:
+    """Returns what is wrong with a table in place of a number, such as a wrong distribution."""
+    if is_distribution(table):
+        return f"{DISTRIBUTION_FORM}, but is {table}"
+    return _describe_wrong_number(table, kind, location)
+
+
+def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
+    """Returns what is wrong with a value that is no number, and what may stand in its place.
+
+    Args:
+        value: The value.
+        kind: Type of the refused table.
+        location: Location of the value in the table.
+    """
+    vector_length = _find_extra(kind, location, "per")
+    if vector_length is None:
+        return describe_wrong_type(value, "a number")
+    entry = _VECTOR_ENTRY[vector_length]
+    return describe_wrong_type(value, f"a number, or a list with one for each {entry}")
+
+
+def _quoted_key(problem: str, start: str) -> str | None:
+    """Returns the key that a message quotes after a certain start, or None for other messages.
+
+    For example, "Object missing required field `name`" quotes the key "name".
+    """
+    quoted = problem.removeprefix(start)
+    return None if quoted == problem else quoted[1:-1]
+
+
+# The location of a value, and the types that the value may have there.
+
+
+def _split_message(message: str, table: Any, kind: Any) -> tuple[str, Location]:
+    """Splits a message of msgspec into the problem and the location of the refused value.
+
+    msgspec does not name the keys of a dictionary: it writes `$.sites[...].q0_rad[0]`. These
+    keys are found by `_find_refused_key`.
+
+    Args:
+        message: The message.
+        table: The refused table.
+        kind: Type of the table.
+    """
+    match = _MESSAGE.fullmatch(message)
+    if match is None:
+        return message, []
+    location: Location = []
+    value = table
+    for part in _LOCATION_PART.finditer(match["location"]):
+        step: Any = part["key"]
+        if part["index"] is not None:
+            step = int(part["index"])
+        elif step is None:
+            step = _find_refused_key(message, table, kind, location)
+        try:
+            value = value[step]
+        except (LookupError, TypeError):
+            # An unknown key of a hostile table may look like the end of a message.
+            break
+        location.append(step)
+    return match["problem"], location
+
+
+def _find_refused_key(message: str, table: Any, kind: Any, location: Location) -> str | None:
+    """Returns the key of the entry of a dictionary that msgspec refuses with a message.
+
+    Args:
+        message: The message.
+        table: The refused table.
+        kind: Type of the table.
+        location: Location of the dictionary in the table.
+
+    Returns:
+        The key. None if no entry alone is refused with this message.
+    """
+    for key, entry in _value_at(table, location).items():
+        try:
+            msgspec.convert(_isolate(table, location, {key: entry}), kind)
+        except msgspec.ValidationError as error:
+            if str(error) == message:
+                return str(key)
+    return None
+
+
+def _isolate(table: Any, location: Location, value: Any) -> Any:
+    """Returns a copy of a table with another value at a location, and without other tables.
+
+    The plain values beside the location are kept, because one of them may decide about
+    the type, as the key `law` does. Without the other tables, a long scenario of a stranger is
+    not compared again for each of its entries.
+    """
+    if not location:
+        return value
+    part: Any = location[0]
+    inner = _isolate(table[part], location[1:], value)
+    if isinstance(table, list):
+        return [*table[:part], inner]
+    plain = {key: entry for key, entry in table.items() if not isinstance(entry, dict | list)}
+    return {**plain, part: inner}
+
+
+def _value_at(table: Any, location: Location) -> Any:
+    """Returns the value at a location inside a table."""
+    value = table
+    for part in location:
+        value = value[part]
+    return value
+
+
+def _find_table_for_number(table: Any, kind: Any, location: Location) -> Location | None:
+    """Returns the location of a table that stands where a number belongs.
+
+    It is the table of a random distribution, or was meant to be. None if the refused value is
+    not part of such a table.
+    """
+    for length in range(1, len(location) + 1):
+        start = location[:length]
+        takes_distribution = StatedDistribution in _list_hints(kind, start)
+        if takes_distribution and isinstance(_value_at(table, start), dict):
+            return start
+    return None
+
+
+def _list_hints(kind: Any, location: Location) -> list[Any]:
+    """Returns the types that a value at a location of a table may have.
+
+    Args:
+        kind: Type of the table.
+        location: Location of the value.
+    """
+    hints = list(_list_alternatives(kind))
+    for part in location:
+        inner_hints = [inner for hint in hints for inner in _list_inner_hints(hint, part)]
+        hints = [member for inner in inner_hints for member in _list_alternatives(inner)]
+    return hints
+
+
+def _list_alternatives(hint: Any) -> Iterator[Any]:
+    """Yields the members of a union of types, or a type that is no union."""
+    base = _strip_annotation(hint)
+    if get_origin(base) not in (Union, UnionType):
+        yield hint
+        return
+    for member in get_args(base):
+        yield from _list_alternatives(member)
+
+
+def _list_inner_hints(hint: Any, part: str | int) -> Iterator[Any]:
+    """Yields the type of a field, a value of a dictionary or an entry of a list.
+
+    Args:
+        hint: Type of the struct, dictionary or list.
+        part: Key or index.
+    """
+    base = _strip_annotation(hint)
+    origin, arguments = get_origin(base), get_args(base)
+    if isinstance(base, type) and issubclass(base, msgspec.Struct):
+        yield from (field.type for field in list_fields(base) if field.encode_name == part)
+    elif origin is dict and isinstance(part, str):
+        yield arguments[1]
+    elif origin in (list, tuple) and isinstance(part, int):
+        is_fixed = origin is tuple and arguments[-1] is not Ellipsis
+        yield arguments[part if is_fixed else 0]
+
+
+def _strip_annotation(hint: Any) -> Any:
+    """Returns a type without the limits that an annotation adds to it."""
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
+def _find_extra(kind: Any, location: Location, name: str) -> str | None:
+    """Returns what the annotation of a value states in `Meta.extra` under a name, or None."""
+    for hint in _list_hints(kind, location):
+        for annotation in getattr(hint, "__metadata__", ()):
+            extra = annotation.extra if isinstance(annotation, Meta) else None
+            if extra is not None and name in extra:
+                return str(extra[name])
+    return None
+
+
+def _list_keys(hint: Any) -> tuple[str, ...]:
+    """Returns the keys of a table of a type. Empty if the type is no table."""
+    is_struct = isinstance(hint, type) and issubclass(hint, msgspec.Struct)
+    return field_names(hint) if is_struct else ()
+
+
+def _list_choices(hint: Any) -> tuple[str, ...]:
+    """Returns the texts that a type permits. Empty if the type is not a choice of texts."""
+    return get_args(hint) if get_origin(hint) is Literal else ()
+
+
+def _is_list_of_tables(hint: Any) -> bool:
+    """True for the type of a list of tables, as of operators or planned changes."""
+    base = _strip_annotation(hint)
+    if get_origin(base) not in (list, tuple):
+        return False
+    entry = get_args(base)[0]
+    return get_origin(entry) is dict or bool(_list_keys(entry))

@@ -1,0 +1,325 @@
+"""Completes the tables of the sites of a scenario: arms, control laws, limits, operators.
+
+A scenario is a TOML file that describes an experiment. A site is a process that runs one arm.
+Its author may state keys once for all sites, in tables such as `[arm]`, and again for a single
+site.
+
+The names, types and ranges of all keys have been checked before, see `written_tables`. Only
+random numbers can still be out of range, since they are drawn here.
+"""
+
+import math
+from typing import NamedTuple
+
+from ..core import ArmLinks
+from ..errors import ScenarioError
+from ..fields import Frozen, TomlTable
+from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm
+from .control_tables import complete_control
+from .distributions import Draws, has_distribution
+from .key_checks import (
+    VectorCounts,
+    expand_vectors,
+    field_names,
+    find_count_problem,
+)
+from .laws import LAWS
+from .link_inertia import LinkInertia
+from .link_tables import complete_link
+from .named_files import NamedFiles
+from .operators import ENVIRONMENTS, OPERATORS, HeldArm, resolve_operators
+from .own_plant import resolve_plant
+from .refusals import convert_drawn
+from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, Limits, SiteSpec
+
+_MIN_DOWN_LENGTH = 1e-6
+"""Smallest sum of the absolute components of a vector that still counts as a direction."""
+_BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
+
+
+class _SharedByAll(NamedTuple):
+    """What all sites of a scenario share while their tables are completed.
+
+    Attributes:
+        rate_hz: Tick rate of the sites that state no other, in Hz.
+        control: Table `control` for all sites, as its author wrote it.
+        draws: Draws the numbers that are given as distributions.
+        files: Files that the sites name.
+        chains: Whether the arms are modelled as general chains of joints.
+    """
+
+    rate_hz: int
+    control: TomlTable
+    draws: Draws
+    files: NamedFiles
+    chains: bool
+
+
+def complete_site_tables(
+    tables: TomlTable, rate_hz: int, draws: Draws, files: NamedFiles
+) -> TomlTable:
+    """Returns the complete table of every site, by name.
+
+    Args:
+        tables: Tables of the scenario file.
+        rate_hz: Tick rate of the sites that state no other, in Hz.
+        draws: Draws the numbers that are given as distributions.
+        files: Files that the sites name.
+
+    Raises:
+        ScenarioError: A table is not valid.
+    """
+    control = tables.get("control", {})
+    # A mistake in the table for all sites is refused there, and not at the first site.
+    complete_control(control, {}, "control", VectorCounts())
+    sites = {name: _join_groups(site, tables) for name, site in tables["sites"].items()}
+
+    # The kernel computes planar arms with their own formulas, and all other arms as chains. If
+    # one arm is a chain, all arms are: every run uses the same functions for all its sites.
+    chains = False
+    for site in sites.values():
+        shares_pose = site["task"].get("space", "joints") != "joints"
+        if site["arm"].get("urdf") or shares_pose:
+            chains = True
+
+    shared = _SharedByAll(rate_hz, control, draws, files, chains)
+    return {name: _complete_site(site, name, shared) for name, site in sites.items()}
+
+
+def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
+    """Returns the table of a site, completed with the keys that all sites share.
+
+    The groups of keys in `SITE_GROUPS`, such as `arm` and `limits`, may be written once for all
+    sites, and again for a single site. The keys of the single site have priority.
+
+    The table `arm.links` contains a table for each link of a robot. These are joined link by
+    link and key by key, so that a site may change a single inertia.
+
+    Args:
+        written: Table of the site as its author wrote it.
+        tables: Tables of the scenario file.
+    """
+    site = dict(written)
+    for group in SITE_GROUPS:
+        common = tables.get(group, {})
+        local = written.get(group, {})
+        if "urdf" in local:
+            # An arm with its own file inherits nothing: the keys for all arms mean another arm.
+            common = {}
+        joined = {**common, **local}
+        if "links" in common and "links" in local:
+            joined["links"] = {
+                name: {**common["links"].get(name, {}), **local["links"].get(name, {})}
+                for name in {**common["links"], **local["links"]}
+            }
+        site[group] = joined
+    return site
+
+
+def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTable:
+    """Returns the complete table of a site.
+
+    The model of the arm comes first, because it states the number of joints, and thereby the
+    lengths of the site's vectors. The order of the draws decides the order of the table
+    `drawn`, and thereby the hash of the scenario, so it must not change.
+
+    Args:
+        site: Table of the site, joined with the tables for all sites.
+        name: Name of the site.
+        shared: What all sites share.
+
+    Raises:
+        ScenarioError: A table is not valid.
+    """
+    path = f"sites.{name}"
+    model, arm = _complete_arm(site, shared, f"{path}.arm")
+    counts = model.counts
+    site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
+    site["arm"] = arm
+    site["control"] = complete_control(
+        site.get("control", {}), shared.control, f"{path}.control", counts
+    )
+    site["limits"] = {**_list_default_limits(site, model), **site["limits"]}
+    site.setdefault("role", "master")
+    site.setdefault("rate_hz", shared.rate_hz)
+    if "plant" in site:
+        site["plant"] = resolve_plant(site["plant"], f"{path}.plant")
+    if "view" in site:
+        site["view"] = complete_link(site["view"], {}, name, shared.files, f"{path}.view")
+
+    _draw_numbers(site, shared.draws, path)
+    _check_counts(site, counts, path)
+    held_arm = HeldArm(
+        counts, site["q0_rad"], lambda: model.end_effector(site["q0_rad"]), shared.draws
+    )
+    for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
+        actors = site.get(group, [])
+        site[group] = resolve_operators(actors, kinds, held_arm, f"{path}.{group}")
+    return {key: site[key] for key in field_names(SiteSpec) if key in site}
+
+
+def _complete_arm(
+    site: TomlTable, shared: _SharedByAll, path: str
+) -> tuple[ArmModel, TomlTable]:
+    """Returns the model of an arm, and the complete table of the arm.
+
+    The key `armature_kg_m2` (rotor inertias) may contain one number for all joints, and only
+    the model knows the number of joints. Therefore the model is built without this key first,
+    and again with the key.
+
+    Args:
+        site: Table of the site.
+        shared: What all sites share.
+        path: Path of the arm's table, for error messages.
+
+    Raises:
+        ScenarioError: A drawn number is out of range, a key belongs to another kind of arm, or
+            the URDF file of the arm cannot be used.
+    """
+    table = dict(site["arm"])
+    links = table.pop("links", {})
+    for name, link in links.items():
+        if not link:
+            keys = ", ".join(field_names(LinkInertia))
+            raise ScenarioError(
+                f"is empty: give at least one of {keys}", path=f"{path}.links.{name}"
+            )
+    # The tables of links are drawn one by one, as `Draws` looks into no inner table.
+    drawn_links = {
+        name: shared.draws.draw_numbers(link, f"{path}.links.{name}")
+        for name, link in links.items()
+    }
+    armature = table.pop("armature_kg_m2", None)
+    table = shared.draws.draw_numbers(table, path)
+    if drawn_links:
+        table["links"] = drawn_links
+    model = _model_arm(table, site["task"], shared, path)
+    if armature is None:
+        return model, table
+
+    if not table.get("urdf"):
+        raise ScenarioError(_BELONGS_TO_CHAIN, path=f"{path}.armature_kg_m2")
+    armatures = expand_vectors({"armature_kg_m2": armature}, Arm, model.counts)
+    table |= shared.draws.draw_numbers(armatures, path)
+    return _model_arm(table, site["task"], shared, path), table
+
+
+def _model_arm(
+    table: TomlTable, task_table: TomlTable, shared: _SharedByAll, path: str
+) -> ArmModel:
+    """Returns the model of an arm, which knows the dynamics and the number of joints.
+
+    Args:
+        table: Table of the arm.
+        task_table: Table `task` of the site: the coordinates that the sites share. Its random
+            numbers are not drawn yet. The lengths of the vectors do not depend on them.
+        shared: What all sites share.
+        path: Path of the arm's table, for error messages.
+
+    Raises:
+        ScenarioError: A drawn number is out of range, a key belongs to another kind of arm, or
+            the URDF file of the arm cannot be used.
+    """
+    draws = shared.draws
+    arm = convert_drawn(table=table, kind=Arm, path=path, drawn=draws.drawn, seed=draws.seed)
+    _check_arm_keys(arm, table, shared.chains, path)
+
+    task_path = f"{path.removesuffix('arm')}task"
+    certain = {key: value for key, value in task_table.items() if not has_distribution(value)}
+    task = convert_drawn(
+        table=certain, kind=Task, path=task_path, drawn=draws.drawn, seed=draws.seed
+    )
+    idle_key = task.find_idle_key(task_table)
+    if idle_key is not None:
+        raise ScenarioError(idle_key.problem, path=f"{task_path}.{idle_key.key}")
+
+    try:
+        return build_arm(arm, task, shared.files.urdf_texts, shared.chains)
+    except ScenarioError as error:
+        key = error.path or ("urdf" if arm.urdf else "")
+        raise ScenarioError(error.problem, path=f"{path}.{key}".rstrip(".")) from None
+
+
+def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None:
+    """Refuses keys that belong to another kind of arm, and gravity without a direction.
+
+    Args:
+        arm: The arm.
+        table: Table from which the arm was built. It shows which keys the author wrote.
+        chains: Whether the arms of the scenario are general chains of joints.
+        path: Path of the table, for error messages.
+    """
+    foreign_keys = ArmLinks._fields if arm.urdf else CHAIN_KEYS
+    for key in table:
+        if key in foreign_keys:
+            problem = _BELONGS_TO_CHAIN
+            if arm.urdf:
+                problem = f"belongs to the planar arm, but this arm is {arm.urdf}"
+            raise ScenarioError(problem, path=f"{path}.{key}")
+    for key in BASE_KEYS:
+        if key in table and not chains:
+            raise ScenarioError(
+                "has no effect where all arms are planar and share joint angles: "
+                "set task.space, or leave this key out",
+                path=f"{path}.{key}",
+            )
+    if sum(abs(component) for component in arm.down) < _MIN_DOWN_LENGTH:
+        raise ScenarioError("must be a vector other than zero", path=f"{path}.down")
+
+
+def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
+    """Returns the limits of a site that apply if its author states none.
+
+    The efforts and speeds of a chain's joints come from its URDF file. A joint for which the
+    file states no positive finite limit has the default of `Limits`. A simulated arm with the
+    stale rule "glide" also has a limit on the torque's rate of change.
+    """
+    limits: TomlTable = {}
+    if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
+        limits["tau_rate_limit_nm_s"] = GLIDE_TAU_RATE_NM_S
+    if model.chain is None:
+        return limits
+
+    file_limits = {"tau_limit_nm": model.efforts, "qd_limit_rad_s": model.speeds}
+    for key, stated_limits in file_limits.items():
+        default = getattr(Limits(), key)
+        limits[key] = [limit if 0.0 < limit < math.inf else default for limit in stated_limits]
+    return limits
+
+
+def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
+    """Draws the numbers of a site that are given as distributions, in place.
+
+    These are the start, the limits, the rules for stale samples, the task and the gains of the
+    control law. The numbers of the arm have been drawn before.
+    """
+    start = {key: site[key] for key in ("q0_rad", "qd0_rad_s")}
+    site |= draws.draw_numbers(start, path)
+    drawn_groups = [group for group in SITE_GROUPS if group != "arm"]
+    for group in (*drawn_groups, "control"):
+        site[group] = draws.draw_numbers(site[group], f"{path}.{group}")
+    settings = site["control"].get("settings")
+    if settings is not None:
+        site["control"]["settings"] = draws.draw_numbers(settings, f"{path}.control.settings")
+
+
+def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
+    """Refuses vectors of a site that have too few or too many numbers.
+
+    Args:
+        site: Complete table of the site.
+        counts: Number of joints of the arm, and number of coordinates that the sites share.
+        path: Path of the site, for error messages.
+    """
+    law = site["control"]["law"]
+    tables: list[tuple[TomlTable, type[Frozen], str]] = [
+        (site, SiteSpec, path),
+        (site["arm"], Arm, f"{path}.arm"),
+        (site["task"], Task, f"{path}.task"),
+        (site["control"], LAWS[law], f"{path}.control"),
+        (site["limits"], Limits, f"{path}.limits"),
+    ]
+    for table, kind, table_path in tables:
+        problem = find_count_problem(table, kind, counts)
+        if problem is not None:
+            raise ScenarioError(problem.problem, path=f"{table_path}.{problem.key}")

@@ -1,0 +1,99 @@
+"""Derives the type of a table that an author may write from the type of the complete table.
+
+A scenario is a TOML file that describes an experiment. In a complete scenario, each key has a
+value. Its author may leave keys out, write one number in place of a vector with equal entries,
+and write a random distribution in place of a number. Without this module, each table would have
+two types with the same keys and ranges.
+"""
+
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import msgspec
+from msgspec import UNSET, Meta
+
+from ..fields import Frozen, TomlTable
+from .distributions import StatedDistribution
+from .key_checks import StructType, list_fields
+
+
+@cache
+def written_kind(
+    kind: StructType, *other_keys: str, takes_distributions: bool = True
+) -> StructType:
+    """Returns the type of the table that an author may write for a type of a complete table.
+
+    Every key may be left out. A single number may stand for a vector with one number per joint,
+    axis or parameter.
+
+    Args:
+        kind: Type of the complete table, for example `Limits`.
+        other_keys: Keys that an author may write in addition. Their values are texts.
+        takes_distributions: Whether a random distribution may stand for each number.
+    """
+    fields: list[tuple[str, Any, Any]] = [(key, str, UNSET) for key in other_keys]
+    for field in list_fields(kind):
+        hint = written_type(field.type, takes_distributions)
+        if field.default == ():
+            # An empty vector as default means that a written vector must be complete.
+            hint = _list_type(field.type, takes_distributions)
+        fields.append((field.name, hint, UNSET))
+    return msgspec.defstruct(f"Written{kind.__name__}", fields, bases=(Frozen,), frozen=True)
+
+
+def written_type(hint: Any, takes_distributions: bool) -> Any:
+    """Returns the type that an author may write for the type of a complete value.
+
+    Args:
+        hint: Type of the complete value.
+        takes_distributions: Whether a random distribution may stand for a number.
+    """
+    base, annotations = _split_annotation(hint)
+    origin = get_origin(base)
+    if base is float and takes_distributions:
+        return hint | StatedDistribution
+    if origin in (Union, UnionType):
+        # TOML has no None: a key is left out instead.
+        members = [member for member in get_args(base) if member is not type(None)]
+        written_members = [written_type(member, takes_distributions) for member in members]
+        return Union[tuple(written_members)]  # noqa: UP007 - the members are computed
+    if origin is dict:
+        return dict[str, written_type(get_args(base)[1], takes_distributions)]  # type: ignore[misc]
+    if origin is tuple:
+        is_vector = any(meta.extra and "per" in meta.extra for meta in annotations)
+        written_list = _list_type(hint, takes_distributions)
+        if not (is_vector and takes_distributions):
+            return written_list
+        return written_type(get_args(base)[0], takes_distributions) | written_list
+    if isinstance(base, type) and issubclass(base, msgspec.Struct):
+        return written_kind(base, takes_distributions=takes_distributions)
+    return hint
+
+
+def _list_type(hint: Any, takes_distributions: bool) -> Any:
+    """Returns the type of the list that an author may write for the type of a complete list.
+
+    The length of a vector depends on the arm, and is checked when the arm is known.
+    """
+    base, annotations = _split_annotation(hint)
+    entry = get_args(base)[0]
+    if get_origin(entry) is tuple:
+        # The rows of a table of numbers are checked with the complete scenario.
+        return list
+    if isinstance(entry, type) and issubclass(entry, msgspec.Struct):
+        # The keys of these tables depend on their site.
+        return list[TomlTable]
+
+    entries: Any = list[written_type(entry, takes_distributions)]  # type: ignore[misc]
+    for annotation in annotations:
+        if annotation.extra and "per" in annotation.extra:
+            return Annotated[entries, Meta(extra=annotation.extra)]
+    return Annotated[(entries, *annotations)] if annotations else entries
+
+
+def _split_annotation(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
+    """Returns a type without its annotations, and its annotations."""
+    if get_origin(hint) is Annotated:
+        return get_args(hint)[0], hint.__metadata__
+    return hint, ()

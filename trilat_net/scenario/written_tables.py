@@ -1,0 +1,280 @@
+"""Describes the tables that the author of a scenario may write, and refuses all others.
+
+A scenario is a TOML file that describes an experiment. Its author writes less than the program
+needs: most keys may be left out, tables such as `[arm]` hold for all sites, one number may
+stand for a vector, and a random distribution may stand for a number. `WrittenScenario` is the
+type of such a file, and `scenario_types.Scenario` the type of the complete description.
+
+Tables of which one key decides about the others, such as the law of `[control]`, are checked
+with `check_table` as soon as that key is known.
+
+Invariant:
+    - The keys, types and ranges of a group such as `arm` are stated once, in its complete type.
+      The type of the written table follows from it, see `written_kind`.
+"""
+
+import re
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import msgspec
+from msgspec import UNSET, Meta, UnsetType, field
+
+from ..errors import ScenarioError, count_nouns
+from ..fields import Frozen, Joints, RateHz, TomlTable
+from .arms import Arm, Task
+from .delay_models import DELAY_MODELS
+from .distributions import Distribution
+from .expect import Expect
+from .key_checks import StructType, check_finite, field_names
+from .laws import LAWS
+from .refusals import check_table, refuse
+from .scenario_types import (
+    Duration,
+    Limits,
+    OnStale,
+    ScenarioName,
+    SchemeName,
+    Seed,
+)
+from .suggestions import list_group_paths
+from .written_kinds import written_kind, written_type
+
+MAX_SITES = 32
+"""Largest number of sites of an experiment. Every pair of sites has two links."""
+_SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_RESERVED_NAME = "recorder"
+"""Name that no site may have, since the program that writes the log has it."""
+TRACE_KEYS = ("file", "of")
+"""Keys of a link that name a file of delays. A resolved link contains the delays instead."""
+
+
+if TYPE_CHECKING:
+    WrittenArm = Arm
+    WrittenLimits = Limits
+    WrittenOnStale = OnStale
+    WrittenTask = Task
+    WrittenExpect = Expect
+    WrittenJoints = Joints
+else:
+    # Built at run time from the complete types.
+    WrittenArm = written_kind(Arm)
+    WrittenLimits = written_kind(Limits)
+    WrittenOnStale = written_kind(OnStale)
+    WrittenTask = written_kind(Task)
+    WrittenExpect = written_kind(Expect, takes_distributions=False)
+    WrittenJoints = written_type(Joints, takes_distributions=True)
+
+_LINK_TABLES: dict[str, StructType] = {
+    model: written_kind(
+        kind,
+        "model",
+        "preset",
+        *(TRACE_KEYS if model == "trace" else ()),
+        takes_distributions=False,
+    )
+    for model, kind in DELAY_MODELS.items()
+}
+_LAW_TABLES: dict[str, StructType] = {
+    law: written_kind(kind, "law") for law, kind in LAWS.items()
+}
+"""Types of the tables of a link and of a control law, by the name of the model or law."""
+for _kind in _LINK_TABLES.values():
+    # A link may change during a run: msgspec 0.22 crashes if two threads use a type at first.
+    msgspec.convert({}, _kind)
+_USER_LAW = "own"
+"""Name that all laws of users have. Each has other keys, which explain no misplaced key."""
+
+
+class WrittenSite(Frozen, frozen=True, kw_only=True):
+    """Table of a site as an author may write it, see `scenario_types.SiteSpec`.
+
+    The keys of `control`, `view` and of the tables in the lists depend on the kind that the
+    table names.
+    """
+
+    role: Literal["master", "slave"] | UnsetType = UNSET
+    rate_hz: RateHz | UnsetType = UNSET
+    q0_rad: WrittenJoints | UnsetType = UNSET
+    qd0_rad_s: WrittenJoints | UnsetType = UNSET
+    arm: WrittenArm | UnsetType = UNSET
+    control: TomlTable = field(default_factory=dict)
+    limits: WrittenLimits | UnsetType = UNSET
+    on_stale: WrittenOnStale | UnsetType = UNSET
+    task: WrittenTask | UnsetType = UNSET
+    hands: list[TomlTable] = field(default_factory=list)
+    environment: list[TomlTable] = field(default_factory=list)
+    plant: str | TomlTable = "simulated"
+    view: TomlTable | UnsetType = UNSET
+
+
+class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
+    """Planned change of a link or of dominance factors as an author may write it.
+
+    The keys of `to` depend on what is changed, see `scenario_types.Change`.
+    """
+
+    at_s: Annotated[float, Meta(extra={"must_be": "a time in s"})]
+    link: Annotated[str, Meta(extra={"must_be": "a name"})] = ""
+    dominance: Annotated[str, Meta(extra={"must_be": "a name"})] = ""
+    to: TomlTable = field(default_factory=dict)
+    ramp_s: float = 0.0
+
+
+class WrittenScenario(Frozen, frozen=True, kw_only=True):
+    """Tables of a scenario file as an author may write them, see `scenario_types.Scenario`.
+
+    Attributes:
+        rate_hz: Tick rate of all sites that state no other, in Hz.
+        arm: Keys of the arms of all sites. A site may state other values.
+        limits: Limits of all sites.
+        on_stale: Stale rule of all sites.
+        task: Shared coordinates of all sites.
+        control: Control law of all sites, with its gains.
+        link: Settings of all links.
+    """
+
+    name: ScenarioName
+    title: str = ""
+    about: str = ""
+    assumed: list[str] = field(default_factory=list)
+    rate_hz: RateHz = 1000
+    duration_s: Duration = 20.0
+    seed: Seed = 1
+    scheme: SchemeName = "second_order"
+    arm: WrittenArm | UnsetType = UNSET
+    limits: WrittenLimits | UnsetType = UNSET
+    on_stale: WrittenOnStale | UnsetType = UNSET
+    task: WrittenTask | UnsetType = UNSET
+    control: TomlTable = field(default_factory=dict)
+    link: TomlTable = field(default_factory=dict)
+    sites: Annotated[dict[str, WrittenSite], Meta(extra={"must_be": "tables [sites.NAME]"})]
+    dominance: TomlTable
+    links: TomlTable = field(default_factory=dict)
+    timeline: list[WrittenChange] = field(default_factory=list)
+    expect: WrittenExpect | UnsetType = UNSET
+    drawn: dict[str, Distribution] = field(default_factory=dict)
+    urdf: dict[str, Annotated[str, Meta(extra={"must_be": "the text of a URDF"})]] = field(
+        default_factory=dict
+    )
+
+
+def check_tables(tables: TomlTable) -> WrittenScenario:
+    """Refuses a scenario file with an unknown key, or with a value that no key may have.
+
+    Conditions that involve several tables are checked later.
+
+    Args:
+        tables: Tables of the file as its author wrote them.
+
+    Returns:
+        The tables as typed values, with the defaults of the whole scenario.
+
+    Raises:
+        ScenarioError: A key is unknown or missing, or a value has a wrong type or range.
+    """
+    check_finite(tables, "")
+    try:
+        written = msgspec.convert(tables, WrittenScenario)
+    except msgspec.ValidationError as error:
+        sites = tables.get("sites")
+        site_paths = [f"sites.{name}" for name in sites] if isinstance(sites, dict) else []
+        paths = [*site_paths, *list_group_paths()]
+        raise refuse(error, tables, WrittenScenario, "", paths) from None
+    _check_site_names(written.sites)
+    return written
+
+
+def _check_site_names(names: Collection[str]) -> None:
+    """Refuses names that a site cannot have, and too few or too many sites.
+
+    Args:
+        names: Names of the sites.
+
+    Raises:
+        ScenarioError: A name is not valid, or the number of sites.
+    """
+    for name in names:
+        if not _SITE_NAME.fullmatch(name) or name == _RESERVED_NAME:
+            raise ScenarioError(
+                "the name of a site must consist of lower-case letters, digits and _, begin "
+                f"with a letter, and not be {_RESERVED_NAME!r}",
+                path=f"sites.{name}",
+            )
+    if len(names) > MAX_SITES:
+        raise ScenarioError(
+            f"has {count_nouns(len(names), 'site')}, but at most {MAX_SITES} are allowed",
+            path="sites",
+        )
+    if len(names) < 2:
+        raise ScenarioError(
+            f"an experiment must have at least two sites, but this one has {len(names)}",
+            path="sites",
+        )
+
+
+def check_control(table: TomlTable, law: str, path: str) -> None:
+    """Refuses a table `control` with a key that its law does not have, or a wrong gain.
+
+    Args:
+        table: The table as its author wrote it.
+        law: Name of a built-in law, or "own".
+        path: Dotted path of the table.
+    """
+    _check_foreign_keys(table, _LAW_TABLES, "law", law, path)
+    check_table(table, _LAW_TABLES[law], path)
+
+
+def check_link(table: TomlTable, model: str, path: str) -> None:
+    """Refuses a table of a link with a key that its delay model does not have.
+
+    Args:
+        table: The table as its author wrote it.
+        model: Name of the delay model.
+        path: Dotted path of the table.
+    """
+    _check_foreign_keys(table, _LINK_TABLES, "model", model, path)
+    # The settings of one link stand in the table `links`, those of all links in `link`.
+    link_paths = [f"links.{key}" for key in table if path == "link" and "->" in key]
+    check_table(table, _LINK_TABLES[model], path, link_paths)
+
+
+def _check_foreign_keys(
+    table: TomlTable, kinds: Mapping[str, StructType], group: str, chosen: str, path: str
+) -> None:
+    """Refuses a key that belongs to another law or delay model than that of a table.
+
+    Upper and lower case count as equal, so that the user of `control.D` learns of `d`. A key
+    that differs from a valid one only in its case is left to `check_table`, which suggests it.
+
+    Args:
+        table: Table of a control law or a delay model.
+        kinds: Types of the tables of all laws or models.
+        group: "law" or "model".
+        chosen: The law or model of the table.
+        path: Dotted path of the table.
+
+    Raises:
+        ScenarioError: The key belongs to other kinds.
+    """
+    valid = field_names(kinds[chosen])
+    valid_words = {key.casefold() for key in valid}
+    for key in table:
+        sought = key.casefold()
+        if sought in valid_words:
+            continue
+        owners = {}
+        for name, kind in kinds.items():
+            for owned in field_names(kind):
+                if owned.casefold() == sought and name != _USER_LAW:
+                    owners[name] = owned
+        if not owners:
+            continue
+        owned_keys = " or ".join(dict.fromkeys(owners.values()))
+        subject = "belongs to" if owned_keys == key else f"{owned_keys} belongs to"
+        other_keys = [owned for owned in valid if owned != group]
+        raise ScenarioError(
+            f"{subject} {group} {', '.join(owners)}, but {path}.{group} is {chosen}, which "
+            f"has {', '.join(other_keys)}",
+            path=f"{path}.{key}",
+        )
