@@ -391,9 +391,8 @@ def _run_twins(
 
     run = FusedRun(scenario, inputs=inputs)
     has_changes = inputs is not None and bool(inputs.changes)
-    is_even = len(set(ticks)) == 1
     count = 1 + len(pushes)
-    if is_even and not has_changes and suits_twins(run, count, ticks[0], LANE_SITE_TICKS):
+    if not has_changes and suits_twins(run, count, ticks, LANE_SITE_TICKS):
         # If an arm leaves its limits, all runs are executed again, one by one.
         with suppress(LaneEndedError):
             return _LaneTwinRuns(scenario, pushes, ticks, inputs, log).run()
@@ -662,9 +661,7 @@ class _LaneTwinRuns(_TwinRuns):
 
         run = FusedRun(scenario, inputs=inputs)
         count = 1 + len(self._pushes)
-        self._lanes = TwinLanes(
-            run, count=count, ticks=ticks[0], feed=run.memory.feed, kept=keep
-        )
+        self._lanes = TwinLanes(run, count=count, ticks=ticks, feed=run.memory.feed, kept=keep)
         return [LaneTwin(self._lanes, lane) for lane in range(count)]
 
     def _execute_window(self, end_s: float) -> None:
@@ -675,12 +672,11 @@ class _LaneTwinRuns(_TwinRuns):
         """
         lanes = self._lanes
         lanes.step_to(math.ceil(end_s * NS_PER_S) - 1)
-        t_ns = lanes.read_times()
         if self._log is not None:
             everything = slice(None)
             run = slice(0, 1)
             records = [
-                (t_ns, lanes.read_records(i, everything, run)[:, :, 0])
+                (lanes.read_times(i), lanes.read_records(i, everything, run)[:, :, 0])
                 for i in range(len(self._layouts))
             ]
             self._compare_with_log(self._log, records)
@@ -689,7 +685,7 @@ class _LaneTwinRuns(_TwinRuns):
         for n, pushed in enumerate(self._pushed):
             if pushed and self._died[n] is None:
                 measured.append(n)
-        self._measure_window(t_ns, measured)
+        self._measure_window(measured)
         for n, push in enumerate(self._pushes):
             if n in measured:
                 self._renew_difference(n, end_s)
@@ -697,26 +693,26 @@ class _LaneTwinRuns(_TwinRuns):
                 # A twin without a push has the state of the run.
                 self._push(n, end_s)
 
-    def _measure_window(self, t_ns: Ints, measured: Sequence[int]) -> None:
+    def _measure_window(self, measured: Sequence[int]) -> None:
         """Adds the course of the run and of the differences in one window to the paths.
 
         Args:
-            t_ns: Times of the ticks of the window, ns.
             measured: Indices of the twins that are measured.
         """
-        if not len(t_ns):
-            return
         twins = np.array(measured, dtype=np.int64)
-        buckets = t_ns * BUCKETS_PER_S // NS_PER_S
-        starts = np.flatnonzero(np.diff(buckets, prepend=-1))
-        rows = buckets[starts]
-        ends = np.append(starts[1:], len(t_ns))
         runs = slice(0, 1 + len(self._pushes))
         column = 0
         for i, layout in enumerate(self._layouts):
-            qd = self._lanes.read_records(i, layout.columns()["qd"], runs)
             columns = slice(column, column + layout.joints)
             column += layout.joints
+            t_ns = self._lanes.read_times(i)
+            if not len(t_ns):
+                continue
+            buckets = t_ns * BUCKETS_PER_S // NS_PER_S
+            starts = np.flatnonzero(np.diff(buckets, prepend=-1))
+            rows = buckets[starts]
+            ends = np.append(starts[1:], len(t_ns))
+            qd = self._lanes.read_records(i, layout.columns()["qd"], runs)
             speed = np.maximum.reduceat(np.abs(qd[:, :, 0]), starts, axis=0)
             self._speed[rows, columns] = np.maximum(self._speed[rows, columns], speed)
             difference = qd[:, :, 1 + twins] - qd[:, :, :1]
@@ -726,8 +722,7 @@ class _LaneTwinRuns(_TwinRuns):
                 known = self._largest[n][rows, columns]
                 self._largest[n][rows, columns] = np.maximum(known, unscaled[:, :, position])
                 self._last[n][rows, columns] = difference[ends - 1, :, position]
-        for n in measured:
-            self._scales[n, rows] = self._scale[n]
+                self._scales[n, rows] = self._scale[n]
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:

@@ -206,6 +206,7 @@ def compute_law(
     t_ns: int,
     site: RowArray,
     links: RowArray,
+    chain: RowArray | None,
     law: RowArray,
     received: RowArray,
     sent: RowArray,
@@ -220,6 +221,8 @@ def compute_law(
         t_ns: Nominal time of the tick, ns since the epoch.
         site: Row of the site, in which the torque is written.
         links: Rows of the site's links.
+        chain: Rows of the chain of joints, or None for the planar arm. Its model is
+            in the row of the site already.
         law: Row with the numbers of the law; changed.
         received: Rows with the numbers that the peers' laws sent.
         sent: Row with the numbers that this law sends; written.
@@ -236,6 +239,7 @@ def _compute_nothing(
     _t_ns: int,
     _site: Any,
     _links: Any,
+    _chain: Any,
     _law: Any,
     _received: Any,
     _sent: Any,
@@ -264,6 +268,7 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
         t_ns: int,
         site: Any,
         links: Any,
+        chain: Any,
         law: Any,
         received: Any,
         sent: Any,
@@ -272,7 +277,7 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
         s = site[0]
         if s.mode == _DIVERGED:
             return
-        update_law_view(k, t_ns, site, links, None)
+        update_law_view(k, t_ns, site, links, chain)
         now = collect_law_input(
             s,
             links,
