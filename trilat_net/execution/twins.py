@@ -739,7 +739,9 @@ class _LaneTwinRuns(_TwinRuns):
 
         run = FusedRun(scenario, inputs=inputs)
         count = 1 + len(self._pushes)
-        self._lanes = TwinLanes(run, count=count, ticks=ticks, feed=run.memory.feed, kept=keep)
+        self._lanes = TwinLanes(
+            run, count=count, ticks=ticks, feed=run.memory.feed, kept=record_count
+        )
         return [LaneTwin(self._lanes, lane) for lane in range(count)]
 
     def _execute_window(self, end_s: float) -> None:
@@ -798,7 +800,7 @@ class _LaneTwinRuns(_TwinRuns):
             log_peaks = np.log(peaks) + self._scale[twins]
             for position, n in enumerate(measured):
                 known = self._largest[n][rows, columns]
-                self._largest[n][rows, columns] = np.maximum(known, unscaled[:, :, position])
+                self._largest[n][rows, columns] = np.maximum(known, log_peaks[:, :, position])
                 self._last[n][rows, columns] = difference[ends - 1, :, position]
                 self._scales[n, rows] = self._scale[n]
 

@@ -270,9 +270,9 @@ def _solve(s: Row, b: Array, y: Array) -> None:
         y[j] = b[j]
         for k in range(j):
             y[j] -= A[j, k] * y[k]
-    for j in range(m - 1, -1, -1):
+    for j in range(coordinates - 1, -1, -1):
         y[j] = _divide(y[j], A[j, j])
-        for k in range(j + 1, m):
+        for k in range(j + 1, coordinates):
             y[j] -= A[k, j] * y[k]
 
 
