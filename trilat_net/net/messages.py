@@ -133,9 +133,9 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         x: in task space the coordinates that the sites exchange; in joint space these are left out.
         xd: their derivatives.
         wrench: exogenous torque in those coordinates.
-        ch: what the site's law sends besides, see `core.law_channel`; left out if it sends nothing.
+        ch: what the site's law sends besides, see `core.plug.law_channel`; left out if it sends nothing.
         hand: what somebody who holds the arm does: grip from 0 to 1, number of the newest message (-1
-            without), who holds it (0: nobody), target, its velocity, see `core.live_hand`; left out without
+            without), who holds it (0: nobody), target, its velocity, see `core.life.live_hand`; left out without
             a live hand.
         bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base frame, m, and
             the unit quaternion w, x, y, z; left out without any.
