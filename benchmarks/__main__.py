@@ -4,6 +4,7 @@ import sys
 
 from . import (
     analysis,
+    cells,
     clocks,
     cluster,
     cost,
@@ -41,6 +42,7 @@ BENCHMARKS = {
 }
 LONG = {
     "analysis": analysis.run,
+    "cells": cells.run,
     "clocks": clocks.run,
     "cluster": cluster.run,
     "cost": cost.run,

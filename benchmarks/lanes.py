@@ -30,6 +30,9 @@ WALL = [{"kind": "wall", "point_m": [1.8, 0.0], "normal": [-1.0, 0.0], "stiffnes
 LOSSY = {"link.loss": 0.1, "sites.s.environment": WALL}
 TDPA = {"control.law": "tdpa", "scheme": "digital", "control.B": 5.0}
 WAVE = {"control.law": "wave", "scheme": "digital"}
+GLIDE = {f"sites.{site}.on_stale": {"action": "glide"} for site in ("m1", "m2", "s")}
+SHORT = {"duration_s": 4.0}
+POSES = {**SHORT, "task.space": "pose"}
 CASES = (
     Case("free", "free", {}, "control.Kd", 2.0, 3.0),
     Case("paper", "paper", {}, "control.Kd", 2.0, 3.0),
@@ -37,8 +40,14 @@ CASES = (
     Case("P+d, jitter, loss and a wall", "jitter", LOSSY, "link.half_width_ms", 10.0, 40.0),
     Case("4g", "4g", {}, "control.Kd", 2.0, 3.0),
     Case("tdpa", "free", TDPA, "control.K", 15.0, 22.0),
-    Case("six_joints", "six_joints", {"duration_s": 4.0}, "control.Kd", 2.0, 3.0),
+    Case("six_joints", "six_joints", SHORT, "control.Kd", 2.0, 3.0),
     Case("wave", "free", WAVE, "control.b", 9.0, 11.0),
+    Case("a site at 500 Hz", "free", {"sites.s.rate_hz": 500}, "control.Kd", 2.0, 3.0),
+    Case("glide", "free", GLIDE, "control.Kd", 2.0, 3.0),
+    Case("play", "play", {}, "control.Kd", 2.0, 3.0),
+    Case("unlike_arms, positions", "unlike_arms", SHORT, "control.Kd", 9.0, 11.0),
+    Case("unlike_arms, poses", "unlike_arms", POSES, "control.Kd", 9.0, 11.0),
+    Case("six_joints, wave", "six_joints", {**SHORT, **WAVE}, "control.b", 9.0, 11.0),
 )
 WIDTHS = (8, 16, LANES)
 ROUNDS = 5

@@ -206,6 +206,7 @@ class GapRepair:
         if request is None:
             self._due_ns = None
             return
+
         was_nothing_missing = self._due_ns is None
         if was_nothing_missing:
             self._due_ns = now_ns + GRACE_NS
@@ -296,6 +297,8 @@ class GapRepair:
             The new messages of a valid reply. Nothing if no valid reply has arrived.
         """
         request = open_request.request
+
+        # The connection works: ask for more at once, and adapt the timeout.
         shortest_timeout_ns, longest_timeout_ns = ANSWER_NS
         elapsed_ns = now_ns - open_request.sent_ns
         while (reply := open_request.replies.poll()) is not None:

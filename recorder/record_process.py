@@ -93,6 +93,9 @@ CollectProvenance = Callable[[], Mapping[str, str]]
 class Recorder:
     """Runs one recording: joins the session, writes its messages, and completes the file.
 
+    The recorder is a process of its own, so that a slow disk cannot delay the control loops of
+    the arms.
+
     Args:
         bus: Network connection of the recorder.
         clock: Clock of the recorder.
@@ -129,13 +132,18 @@ class Recorder:
         self._stopped = stopped
         self._say = say
         self._is_ending = is_ending
+
+        # The queue receives the messages of all sites from now on.
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             bus.tap(topics.key(session, "*", channel), self._queue.receive)
         self._presence = bus.presence(topics.presence_key(session, "*"))
+
+        # The recorder announces itself, and records its own events too.
         info = describe_member(topics.RECORDER, boot, clock, provenance["fingerprint"])
         keep = partial(self._queue.receive, topics.key(session, topics.RECORDER, topics.EVENT))
         self._publisher = EventPublisher(bus, session, info, keep)
+
         self._joining = SessionJoin(
             bus=bus, clock=clock, session=session, publisher=self._publisher, sites=()
         )
@@ -429,6 +437,7 @@ def record_session(
                 afterwards()
     if interrupt.is_requested():
         return interrupt.exit_code
+
     problem = recording.describe_problem()
     if problem:
         raise RunFailed(problem)

@@ -357,6 +357,7 @@ class Recording:
         """
         if not isinstance(event, Event) or event.about not in self._sites:
             return
+
         restarted_site = event.about
         boot = event.boots.get(restarted_site)
         is_recorded = boot == self._recorded_boots.get(restarted_site)
@@ -417,6 +418,7 @@ class Recording:
         arrived_since_epoch_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
             raise WireError("stranger", f"a message arrived under the unknown key {key}")
+
         recorded_site, channel = self._channels[key]
         # By this time, the reception judges whether the message is from the future.
         recorded_site.since_ns = arrived_since_epoch_ns
@@ -515,6 +517,7 @@ class Recording:
         token = topics.parse_key(key)
         if token is None or token.member not in self._sites:
             return
+
         recorded_boot = str(self._recorded_boots.get(token.member))  # keys contain text
         is_recorded_start = recorded_boot == token.boot
         if not is_recorded_start:
@@ -557,6 +560,8 @@ class Recording:
     def is_over(self, now_ns: int) -> bool:
         """Finds out whether the recording can end, because no site can send any more messages.
 
+        The recorder then completes the log file and ends.
+
         Args:
             now_ns: Present time on the monotonic clock, in ns.
 
@@ -583,6 +588,7 @@ class Recording:
         """
         if site in self._stored_sites:
             return True
+
         absent_since_ns = self._update_gone_since_ns(site, now_ns)
         if absent_since_ns is None:  # the site is present
             return False
@@ -754,6 +760,8 @@ _ALL_GAPS = 600
 
 class RecorderReport:
     """Publishes statistics of a recording once a second, such as its size and missing messages.
+
+    A person who watches the session sees there whether the log is complete and how large it is.
 
     Args:
         bus: Network connection of the recorder.

@@ -282,6 +282,7 @@ class SiteReception:
         """
         if channel == topics.EVENT:
             return self._read_event(payload)
+
         content = self._decoders[channel](payload)
         number = number_message(channel, content.tick, self._rate_hz)
         sent_ns = content.sent_ns if channel == topics.STATE else content.t_ns
@@ -310,6 +311,7 @@ class SiteReception:
                 f"{self.name} reports {count_nouns(event.ticks, 'tick')}, but must report 0 to "
                 f"{self._ticks}",
             )
+
         # Only these two events state how many ticks the site has executed.
         stated_ticks = event.ticks if event.kind in ("join", "end") else 0
         self._check(
@@ -607,6 +609,8 @@ class SiteReception:
 
     def describe_missing(self) -> str:
         """Describes for the user which messages of the site are missing.
+
+        Messages that were lost and could not be requested again leave gaps in the log.
 
         Returns:
             The number of missing messages and their first ranges, for each channel. Empty if no

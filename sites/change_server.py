@@ -63,9 +63,8 @@ _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
 class ChangeServer:
     """Checks the requests to one site, replies, and keeps the accepted changes for its loop.
 
-    The control loop of the site calls `pop_changes` before each tick.
-
-    A request changes for example the delay of a link, or orders the site to stop its arm.
+    A request changes for example the delay of a link, or orders the site to stop its arm. The
+    control loop of the site calls `pop_changes` before each tick, a period of the loop.
 
     Args:
         scenario: Scenario of the session.
@@ -248,6 +247,8 @@ class ChangeServer:
 
     def _make_order_change(self, tick: int, order: SiteOrder) -> CoreChange:
         """Returns the change with which the order of a user takes effect in a tick.
+
+        A user stops an arm, lets it move again, or clears a fault by such an order.
 
         Args:
             tick: Number of the tick, a period of the control loop.

@@ -62,6 +62,10 @@ def _read_thread_usage() -> tuple[int, int]:
 class WatchedCode:
     """Calls a user's own code, and measures its computing time.
 
+    The code is for example a control law in Python, which the control loop of the arm calls in
+    every period. Code that is too slow would make the arm unsafe, and ends the run with an
+    error.
+
     Args:
         name: Name of the code, as in "the law mylaw:MyLaw".
         rate_hz: How often the code is called, in 1/s.

@@ -184,6 +184,7 @@ class ExternalArm:
         distance_rad = max(abs(angle - expected) for angle, expected in joints)
         if distance_rad <= _START_POSE_TOLERANCE_RAD:
             return ""
+
         return (
             f"its arm stands {distance_rad:.3g} rad off q0_rad, "
             "which its peers take for its start: their references will jump"
@@ -326,12 +327,12 @@ class _Holder:
 class DeadManSwitch:
     """State of the dead-man switch of one arm, for which several programs may report.
 
+    A person holds the switch while the arm may move. Releasing it stops the arm.
+
     The arm stops if any program that holds the switch releases it or falls silent. The others
     then have to release the switch and press it again. The age of a message is measured on the
     clock of this machine from its arrival. The switch therefore counts as released if this
     process was suspended.
-
-    A person holds the switch while the arm may move. Releasing it stops the arm.
 
     Args:
         site: Name of the site of the arm.
@@ -469,11 +470,13 @@ class DeadManSwitch:
         if is_out_of_order:
             self._dropped["old switch message"] += 1
             return
+
         program.n = message.n
 
         if message.held:
             program.pressed_ns = received_ns
             return
+
         # The program does not hold the switch. If it held it until now, the arm must stop.
         has_held_switch = program.counts and program.pressed_ns is not None
         if has_held_switch:

@@ -18,6 +18,9 @@ from .site_loop import PeerInbox, StateBlock, run_loop
 def rehearse_loop(scenario: Scenario, name: str, clock: Clock) -> list[int]:
     """Executes all ticks of a site in real time, without other sites.
 
+    `trilat doctor` learns from the result whether this machine can run the site punctually. A
+    tick is one period of the control loop.
+
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
         name: Name of the site.

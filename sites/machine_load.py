@@ -84,6 +84,7 @@ def describe_load(busy_share: float | None) -> str:
     """
     if busy_share is None or busy_share < BUSY_SHARE:
         return ""
+
     cores = workers.count_cores()
     processors = "one processor is"
     if cores > 1:

@@ -25,6 +25,9 @@ from .site_parts import SiteParts
 class PeerAdmission:
     """Decides in a running session from which tick on samples of a restarted peer are used.
 
+    The process of a peer may crash and be started again. Samples of its old process that are
+    still in transit must then not be mixed with those of the new one.
+
     A peer is another site of the session.
 
     Args:
@@ -138,6 +141,7 @@ class PeerAdmission:
         tick = self._inbox.find_last_tick_of(index, coming.boot)
         if tick is None:
             return
+
         self._publisher.publish(
             "last",
             f"the previous start of {coming.member} was heard up to tick {tick}",

@@ -34,6 +34,9 @@ _INBOX_CAPACITY = 256
 class PeerMonitor:
     """Keeps track of the other members of a session for one site.
 
+    A site is the process that controls one arm, and a recorder is the process that writes the
+    log. Processes may crash, join late or be restarted while the arm runs.
+
     The site calls `watch` ten times a second, and reads the attributes.
 
     Args:
@@ -163,6 +166,7 @@ class PeerMonitor:
         # The departure of a member that has published its end was reported already.
         if member_boot in self._ended:
             return
+
         if is_member_process and alive:
             self.departed.pop(member, None)
         elif not alive and (is_member_process or is_recorder):
@@ -231,6 +235,7 @@ class PeerMonitor:
             elif event.kind == "admit" and event.about == self._site:
                 admitted_boot = event.boots.get(self._site, local_boot)
 
+        # A peer has admitted another process in place of this one.
         if admitted_boot != local_boot and self.boots.get(self._site) == local_boot:
             self.ended_by = f"another start of {self._site} has replaced this site"
             self.ended_member = self._site

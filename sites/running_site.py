@@ -272,6 +272,8 @@ class RunningSite:
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Executes one tick: reads the inputs, computes the torque, and moves a simulated arm.
 
+        The control loop calls this once per period, for example a thousand times per second.
+
         Args:
             tick: Number of the tick, a period of the control loop.
             arrivals: Samples of the peers (their published states) that have arrived since the

@@ -94,6 +94,9 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
 class SiteEnd:
     """Ends a site: publishes the result, waits for the recorders, and informs the user.
 
+    A site is the process that controls one arm. After its last control period it still has
+    messages that the log needs.
+
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
@@ -285,8 +288,8 @@ class SiteEnd:
     def _may_leave(self) -> bool:
         """Returns True if the site need not wait for the recorders any longer.
 
-        This is so after a second signal. After a first signal, it is so once the recorders have
-        stored everything.
+        After a first signal such as Ctrl-C, the site waits until the recorders have stored
+        everything. A second signal ends the wait at once.
         """
         interrupt = self._parts.interrupt
         is_complete = self._parts.monitor.all_stored and interrupt.is_requested()

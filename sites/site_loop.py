@@ -77,6 +77,8 @@ STEP_MARGIN_RAD = 0.02
 class PeerInbox:
     """Receives the samples of the peers of a site, and drops those that fail a check.
 
+    A sample is the state that a peer publishes in each tick, a period of its control loop.
+
     A boot is a number that identifies one start of a process. For each peer, only samples of
     one boot are accepted, so that a peer that was started twice does not act twice. A site that
     joins a running session ignores samples from before its own first tick.
@@ -84,8 +86,6 @@ class PeerInbox:
     If the scenario lets the arm glide back to its peers after a break, two more kinds of
     samples are dropped: those far in the future, and those that the peer's arm cannot have
     reached from its previous sample within its speed limit.
-
-    A sample is the state that a peer publishes in each tick, a period of its control loop.
 
     Args:
         links: Directed connections from the peers to this site. All other sequences have the
@@ -214,6 +214,7 @@ class PeerInbox:
         if isinstance(sample, WireError):
             self._dropped[sample.reason] += 1
             return None
+
         link = self._links[index]
         if sample.site != link.peer or sample.boot != self._boots[index]:
             self._dropped["stranger"] += 1
@@ -222,6 +223,7 @@ class PeerInbox:
         nominal_ns = sample.tick * NS_PER_S // link.rate_hz  # time of its tick since the epoch
         if nominal_ns < self._from_ns:
             return None  # from before the first tick of this site
+
         glides = bool(link.speed_limit)  # only links under the rule `glide` have this limit
         ahead_limit_ns = _GLIDE_AHEAD_LIMIT_NS if glides else AHEAD_LIMIT_NS
         if nominal_ns - since_epoch_ns > ahead_limit_ns:

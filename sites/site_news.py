@@ -53,6 +53,9 @@ def publish_clocks(
 class SiteNews:
     """Publishes the events of a running site, and prints lines for its user.
 
+    Events tell the recorder and the other processes what happened at this arm, for example that
+    it stopped because the network was interrupted.
+
     The control loop calls `report_tick` after ticks in which something changed, and
     `publish_news` ten times a second.
 
@@ -212,6 +215,7 @@ class SiteNews:
             return
         if self._parts.setup.on_stale.action is not StaleAction.GLIDE:
             return
+
         second = output.t_ns // NS_PER_S
         is_too_far = find_life_reason(output) is LifeReason.ALIGN_LIMIT
         if is_too_far and second > self._waiting_s:

@@ -131,6 +131,7 @@ def join_and_run(parts: SiteParts) -> int:
     running = _join_session(parts, give_up_ns)
     if running is None:
         return parts.interrupt.exit_code
+
     outcome = running.run()
     end = SiteEnd(parts, running.publisher, running.link_monitors, outcome)
     return end.leave_session()

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from tests.execution.circling_hand import CirclingHand
 from trilat_net.execution import twins as twins_module
 from trilat_net.execution.lanes import twin_lanes
 from trilat_net.execution.twins import (
     Push,
     Twins,
 )
+from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.records import Mode
 from trilat_net.scenario import Scenario, load_scenario
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -84,6 +87,36 @@ def test_twins_of_a_chain_are_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) ->
     scenario = load_scenario("six_joints")
     pushes = push_in_many_ways(scenario, scenario.names[0])
     check_both_ways(monkeypatch, lambda: Twins.of_scenario(scenario, pushes, 2.0))
+
+
+def test_twins_of_several_rates_equal_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slow site makes no tick in some windows, and accepts several samples at once."""
+    rates = {"rate_hz": 700, "sites.s.rate_hz": 7}
+    scenario = load_scenario("two_sites", {**rates, "link.delay_ms": 80.0})
+    pushes = push_in_many_ways(scenario, "m")
+    check_both_ways(monkeypatch, lambda: Twins.of_scenario(scenario, pushes, 4.0))
+
+
+@pytest.mark.parametrize(
+    "rates", [{}, pytest.param({"sites.s.rate_hz": 400}, marks=pytest.mark.long)]
+)
+def test_twins_of_hand_log_equal_in_lanes(
+    monkeypatch: pytest.MonkeyPatch, rates: dict[str, int]
+) -> None:
+    """A person takes hold of an arm, and peers that are not heard in time stop the others."""
+    live = [{"kind": "live", "mode": "tip"}]
+    glide = {"action": "glide", "silence_ms": 60.0}
+    links = {"link.delay_ms": 20.0, "link.loss": 0.97}
+    scenario = load_scenario(
+        "paper",
+        {"duration_s": 1.2, "on_stale": glide, "sites.m1.hands": live, **links, **rates},
+    )
+    log = simulate_scenario(scenario, hands={"m1": CirclingHand(scenario, "m1")})
+    assert log["m1"].hand[:, 0].any()
+    assert {Mode.HOLD, Mode.RETURN} <= set(log["s"].mode.tolist())
+    pushes = push_in_many_ways(scenario, "m1")[:2]
+    twins = check_both_ways(monkeypatch, lambda: Twins.of_log(log, pushes))
+    assert twins.same
 
 
 def test_twins_that_leave_their_limits_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:

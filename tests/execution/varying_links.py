@@ -24,3 +24,12 @@ VARYING_LINKS: tuple[dict[str, Any], ...] = (
     {"link.preset": "4g", "link.duplicate": 0.2},
 )
 """Overrides of a scenario, one set for each kind of variation."""
+
+LINKS: tuple[dict[str, Any], ...] = (
+    {"link.delay_ms": 0.0},
+    {"link.delay_ms": 33.3},
+    {"link.delay_ms": 150.0, "link.loss": 0.2},
+    {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0},
+    *VARYING_LINKS,
+)
+"""Links with constant, lossy and varying delays."""

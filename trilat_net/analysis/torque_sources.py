@@ -25,6 +25,7 @@ from ..log import Log
 from ..scenario import ActorBase, Scenario, SiteSpec
 from .aligned import AlignedRecords, Bools, align_records
 from .arm_rows import EndEffectorRows, build_arm_rows
+from .row_reductions import sum_rows
 
 SCRIPT_TORQUE_TOLERANCE = 1e-8
 """Largest relative difference of a torque that agrees with the scenario."""
@@ -607,7 +608,7 @@ def _find_generated_energy(
     force_vector = force[:, np.newaxis] * np.array(wall.b)
     torque = _map_to_joints(end_effector.J, force_vector)
     motion = np.diff(records.q, axis=0)
-    work = (torque[:-1] * motion).sum(axis=1)
+    work = sum_rows(torque[:-1] * motion)
     depth = np.where(force > 0.0, wall_depth(wall, end_effector), 0.0)
     stored = 0.5 * wall.K[0] * depth**2
     generated = work + np.diff(stored)

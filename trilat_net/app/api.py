@@ -245,6 +245,7 @@ def report(
         raise UsageError(
             "a report needs a log in a file: save the log first, as in log.save('run.mcap')"
         )
+
     folder = choose_report_folder(first_file) if out is None else Path(out)
     return conclude(open_log_of_run, make_results_folder(folder, "", force=force), png=png)
 

@@ -136,6 +136,7 @@ class SessionProcess:
 
         if exit_code in (0, None):
             return None
+
         interrupted_codes = (128 + signal.SIGINT, -signal.SIGINT)
         if self._signalled and exit_code in interrupted_codes:
             # The process was already ending, and had removed its signal handler.
@@ -789,6 +790,7 @@ def run(
     if problems:
         log_note = f"; {result.log} holds what there was" if result.log.exists() else ""
         raise RunFailed("; ".join(problems) + log_note)
+
     log = open_log(result.log)
     log.warn_of_failures()
     return log

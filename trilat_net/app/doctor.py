@@ -146,6 +146,7 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
             "keys", "ok", "none given: without --keys a member listens on this machine alone"
         )
         return None
+
     try:
         member_keys = read_member_keys(folder)
     except UsageError as error:
@@ -259,6 +260,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 
     if endpoint.startswith(ENCRYPTED) or is_loopback(endpoint):
         return DoctorFinding("links", "ok", f"can listen at {endpoint}")
+
     text = f"{endpoint} would listen unencrypted, to anybody who reaches it"
     return DoctorFinding("links", "warn", text)
 
@@ -314,6 +316,7 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
         return DoctorFinding(
             "links", "warn", f"{endpoint} was not tried: QUIC asks for the keys of a member"
         )
+
     try:
         with closing(ZenohBus([], [endpoint], "client", member_keys.settings)):
             text = f"{endpoint} answers over QUIC, with a certificate of the same authority"
@@ -602,6 +605,7 @@ def examine_rate() -> DoctorFinding:
     if not is_held(rate_hz, late_us):
         text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
+
     text = f"a site alone holds {rate_hz} Hz: {text} ({share_text} must within half a period)"
     if missed_rates:
         missed_hz, missed_us, _ = missed_rates[-1]

@@ -342,6 +342,8 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
 class _ScenarioNeeds(NamedTuple):
     """Requirements of a scenario on the network.
 
+    They follow from its message rate and from the delays for which its control loop is stable.
+
     Attributes:
         sample_bytes: Size of a sample of the largest arm, in bytes.
         rate_hz: Largest tick rate of a site, in 1/s.

@@ -525,6 +525,9 @@ class RunningSession:
     def set_link(self, link: str, **to: Any) -> str:
         """Changes settings of a link while the session runs, as `trilat set link` does.
 
+        A link is the connection in one direction between two sites, the processes that each run
+        one arm. Its settings are, for example, an additional delay or loss.
+
         Args:
             link: The link, as in "m1->s" for the direction from site m1 to site s.
             **to: The new settings, as in `delay_ms=350`.
@@ -539,6 +542,9 @@ class RunningSession:
 
     def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
         """Changes the weights with which a site follows its peers, as `trilat set dominance`.
+
+        A site is the process that runs one arm. The arm follows a weighted mean of the other
+        arms. With other weights, another operator leads it.
 
         Args:
             site: Name of the site.
@@ -771,6 +777,8 @@ class RunningSession:
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
         """Measures round trip times and clock offsets of the session, as `trilat ping` does.
+
+        A member is a process of the session: a site, which runs one arm, or a recorder.
 
         Args:
             count: Number of pings to each member.

@@ -70,6 +70,7 @@ __all__ = [
     "Vector",
     "choose",
     "five",
+    "holds_anywhere",
     "pair",
     "put_pair",
     "relative_rotation",
@@ -97,14 +98,15 @@ __all__ = [
     "ReplayedInputs",
     "adapts",
     "channel_of",
-    "emit_stages",
+    "emit_stage",
+    "error_stages",
     "finish_advance",
     "finish_site",
     "first_sent_column",
     "guard_reference",
+    "guard_torque",
     "hold_motor_torque",
     "max_over_joints",
-    "reference_stages",
     "run_until",
     "sense_site",
     "sum_trapezoid",
@@ -122,7 +124,6 @@ __all__ = [
     "ChainJoint",
     "Matrix",
     "Three",
-    "add_task_torque",
     "apply",
     "build_chain",
     "chain_stages",
@@ -138,11 +139,10 @@ __all__ = [
     "propagate_motion",
     "regressor",
     "rotate",
+    "task_space",
     "theta_from_links",
     "three",
     "two_link_stages",
-    "update_pose",
-    "update_task_errors",
     # Torques of operators and environments
     "LIVE_KINDS",
     "NO_TORQUE",
@@ -242,7 +242,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .arms import chain_stages, two_link_stages
+    from .arms import chain_stages, task_space, two_link_stages
     from .arms.chain import (
         COULOMB_SPEED,
         LINK_PARAMETERS,
@@ -277,13 +277,7 @@ if TYPE_CHECKING:
         torque_on_arm,
     )
     from .arms.rotation import relative_rotation, rotation_matrix
-    from .arms.task_space import (
-        POSE,
-        POSITION,
-        add_task_torque,
-        update_pose,
-        update_task_errors,
-    )
+    from .arms.task_space import POSE, POSITION
     from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
     from .life.live_hand import (
         GRIP_NS,
@@ -401,11 +395,12 @@ if TYPE_CHECKING:
     from .step.kernel import (
         adapts,
         channel_of,
-        emit_stages,
+        emit_stage,
+        error_stages,
         finish_advance,
         guard_reference,
+        guard_torque,
         hold_motor_torque,
-        reference_stages,
         sum_trapezoid,
         torque_stage,
         updates_estimate,
@@ -463,6 +458,7 @@ if TYPE_CHECKING:
         Vector,
         choose,
         five,
+        holds_anywhere,
         pair,
         put_pair,
         round_down,
@@ -485,7 +481,7 @@ else:
                 "TorqueSource TorqueTable add_source_torque torque_on_arm"
             ),
             "arms.rotation": "relative_rotation rotation_matrix",
-            "arms.task_space": "POSE POSITION add_task_torque update_pose update_task_errors",
+            "arms.task_space": "POSE POSITION task_space",
             "arms.two_link_arm": "ArmLinks forward_kinematics regressor theta_from_links",
             "arms.two_link_stages": "two_link_stages",
             "life.live_hand": (
@@ -539,9 +535,8 @@ else:
                 "lane_leaf leaf loop_leaf read_lane_assembly set_lane_form"
             ),
             "step.kernel": (
-                "adapts channel_of emit_stages finish_advance guard_reference "
-                "hold_motor_torque reference_stages sum_trapezoid torque_stage "
-                "updates_estimate"
+                "adapts channel_of emit_stage error_stages finish_advance guard_reference "
+                "guard_torque hold_motor_torque sum_trapezoid torque_stage updates_estimate"
             ),
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.row_fields": "LinkRow",
@@ -560,8 +555,8 @@ else:
                 "describe_mode find_life_reason first_tick_at tick_ns"
             ),
             "step.vectors": (
-                "Array IntArray Pair Points Row RowArray Vector choose five pair put_pair "
-                "round_down whole"
+                "Array IntArray Pair Points Row RowArray Vector choose five holds_anywhere "
+                "pair put_pair round_down whole"
             ),
         },
     )

@@ -394,7 +394,8 @@ class FusedRun:
         # Ticks of the fastest site until the latest sample arrives, with a margin for rounding.
         late_ticks = self._inputs.late_ns * fastest_hz // NS_PER_S + 2
         ticks_per_slow_tick = _find_largest_ratio(self.scenario)
-        needed = max(ticks_per_slow_tick + 1, keep, late_ticks)
+        # The last tick of a slow site may be planned half of its period late, see `advance_to`.
+        needed = max(2 * ticks_per_slow_tick + 1, keep, late_ticks)
         pages = 1 << needed.bit_length()  # the least power of two above `needed`
         floats = max(layout.floats for layout in self._layouts)
         return RecentRecords(

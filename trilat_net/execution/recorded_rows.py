@@ -136,6 +136,7 @@ class PlainRows:
         samples: SampleTable,
         resume_every: int = 0,
     ) -> None:
+        """Stores the records. Their arrivals are looked up when they are first needed."""
         self._site_log = site_log
         self._indexed = indexed
         self._samples = samples

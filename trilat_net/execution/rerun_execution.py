@@ -475,6 +475,7 @@ class RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
+        """Creates the site in its initial state, and collects its inputs from the log."""
         site_log = log[name]
         scenario = request.scenario
         setup = scenario.setup(name)
@@ -685,6 +686,7 @@ class RerunExecution:
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
+        """Creates the executed sites, and connects them by the samples that they compute."""
         self._log = log
         self._request = request
         self._recent: dict[str, dict[int, Arrival]] = {name: {} for name in request.replaced}

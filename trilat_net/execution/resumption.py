@@ -202,6 +202,7 @@ class RecordedInputs(Generic[Change]):
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
+        """Collects the samples and changes of one site, before its first tick is executed."""
         self._site_log = site_log
         self._states = site_log.states if states is None else states
         self._links = links

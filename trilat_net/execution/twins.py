@@ -397,13 +397,8 @@ def _run_twins(
 
     run = FusedRun(scenario, inputs=inputs)
     has_changes = inputs is not None and bool(inputs.changes)
-    has_equal_ticks = len(set(ticks)) == 1
-    run_count = 1 + len(pushes)
-    if (
-        has_equal_ticks
-        and not has_changes
-        and suits_twins(run, run_count, ticks[0], LANE_SITE_TICKS)
-    ):
+    count = 1 + len(pushes)
+    if not has_changes and suits_twins(run, count, ticks, LANE_SITE_TICKS):
         # If an arm leaves its limits, all runs are executed again, one by one.
         with suppress(LaneEndedError):
             return _LaneTwinRuns(scenario, pushes, ticks, inputs, log).run()
@@ -450,6 +445,7 @@ class _TwinRuns:
         inputs: RunInputs | None = None,
         log: Log | None = None,
     ) -> None:
+        """Creates the run and its twins before their first tick, and empty results."""
         self._log = log
         self._pushes = pushes
         self._joints = _list_joints(scenario)
@@ -742,11 +738,11 @@ class _LaneTwinRuns(_TwinRuns):
         from .lanes.twin_lanes import LaneTwin, TwinLanes
 
         run = FusedRun(scenario, inputs=inputs)
-        run_count = 1 + len(self._pushes)
+        count = 1 + len(self._pushes)
         self._lanes = TwinLanes(
-            run, count=run_count, ticks=ticks[0], feed=run.memory.feed, kept=record_count
+            run, count=count, ticks=ticks, feed=run.memory.feed, kept=record_count
         )
-        return [LaneTwin(self._lanes, lane) for lane in range(run_count)]
+        return [LaneTwin(self._lanes, lane) for lane in range(count)]
 
     def _execute_window(self, end_s: float) -> None:
         """Executes the run and its twins to the end of a window, and measures the differences.
@@ -756,67 +752,57 @@ class _LaneTwinRuns(_TwinRuns):
         """
         lanes = self._lanes
         lanes.step_to(math.ceil(end_s * NS_PER_S) - 1)
-        t_ns = lanes.read_times()
         if self._log is not None:
-            all_columns = slice(None)
-            first_run = slice(0, 1)  # the other runs are the twins
-            records = []
-            for i in range(len(self._layouts)):
-                rows = lanes.read_records(i, all_columns, first_run)[:, :, 0]
-                records.append((t_ns, rows))
+            everything = slice(None)
+            run = slice(0, 1)
+            records = [
+                (lanes.read_times(i), lanes.read_records(i, everything, run)[:, :, 0])
+                for i in range(len(self._layouts))
+            ]
             self._compare_with_log(self._log, records)
 
-        active_twins = []
-        for twin_index, pushed_at in enumerate(self._pushed):
-            if pushed_at and self._died[twin_index] is None:
-                active_twins.append(twin_index)
-        self._measure_window(t_ns, active_twins)
+        measured = []
+        for n, pushed in enumerate(self._pushed):
+            if pushed and self._died[n] is None:
+                measured.append(n)
+        self._measure_window(measured)
+        for n, push in enumerate(self._pushes):
+            if n in measured:
+                self._renew_difference(n, end_s)
+            elif not self._pushed[n] and push.at_s <= end_s:
+                # A twin without a push has the state of the run.
+                self._push(n, end_s)
 
-        for twin_index, push in enumerate(self._pushes):
-            if twin_index in active_twins:
-                self._renew_difference(twin_index, end_s)
-            elif not self._pushed[twin_index] and push.at_s <= end_s:
-                # A twin without a push has the state of the run, so nothing must be copied.
-                self._push(twin_index, end_s)
-
-    def _measure_window(self, t_ns: Ints, measured: Sequence[int]) -> None:
-        """Stores the speeds of the run, and the differences of its twins, in one window.
-
-        A window is a part of the run, which consists of intervals of 50 ms. The twins are
-        displaced copies of the run. `_TwinRuns` computes the same numbers twin by twin.
+    def _measure_window(self, measured: Sequence[int]) -> None:
+        """Adds the course of the run and of the differences in one window to the paths.
 
         Args:
-            t_ns: Times of the ticks (control periods) of the window, ns.
             measured: Indices of the twins that are measured.
         """
-        if not len(t_ns):
-            return
         twins = np.array(measured, dtype=np.int64)
-        intervals = t_ns * BUCKETS_PER_S // NS_PER_S
-        starts = np.flatnonzero(np.diff(intervals, prepend=-1))  # first tick of each interval
-        rows = intervals[starts]
-        last_ticks = np.append(starts[1:], len(t_ns)) - 1
-        all_runs = slice(0, 1 + len(self._pushes))
-        first_joint = 0  # index of the site's first joint among the joints of all sites
+        runs = slice(0, 1 + len(self._pushes))
+        column = 0
         for i, layout in enumerate(self._layouts):
-            columns = slice(first_joint, first_joint + layout.joints)
-            first_joint += layout.joints
-            # Shape (ticks, joints, runs). Run 0 is the run itself, the others are the twins.
-            qd = self._lanes.read_records(i, layout.columns()["qd"], all_runs)
-            peak_speeds = np.maximum.reduceat(np.abs(qd[:, :, 0]), starts, axis=0)
-            self._speed[rows, columns] = np.maximum(self._speed[rows, columns], peak_speeds)
-
+            columns = slice(column, column + layout.joints)
+            column += layout.joints
+            t_ns = self._lanes.read_times(i)
+            if not len(t_ns):
+                continue
+            buckets = t_ns * BUCKETS_PER_S // NS_PER_S
+            starts = np.flatnonzero(np.diff(buckets, prepend=-1))
+            rows = buckets[starts]
+            ends = np.append(starts[1:], len(t_ns))
+            qd = self._lanes.read_records(i, layout.columns()["qd"], runs)
+            speed = np.maximum.reduceat(np.abs(qd[:, :, 0]), starts, axis=0)
+            self._speed[rows, columns] = np.maximum(self._speed[rows, columns], speed)
             difference = qd[:, :, 1 + twins] - qd[:, :, :1]
             peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)
             log_peaks = np.log(peaks) + self._scale[twins]
             for position, n in enumerate(measured):
-                earlier_peaks = self._largest[n][rows, columns]
-                self._largest[n][rows, columns] = np.maximum(
-                    earlier_peaks, log_peaks[:, :, position]
-                )
-                self._last[n][rows, columns] = difference[last_ticks, :, position]
-        for n in measured:
-            self._scales[n, rows] = self._scale[n]
+                known = self._largest[n][rows, columns]
+                self._largest[n][rows, columns] = np.maximum(known, log_peaks[:, :, position])
+                self._last[n][rows, columns] = difference[ends - 1, :, position]
+                self._scales[n, rows] = self._scale[n]
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:

@@ -938,6 +938,8 @@ def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
     """Returns the records of all sites (arm controllers) of a log, by site and tick.
 
+    A site that is executed again looks up the samples of the other sites in it.
+
     Args:
         log: The log.
         lazy: True if only few records (results of control periods) will be accessed. They are

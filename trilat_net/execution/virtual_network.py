@@ -22,8 +22,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import median_low
 from typing import NamedTuple, Protocol
 
-import numpy as np
-
 from ..core import MAX_ARRIVALS
 from ..errors import LogError, count_nouns
 from ..log import SiteLog
@@ -208,14 +206,14 @@ def read_deliveries(site_log: SiteLog) -> Deliveries:
         site_log: Records of the site, each of which lists the samples that arrived in its tick.
     """
     counts, rows = site_log.arrivals
-    arrivals = rows.tolist()
+    arrivals = rows.tolist()  # those of all ticks, one after another
+    peer_count = len(site_log.peers)
     entries: dict[int, Sequence[ArrivalEntry]] = {}
     start = 0
-    for tick, stop in zip(site_log.tick.tolist(), np.cumsum(counts).tolist(), strict=True):
+    for tick, count in zip(site_log.tick.tolist(), counts.tolist(), strict=True):
+        stop = start + count
         # A damaged record may list a peer that the site does not have.
-        entries[tick] = [
-            entry for entry in arrivals[start:stop] if 0 <= entry[0] < len(site_log.peers)
-        ]
+        entries[tick] = [entry for entry in arrivals[start:stop] if 0 <= entry[0] < peer_count]
         start = stop
     return Deliveries(
         entries=entries,

@@ -241,7 +241,10 @@ def _compare_site_rerun(
 def _pair_records(
     log: Log, request: RerunRequest, name: str, executed: Sequence[RerunTick]
 ) -> _CommonRecords:
-    """Returns the records of a site with the same times in the log and in its rerun.
+    """Pairs the records of a site in a log with those of its rerun, to compare them.
+
+    A rerun executes the log again, possibly with another tick rate. Records with the same time
+    form a pair.
 
     Args:
         log: The log.

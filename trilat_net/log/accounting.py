@@ -170,6 +170,7 @@ class Account:
     """
 
     def __init__(self) -> None:
+        """Starts without any message."""
         self.received = 0
         self.duplicate = 0
         self.reordered = 0
@@ -424,6 +425,7 @@ class StartGap:
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
+        """Starts with an unknown gap, because the site has not been started again yet."""
         self._account = account
         self._under_way = under_way
         # Largest number of messages that the earlier start published, as other sites report.

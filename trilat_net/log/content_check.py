@@ -156,6 +156,7 @@ class ContentCheck:
     def __init__(
         self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool
     ) -> None:
+        """Starts without any accepted message."""
         self._scenario = scenario
         self._about = about
         self._session = about.get("session", "")
@@ -280,6 +281,9 @@ class ContentCheck:
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
         """Decodes a message, and returns it with the identity that its content states.
+
+        The identity consists of sender, channel, number and sending time. It is compared with
+        the place of the message in the file.
 
         Args:
             topic: Topic of the message.

@@ -252,6 +252,7 @@ class LogFile:
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
+        """Creates the file under its working name."""
         self.path = path
         self.working = working or active_path(path)
         self.size = 0

@@ -130,6 +130,7 @@ class Log(Result, Mapping[str, SiteLog]):
     """
 
     def __init__(self, contents: LogContents) -> None:
+        """Reads the scenario and the events. Records are decoded when they are accessed."""
         self.source = contents.source
         self.sources = contents.sources
         self.session = contents.session

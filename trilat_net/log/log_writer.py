@@ -444,6 +444,7 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
+        """Opens the first file of the log, after a check that its name is free."""
         self._open_file = opened or (
             lambda path: LogFile(path, force=storage.force, durable=storage.durable)
         )

@@ -247,6 +247,7 @@ class McapReader:
         *,
         kept: bool = True,
     ) -> None:
+        """Prepares the reading. Only the beginning and the end of the file are read here."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.channels: dict[str, ChannelInfo] = {}

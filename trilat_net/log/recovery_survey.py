@@ -71,6 +71,7 @@ class RecoverySurvey:
     """
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
+        """Reads the whole file once, and selects the parts that belong together."""
         self.profile = ""
         self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}

@@ -58,6 +58,7 @@ class SessionAccounts:
         continued: bool = False,
         events: bool = True,
     ) -> None:
+        """Starts with no counted message and no opened channel."""
         self._session = session
         self._continued = continued
         self._rates_hz: dict[str, int] = {}

@@ -178,6 +178,7 @@ class _ChannelCheck:
         findings: Findings,
         accounts: SessionAccounts,
     ) -> None:
+        """Starts without any checked message."""
         self.member = key.member
         self.kind = key.channel
         self._topic = "/" + topics.key(key.session, key.member, key.channel)
@@ -408,6 +409,7 @@ class _SessionCheck:
     """
 
     def __init__(self) -> None:
+        """Starts without any checked file."""
         self.ours = False
         self.channels: dict[str, _ChannelCheck] = {}
         self._findings = Findings()

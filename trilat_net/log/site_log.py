@@ -151,6 +151,7 @@ class LazyRecords(Sequence[State]):
     def __init__(
         self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
     ) -> None:
+        """Prepares the cache of decoded blocks. No record is decoded yet."""
         block_size = _HEAVY_BLOCK if heavy else BLOCK_RECORDS
         block_count = _HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // block_size
         self._payloads = payloads
@@ -369,6 +370,7 @@ class SiteLog:
         channel: LawChannel = LawChannel(),  # noqa: B008
         axes: tuple[float, ...] = (),
     ) -> None:
+        """Finds the tick of each record, and sorts the records by tick."""
         self.channel = channel
         self.name = name
         self.peers = peers

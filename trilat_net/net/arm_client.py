@@ -98,6 +98,7 @@ class SiteSender:
         channel: str,
         boot: int,
     ) -> None:
+        """Opens the channel to the site. No message is sent yet."""
         self.boot = boot
         self.number = -1
         self._clock = clock
@@ -186,6 +187,7 @@ class SiteClient:
         session: str,
         site: str,
     ) -> None:
+        """Subscribes to the records, the events and the presence of the site."""
         self._bus = bus
         self._clock = clock
         self._site = site
@@ -322,6 +324,7 @@ class _OutsideClient(SiteClient):
         session: str,
         site: str,
     ) -> None:
+        """Subscribes to the messages of the site, and opens the channel to the site."""
         super().__init__(bus, clock, session, site)
         self._sender = SiteSender(
             bus=bus,
@@ -507,6 +510,7 @@ class Hand(SiteClient):
         *,
         repeats: bool = True,
     ) -> None:
+        """Connects to the site. The arm is moved only after the first call of a method."""
         super().__init__(bus, clock, session, site)
         self._operator = operator
         self._compute_pose = compute_pose

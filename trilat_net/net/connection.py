@@ -591,7 +591,7 @@ def _join_options(
 ) -> Connection:
     """Derives the connection of a peer or a router from the command line and a Zenoh file.
 
-    The arguments are those of `Connection.of_member`, and the mode of the process.
+    `listen_else` and `connect_else` are the defaults, see `Connection.of_member`.
 
     Raises:
         UsageError: Both the command line and the file name endpoints at which to listen.

@@ -57,7 +57,7 @@ def _is_address(host: str) -> bool:
 
 
 def _resolve(host: str, endpoint: str) -> None:
-    """Queries the name service for a host name.
+    """Checks that the name service can resolve a host name to an address.
 
     Args:
         host: The host name.

@@ -574,7 +574,9 @@ def _format_member_list(member: str, members: Sequence[str], ends: datetime.date
 def _sign_authority(
     key: ec.EllipticCurvePrivateKey, ends: datetime.datetime
 ) -> x509.Certificate:
-    """Returns the certificate of the authority, signed with its own key.
+    """Returns the certificate of the authority that signs the certificates of all members.
+
+    The authority has no higher authority, so that it signs its own certificate.
 
     Args:
         key: Private key of the authority.
@@ -646,7 +648,9 @@ def _encode(certificate: x509.Certificate) -> bytes:
 
 
 def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """Returns the host names and addresses that a certificate contains.
+    """Returns the host names and addresses for which a certificate is valid, in its format.
+
+    A connection to a member under any other name or address is refused.
 
     Args:
         hosts: Names and addresses in addition to those of the local machine.

@@ -164,6 +164,7 @@ class EventPublisher:
         info: Info,
         keep: Callable[[bytes], None] = lambda _: None,
     ) -> None:
+        """Opens the channel of the events, and begins to receive queries for the identity."""
         self.info = info
         self.published = 0
         self._keep = keep
@@ -309,6 +310,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
+        """Subscribes to the presence of the members. No other member is known yet."""
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()

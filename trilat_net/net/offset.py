@@ -262,6 +262,7 @@ class _AdmissibleLines:
     def __init__(
         self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int
     ) -> None:
+        """Computes the steepest and the flattest line that the limits permit."""
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
         self._ceiling_times_s, self._ceilings = self._read_columns(ceilings)
@@ -406,6 +407,7 @@ class _SlewSegment:
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
+        """Computes both lines, and the largest error on the first one."""
         self.start_ns = start_ns
         self.estimate = estimate
         # Time at which the smoothed offset has reached (joined) the line of the estimate.

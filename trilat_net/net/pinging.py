@@ -281,6 +281,7 @@ class Pinger:
         session: str,
         required: int = PINGS,
     ) -> None:
+        """Starts without any measured round trip."""
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required

@@ -397,6 +397,7 @@ class TopicPublisher:
         *,
         latched: bool,
     ) -> None:
+        """Stores the publisher. The first message will have the number 1."""
         self._declared = declared
         self._gid = gid
         self._clock = clock
@@ -459,6 +460,7 @@ class Ros2Graph:
         domain: int = 0,
         distro: str = "jazzy",
     ) -> None:
+        """Connects to the router of ROS, and announces the node to ROS programs."""
         check_hosts(find_endpoint_addresses(routers))
         self._session = open_zenoh(
             listen=[],
@@ -672,7 +674,10 @@ class Ros2Graph:
         kind: str,
         qos: QualityOfService,
     ) -> tuple[str, bytes]:
-        """Declares the liveliness token of an endpoint, so that ROS programs see it.
+        """Announces a publisher, subscription or service to ROS programs.
+
+        It is announced by a liveliness token, a Zenoh key that exists as long as this program
+        is connected.
 
         Args:
             end: Kind of the endpoint.

@@ -88,6 +88,7 @@ class SessionJoin:
         sites: Sequence[str],
         late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
+        """Announces this process to the other members, and begins to look for them."""
         self._clock = clock
         self._session = session
         self._publisher = publisher

@@ -475,6 +475,7 @@ class SiteTiming:
         leader: str,
         turn_ns: int = 0,
     ) -> None:
+        """Starts the schedule at the epoch, with the first estimates of the peers' clocks."""
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
         self._epoch_ns = epoch_ns
@@ -707,6 +708,8 @@ class SiteTiming:
 
 def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> ClockNotice:
     """Returns the event that states the offset and the drift of a peer's clock.
+
+    Users and the log thus learn how accurate the measured delays are.
 
     Args:
         monitor: Timing of the link from the peer (other site).

@@ -457,7 +457,9 @@ def make_reader(
 
 
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
-    """Raises the error for the first vector whose length differs from the required length.
+    """Checks that the vectors of a received message have the lengths of the scenario.
+
+    A message with other lengths comes from a program that runs another scenario.
 
     Args:
         vectors: The vectors of a message.

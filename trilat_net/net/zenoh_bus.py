@@ -238,6 +238,7 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
+        """Opens the Zenoh session of this connection."""
         other_reason = ", or no router accepts this member" if settings else ""
         self._session = open_zenoh(
             listen=listen,

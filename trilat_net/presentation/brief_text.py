@@ -159,6 +159,7 @@ def _name_subject(quantity: Quantity, values: dict[str, Metric]) -> str:
         return "run"
     if quantity.reduction == "sum":
         return f"all {quantity.of}s together"
+
     are_all_equal = len(set(known_values.values())) == 1
     if len(known_values) > 1 and are_all_equal:
         return f"every {quantity.of}"

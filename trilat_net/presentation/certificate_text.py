@@ -237,6 +237,7 @@ def _explain_judgement(certificate: Certificate) -> str:
             f"{describe_settling(certificate)}; "
             "`trilat certify --accept settled` takes this for a success"
         )
+
     decay_rate = describe_pace(certificate)
     if stability is Stability.NOT_STABLE:
         return decay_rate or "the motion of this run does not come to rest"
@@ -309,6 +310,7 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 
     if certificate.end.behaviour is EndBehaviour.DIVERGED:
         return lines  # the judgement says already which joint exceeded its limit
+
     end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
     lines.append(CertificateLine(end_mark, f"e and qd: {certificate.end.text}"))
     return lines
@@ -409,6 +411,7 @@ def compose_headline(certificate: Certificate) -> str:
     end = certificate.end
     if end.behaviour is EndBehaviour.DIVERGED:
         return f"{certificate.stability}: {end.text}"
+
     stability = certificate.stability
     recorded_stability = end.behaviour.stability
     headline = f"{stability}: {_describe_end(certificate)}"
@@ -517,11 +520,13 @@ def _describe_balance(balance: EnergyBalance) -> str:
     scale_j = balance.scale
     if scale_j <= ZERO_ENERGY_J:
         return "there is no energy in this run"
+
     residual_j = float(np.abs(balance.residual).max())
     unexplained_j = float(np.abs(balance.unexplained).max())
     text = f"closes to {residual_j / scale_j:.1e} of the largest energy, {scale_j:.4g} J"
     if unexplained_j >= residual_j:
         return text
+
     unexplained_fraction = unexplained_j / scale_j
     return f"{text}; to {unexplained_fraction:.1e} once the controller's sampling is booked"
 

@@ -94,6 +94,9 @@ class _PageCharts(NamedTuple):
 class ChartBuilder:
     """Computes the charts of the page that reports a run, from the run's log.
 
+    The numbers become tables, from which the scripts of the page draw the charts in the
+    browser.
+
     Args:
         log: Log of the run.
         twin: Log of the same run without operators, the people or programs that move the arms.
@@ -232,6 +235,8 @@ class ChartBuilder:
 
     def _note_floor(self, unit: str) -> str:
         """Returns a note that small errors are drawn at the bottom of the logarithmic axis.
+
+        A logarithmic axis cannot show an error of zero.
 
         Args:
             unit: Unit of the errors.
@@ -560,6 +565,9 @@ class ChartBuilder:
 
     def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
         """Returns lines at the true values of a parameter over the whole run.
+
+        An adaptive control law estimates the parameters of the arm, and the lines show how
+        close the estimates come.
 
         Args:
             truths: The true value for each site.

@@ -53,6 +53,8 @@ Joints = int | str | Sequence[int | str] | None
 class _Line(NamedTuple):
     """The values of one column at one site.
 
+    A panel of the figure has such a line for each site that has the column.
+
     Attributes:
         site: Name of the site.
         tick: Numbers of the ticks, shape (K,).
@@ -235,7 +237,10 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
-    """Returns the error message for an unknown column, with the most similar name."""
+    """Returns the error message for an unknown column, with the most similar name.
+
+    The user has probably misspelled the name.
+    """
     if name in FIGURES:
         return (
             f"{name!r} is a figure and no column of the log; "
@@ -272,6 +277,7 @@ def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
     numbers = list(range(1, len(names) + 1))
     if joints is None:
         return numbers
+
     selected = [joints] if isinstance(joints, int | str) else list(joints)
     return [
         number
@@ -288,9 +294,11 @@ def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
     """
     if joints is None:
         return
+
     selected = [joints] if isinstance(joints, int | str) else list(joints)
     if not selected:
         raise UsageError("joints is empty; joints are numbers from 1 or names")
+
     for joint in selected:
         if not any(_number_joints(log, site, joint) for site in sites):
             names = log.scenario.arms[sites[0]].joint_names
@@ -458,6 +466,8 @@ def _list_words(lines: Sequence[_Line]) -> list[str]:
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
     """Returns the values of a column as numbers to draw, shape (K,). NaN stands for no value.
+
+    Texts, such as the mode of an arm, are replaced by their positions in a list of all texts.
 
     Args:
         column: The column.

@@ -73,6 +73,8 @@ class EpisodePicture:
     ) -> NDArray[np.uint8]:
         """Draws the arms, the bodies and the goal of the task at one time of an episode.
 
+        An episode is one attempt at a task. Its pictures can be combined to a film.
+
         Args:
             q_rad: Joint angles by site, in rad, shape (n,) each.
             bodies: Poses of the bodies that the arms can touch, by site and name, shape (7,)

@@ -90,6 +90,7 @@ class Exporter:
         names = exports.list_export_formats()
         if form not in names:
             raise UsageError(f"--to must be one of {', '.join(names)}, not {form!r}")
+
         module = import_module(f"{exports.__name__}.{form}")
         self._format: ExportFormat = module.FORMAT
         self._settings = _parse_settings(form, self._format.write, dict(settings))
@@ -124,6 +125,7 @@ class Exporter:
             raise UsageError(
                 f"this format exports a single log, not {len(logs)} logs of different sessions"
             )
+
         total = 0
         for log in logs:
             total += sum(len(log[site]) for site in log.sites)

@@ -80,6 +80,9 @@ def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
 class _Panels:
     """Collects the settings of panels, and gives each panel an identifier.
 
+    Foxglove is a viewer for data of robots. Its layout file refers to panels by their
+    identifiers.
+
     Attributes:
         settings: Settings of each panel, by its identifier.
     """
@@ -137,6 +140,7 @@ def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
     upper_area = panels.add_tabs(tabs)
     if not lower_panels:
         return upper_area
+
     lower_area = _divide("row", lower_panels, _MODES_PERCENT)
     return _divide("column", [upper_area, lower_area], _PLOTS_PERCENT)
 
@@ -223,6 +227,8 @@ def _get_list_path(channels: Ros2Channels, entity: str) -> str:
 
 def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
     """Adds a panel that shows the modes of all arms over time, such as "resting".
+
+    An arm that rests or holds its position does not follow the other arms.
 
     Returns:
         The identifier of the panel. Empty if there are no modes.

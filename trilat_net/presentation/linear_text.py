@@ -132,6 +132,7 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
         [common_age_s] = distinct_ages_s
         yield f"{quantity} on every link: {1e3 * common_age_s:.4g} ms"
         return
+
     for i, j in links:
         yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
 
@@ -162,6 +163,7 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
         None if ticks_differ else analysis.find_sampled_root(root) for root in roots
     ]
     has_sampled_columns = any(sampled is not None for sampled in sampled_roots)
+
     rows = []
     for root, sampled in zip(roots, sampled_roots, strict=True):
         # The imaginary part of a real root may be -0.0, which would be printed as "-0".
@@ -172,11 +174,13 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
             f"{root.damping:.4g}",
             str(root.multiplicity),
         ]
+
         if has_sampled_columns and sampled is None:
             row += ["same", "same"]
         elif sampled is not None:
             row += [f"{sampled.s.real:.4g}", f"{sampled.s.imag:.4g}"]
         rows.append([*row, root.description])
+
     heads = ["re 1/s", "im rad/s", "Hz", "damping", "modes"]
     if has_sampled_columns:
         heads += ["re as computed", "im as computed"]
@@ -196,6 +200,7 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
     zero_count = analysis.decisive.zeros
     if not zero_count:
         return "no root at zero"
+
     subject = "root is" if zero_count == 1 else "roots are"
 
     origins = "shared poses"
@@ -383,6 +388,7 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
     """
     if passivity.passive:
         return "passive"
+
     minima = passivity.minima
     least_text = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
     text = f"not passive {_list_bands(minima.below)}; {least_text}"
@@ -420,10 +426,10 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
 
     A two-port is one joint of two sites, at which one operator each acts. A third site is free,
-    or its arm is clamped. The criterion fails if some passive operators make the two-port
-    unstable, which is so if Llewellyn's parameter is below 1 in some band of frequencies. A
-    line describes a failing two-port, or a group of them, and a last line counts those for
-    which the criterion holds.
+    or its arm is clamped. The criterion fails if Llewellyn's parameter is below 1 in
+    some band of frequencies. Then some passive operators make the two-port unstable. A line
+    describes a failing two-port, or a group of them, and a last line counts those for which the
+    criterion holds.
 
     Args:
         ports: Results for the joints at which the operators act.
@@ -442,6 +448,7 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     holding_count = len(ports.two_ports) - len(failing_ports)
     if not holding_count:
         return lines
+
     subject = "the others"
     if not failing_ports:
         subject = f"every pair and {ports.kind}"

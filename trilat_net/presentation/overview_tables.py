@@ -189,6 +189,7 @@ def _compose_channels(
     """
     if not channels:
         return
+
     prefix = f"/trilat/{session['session']}/" if session else ""
 
     rows = []
@@ -256,6 +257,7 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
     if not accounts:
         yield "no accounts: the recording was not finished"
         return
+
     faulty_accounts = {
         topic: account
         for topic, account in accounts.items()
@@ -271,7 +273,10 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    """Yields the versions of the software and the machine that recorded the log."""
+    """Yields the versions of the software and the machine that recorded the log.
+
+    A run can be repeated bit for bit only with the same versions and the same arithmetic.
+    """
     versions: dict[str, str] = dict(session["versions"])
     version = versions.pop("trilat-net", "unknown")
     libraries = [f"{name} {library}" for name, library in versions.items()]

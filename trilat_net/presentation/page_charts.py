@@ -121,6 +121,7 @@ def render_chart_groups(
         groups = render_macro("charts.html", "groups", groups=rendered_groups)
     if place == "loops":  # the section of the loops says itself what is missing
         return groups
+
     for reason, titles in missing_by_reason.items():
         if titles:
             groups += render_note(f"Not on this page, because {reason}: {'; '.join(titles)}.")

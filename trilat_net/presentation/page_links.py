@@ -119,6 +119,7 @@ def _summarise_links(facts: JsonObject) -> str:
     ages_ms = [link["age_ms"] for link in links.values() if link["age_ms"]["max"] is not None]
     if not ages_ms:
         return f"{stated_text}; no sample came into use."
+
     youngest_ms = format_cell(min(age["min"] for age in ages_ms))
     oldest_ms = format_cell(max(age["max"] for age in ages_ms))
     used_text = f"the controllers used samples that were {youngest_ms} to {oldest_ms} ms old"

@@ -47,6 +47,7 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     scenario = log.scenario
     name, hint = _find_scenario_argument(scenario)
     recording = _list_recording_facts(log, facts)
+
     folds = [
         render_details("What this scenario is about", _render_description(scenario)),
         render_details("What is assumed", _render_assumptions(scenario)),
@@ -55,8 +56,10 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
         render_details("Versions of the software", render_facts(_list_versions(log))),
         render_details("Licence of the plotting library", render_code(licence)),
     ]
+
     body = render_code(_list_commands(log, name)) + render_folds(folds)
     intro = "These commands check the log, simulate its run again, and run its scenario."
+
     law_files = _list_law_files(scenario)
     if law_files:
         intro += (
@@ -95,6 +98,7 @@ def describe_changes(scenario: Scenario) -> str:
     """
     if scenario.name not in list_shipped():
         return ""
+
     shipped = load_scenario(scenario.name)
     if shipped.title != scenario.title:
         return ""

@@ -153,6 +153,7 @@ def describe_basis(certificate: Certificate) -> str:
     decision = certificate.decision
     if certificate.end.behaviour is EndBehaviour.DIVERGED:
         return f"The run {decision.rests_on}."
+
     meaning = _explain_word(certificate)
 
     if decision.stability is Stability.STABLE:
@@ -160,6 +161,7 @@ def describe_basis(certificate: Certificate) -> str:
         return f"{meaning}: {basis}."
     if decision.stability is not Stability.OPEN:
         return f"{meaning} – {decision.rests_on}."
+
     # The judgement is open. The first reason is stated, and the others are counted.
     reason, *other_reasons = [text for text in (decision.rests_on, *decision.reasons) if text]
     count_text = (
@@ -185,6 +187,7 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     end = certificate.end
     if end.missing_sites:
         return f"There is no record of {join_words(end.missing_sites)}."
+
     stability = certificate.stability
     is_stable = stability in (Stability.STABLE, Stability.SETTLED)
     error_remains = end.end_error_rad > SETTLED_ERROR_RAD
@@ -304,6 +307,9 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     """Returns the largest error of some sites, with their largest error in the last second.
 
+    The error e is the difference between the angles of an arm and the angles that it should
+    have.
+
     Args:
         log: Log of the run.
         sites: Names of the sites.
@@ -312,6 +318,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     peak = find_error_peak(log, sites)
     if peak is None:
         return _KeyNumber(f"{join_words(sites)} {place}", NO_NUMBER, "no record")
+
     unit = shared_unit(log)
     detail = f"largest, of {peak.joint}, at {peak.t_s:.2f} s"
 
@@ -349,6 +356,7 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumbe
     known_distances = [distance for distance in distances if distance is not None]
     if not known_distances:
         return []
+
     name = f"{join_words(slaves)} from where the masters are"
     value = f"{max(known_distances):.3g} {unit}"
     return [_KeyNumber(name, value, "largest at the same moment, delay included")]
@@ -403,6 +411,7 @@ def render_alarms(log: Log) -> Markup:
     alarms = list_alarms(log)
     if not alarms:
         return Markup()
+
     severe_alarms = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
     candidates = severe_alarms if severe_alarms else alarms
     listed_alarms = candidates[:_MAX_ALARMS]
@@ -418,6 +427,8 @@ def render_alarms(log: Log) -> Markup:
 
 def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
     """Renders the results of the checks of the log as one line, which unfolds into a list.
+
+    The list is unfolded at first if a check has failed.
 
     Args:
         findings: Results of the checks. Some may be undecided, for example because the code of

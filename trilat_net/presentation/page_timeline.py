@@ -70,6 +70,9 @@ class _RunMoment(NamedTuple):
 def render_timeline(log: Log, facts: JsonObject) -> Markup:
     """Renders the section with what happened during the run, in the order of time.
 
+    Examples are a changed delay, a push by an operator, and an arm that stopped because the
+    network was interrupted.
+
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.

@@ -132,6 +132,7 @@ def _describe_gains(quantities: premise_quantities.GainQuantities) -> str:
 def _describe_walls(quantities: premise_quantities.WallQuantities) -> str:
     if not quantities.walls:
         return "no sampled wall was touched"
+
     summary = "every sampled wall is passive"
     if quantities.active:
         summary = "a sampled wall generates energy in contact"
@@ -187,6 +188,7 @@ def _describe_delays(quantities: premise_quantities.DelayQuantities) -> str:
 
     if not quantities.constant_s:
         return "no sample came into use"
+
     delay_texts = {f"{1e3 * delay_s:.4g} ms" for delay_s in quantities.constant_s}
     return f"constant on every link: {', '.join(sorted(delay_texts))}"
 
@@ -204,6 +206,7 @@ def _describe_following(quantities: premise_quantities.FollowingQuantities) -> s
 
     if not interruption_texts:
         return "every site follows its peers all the time"
+
     modes_text = (
         "hold, brake, return or stop" if quantities.is_halted else "hold, brake or return"
     )
@@ -264,6 +267,7 @@ def _describe_operators(quantities: premise_quantities.OperatorQuantities) -> st
     supply = quantities.supply
     if supply is None:
         return "nobody pushes"
+
     sources = " and ".join(supply.sources)
     if supply.is_passive:
         return f"the {sources} only absorbed energy: passive with respect to r"

@@ -417,6 +417,7 @@ def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves 
         return _select_estimates(topic, field, names)
     if channel.kind == JOINT_STATE:
         return _select_joint_states(topic, field, names)
+
     if channel_name == "tau_x":
         # This quantity shares a plot with the torque of the same joints.
         names = [f"tau_x {name}" for name in names]
@@ -481,6 +482,7 @@ def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> _PlotC
     is_only_reference = has_only_reference_names or topic.endswith("/reference")
     if is_only_reference and field == "effort":
         return None
+
     if is_only_reference:
         # The names in a channel ".../reference" may lack the suffix.
         names = [name.removesuffix(suffix) + suffix for name in names]
@@ -545,7 +547,11 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
 
 
 def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns Rerun's view of a plot, in which each channel has its own colors."""
+    """Returns Rerun's view of a plot, in which each channel has its own colors.
+
+    Rerun is a viewer for data of robots. A legend with too many names would cover the curves,
+    and is hidden.
+    """
     styles_by_channel = {}
     for index, curves in enumerate(plot.curves):
         styles_by_channel[curves.entity] = _style_curves(curves, first_color=2 * index)

@@ -389,6 +389,8 @@ class _JointPanels(NamedTuple):
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
     """Arranges the panels of joints in a grid with few rows and few empty cells.
 
+    A robot arm has from two to about seven joints, and each gets a panel.
+
     Args:
         joints: Number of joints.
         narrow: True if only two panels fit beside each other. Otherwise three or four fit.
@@ -478,6 +480,8 @@ def typeset_unit(unit: str) -> str:
 
 def typeset_symbol(parameter: str) -> str:
     """Returns the symbol of an inertial parameter for Matplotlib, with its index below.
+
+    An adaptive control law estimates such parameters, for example a mass or an inertia.
 
     Args:
         parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
@@ -607,6 +611,8 @@ def write_figure(figure: Figure, path: Path, dpi: int) -> None:
 
 def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
     """Returns a figure as the bytes of a file that contains no date.
+
+    Without a date, the same figure always has the same bytes, so that files can be compared.
 
     Args:
         figure: The Matplotlib figure.
@@ -870,7 +876,10 @@ class TimeFigure:
         self._add_footnote(self._explain_changes(links=links), self._explain_shading())
 
     def _add_footnote(self, *sentences: str) -> None:
-        """Writes sentences below the panels, each on new lines. Empty ones are left out."""
+        """Writes sentences below the panels, each on new lines. Empty ones are left out.
+
+        They explain, for example, the marked changes and the shaded times.
+        """
         letters_per_line = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
         lines: list[str] = []
         for sentence in sentences:
@@ -913,6 +922,7 @@ class TimeFigure:
             meanings |= {interval.meaning for interval in intervals}
         if not meanings:
             return ""
+
         phrases = []
         for meaning in sorted(meanings):
             shade = " (lighter)" if meaning.mode is Mode.RETURN else ""

@@ -562,6 +562,7 @@ def compose_ping(report: Result) -> Iterator[Block]:
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
     clock_note = "clock: the member's minus that of this machine"
     yield f"session {facts['session']} {state}; times in us; {clock_note}"
+
     rows = []
     for member in members:
         round_trip_us = member.get("rtt_us", {})
@@ -572,6 +573,7 @@ def compose_ping(report: Result) -> Iterator[Block]:
             member.get("jitter_us"),
         ]
         time_cells = ["" if time_us is None else f"{time_us:.0f}" for time_us in times_us]
+
         answers = str(member["answers"])
         rows.append(
             [member["member"], member["host"], answers, *time_cells, _describe_clock(member)]
@@ -688,6 +690,7 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
             f"{percentiles_us[key]:.0f}" if key in percentiles_us else ""
             for key in ("p50", "p99", "max")
         ]
+
         same_size = row["bytes"] == needs["sample_bytes"]
         same_rate = row["rate_hz"] == needs["rate_hz"]
         scenario_cell = scenario_name if same_size and same_rate else ""
@@ -695,6 +698,7 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
         rows.append([row["transport"], *map(str, counts), *delay_cells, scenario_cell])
     headers = ("transport", "bytes", "rate", "sent", "lost", "p50", "p99", "max", "as in")
     yield TextTable(headers, rows, align="lrrrrrrrl", units=("", "", "Hz"))
+
     yield f"{scenario_name}: {needs['words']}"
     for transport in facts["transports"]:
         mark = MARKS["ok" if transport["good"] else "fail"]
@@ -820,6 +824,7 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
     """
     if not metrics.sharing_ratios:
         return
+
     joint_header = "joint"
     unit = "N m"
     if metrics.axes:
@@ -904,6 +909,7 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
     """
     if not metrics.responses:
         return
+
     rows = []
     for response in metrics.responses:
         direction = "along" if metrics.axes else "joint"

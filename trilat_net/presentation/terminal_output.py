@@ -181,6 +181,7 @@ def print_result(result: "Result", *, as_json: bool = False, brief: bool = False
     if as_json:
         print_json(result.to_dict())
         return
+
     from .result_text import TextTable, compose
 
     for block in compose(result, brief=brief):
@@ -260,6 +261,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         with progress_lines(label) as show_lines:
             yield show_lines
         return
+
     from rich.progress import (
         BarColumn,
         Progress,

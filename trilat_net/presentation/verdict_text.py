@@ -127,6 +127,7 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
     text = "; ".join([text, *undecided_texts])
     if course.failed:
         return f"{_describe_failed(course.failed)}; {text}"
+
     reservation = ", as far as the log tells" if undecided_texts else ""
     return f"{_COVERED}{reservation}: {text}"
 

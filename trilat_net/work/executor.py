@@ -401,6 +401,9 @@ class WorkerPool:
     ) -> None:
         """Submits batches until every worker has one batch that runs and one that waits.
 
+        A batch that waits keeps the worker busy until the results of the previous batch have
+        been processed.
+
         Args:
             function: The function to run on each item.
             feed: Queue of the items.

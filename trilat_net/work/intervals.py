@@ -59,6 +59,8 @@ class MeanInterval(NamedTuple):
     def of_values(cls, values: Sequence[float | None]) -> "MeanInterval | None":
         """Returns the mean of the numbers of several runs, with its 95 % interval.
 
+        The interval says how uncertain the mean is because there are only a few runs.
+
         Args:
             values: One number per run. None stands for a run without a number.
 
@@ -69,6 +71,7 @@ class MeanInterval(NamedTuple):
         count = len(known)
         if count < 2 or count < len(values):
             return None
+
         # Imported here, because the import takes long.
         from scipy.special import stdtrit
 

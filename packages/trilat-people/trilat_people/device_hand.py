@@ -263,6 +263,7 @@ class DeviceHand:
         counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
         if not self.trips_ns:
             return counts
+
         median_ms, p99_ms = np.percentile(self.trips_ns, [50, 99]) / 1e6
         return (
             f"{counts}; from its place to the force of it "

@@ -67,6 +67,7 @@ def hand_command(
         raise UsageError(
             "a class of your own needs --scenario; a device that you hold needs --device"
         )
+
     from sites import run_hand
     from trilat_net.net import OPERATOR, default_endpoints
     from trilat_net.scenario import find_site

@@ -474,6 +474,9 @@ def _compute_coherence(phasors: Complex) -> Array:
 class _HandFit(NamedTuple):
     """Mass, damping and stiffness of a hand, fitted to measured forces and motions.
 
+    The fit finds the matrices M, B and K for which force = M acceleration + B velocity + K
+    displacement holds best.
+
     There are n axes and F frequencies.
 
     Attributes:

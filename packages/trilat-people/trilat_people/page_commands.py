@@ -82,6 +82,7 @@ def live_command(
         raise UsageError(
             "--connect, --router, --zenoh-config and --keys can be used only with --session"
         )
+
     with PageAttendant(page, clock) as attendant:
         run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
 

@@ -343,6 +343,9 @@ class SilenceNotice:
     def pop(self, topic: str, site: str) -> str:
         """Returns a notice that the robot sends no measurement, if one is due. Empty otherwise.
 
+        The user learns whether the driver of the robot is silent, or sends joints with other
+        names.
+
         Args:
             topic: Name of the topic, with its leading slash.
             site: Name of the site that waits for the robot.
@@ -350,12 +353,14 @@ class SilenceNotice:
         now_ns = self._clock.monotonic_ns()
         if now_ns < self._due_ns:
             return ""
+
         self._due_ns = now_ns + NEXT_NOTICE_NS
 
         if self._has_measurement:
             return f"no further measurement on {topic}: {site} has lost its arm"
         if not self._has_message:
             return f"no message on {topic} yet: {site} waits for its arm"
+
         text = f"no measurement on {topic} yet: {site} waits for its arm"
         if self._other_joints:
             joint_names = ", ".join(names[0] for names in self._joints)
@@ -439,6 +444,7 @@ class RobotArm:
             positions = count_nouns(len(state.position), "position")
             velocities = count_nouns(len(state.velocity), "velocity")
             raise ValueError(f"has {positions} and {velocities}")
+
         q = _check_finite([state.position[index] for index in indices])
         qd = _check_finite([state.velocity[index] for index in indices])
         with self._lock:
@@ -492,6 +498,9 @@ def _order_joints(
     safe_command: Sequence[float],
 ) -> list[int]:
     """Finds the joint of the scenario to which each joint of the controller corresponds.
+
+    A controller of a robot may list its joints in another order than the scenario, and may have
+    further joints.
 
     Args:
         joints: Names that each joint may have, in the order of the scenario.
@@ -552,6 +561,7 @@ def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
         present_names = ", ".join(state.names[:9]) or "no names"
         missing_text = ", ".join(missing_joints)
         raise ValueError(f"lacks {missing_text}; the message has {present_names}")
+
     for names in joints:
         for name in names:
             if state.names.count(name) > 1:

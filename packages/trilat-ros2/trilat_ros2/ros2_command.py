@@ -59,6 +59,7 @@ def ros2_command(
 
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro must be one of {', '.join(DISTROS)}, not {distro!r}")
+
     name = check_ros_name(options.check_session_name(session), "session")
     table = TopicTable.read(names)
     # Checked now, because the bridge would wait for a router at a wrong address forever.

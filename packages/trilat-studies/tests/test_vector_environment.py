@@ -79,6 +79,7 @@ LONG_CASES: dict[str, dict[str, Any]] = {
         "user": "m2",
         "set": {f"sites.{name}.q0_rad": [0.4, 1.2] for name in ("m1", "m2", "s")},
     },
+    "silent peers": {"set": {**BENT, "on_stale.action": "glide"}, "delay_ms": 150.0},
     "a law of its own": {"set": {**BENT, "control.law": "wave", "scheme": "digital"}},
 }
 
@@ -166,7 +167,7 @@ def test_structures_may_differ_between_episodes() -> None:
     [
         ({}, 1, "fewer than"),
         ({"scenario": "six_joints", "set": {}, "user": "m1", "duration_s": 0.1}, 4, "chains"),
-        ({"set": {**BENT, "on_stale.action": "glide"}}, 4, "glide"),
+        ({"set": {**BENT, "sites.s.rate_hz": 500}}, 4, "tick rates"),
         ({"rate_hz": 4}, 4, "lets go"),
     ],
 )

@@ -39,6 +39,7 @@ from ..aligned import (
     view_delayed_peer,
 )
 from ..dominance_history import DominanceHistory, compute_lyapunov_weights, trace_dominance
+from ..row_reductions import any_in_rows, sum_rows
 from ..torque_sources import TorqueSplit
 from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion
@@ -213,7 +214,7 @@ class SiteEnergy:
         for torque in (records.tau, records.tau_x):
             change_of_torque = np.diff(torque, axis=0)
             products = change_of_r * change_of_torque
-            amounts = records.h_s * products.sum(axis=1)
+            amounts = records.h_s * sum_rows(products)
             energy = _accumulate(amounts, self.judged)
             largest_energy = float(np.abs(energy).max())
             error_j += 2.0 * largest_energy
@@ -736,10 +737,10 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
         t_s = motion.records.t_s
         dominance = motion.dominance
         change_of_rate = np.diff(dominance.rate, axis=0, prepend=0.0)
-        ramp_rows = np.flatnonzero(change_of_rate.any(axis=1))
+        ramp_rows = np.flatnonzero(any_in_rows(change_of_rate))
 
         is_step = dominance.alpha[1:] != dominance.before
-        periods_with_step = np.flatnonzero(is_step.any(axis=1))
+        periods_with_step = np.flatnonzero(any_in_rows(is_step))
         step_rows = periods_with_step + 1
 
         times.append(t_s[ramp_rows])

@@ -45,6 +45,7 @@ from ..aligned import AlignedRecords, Bools, DelayedPeer, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
 from ..following import Following, build_following
+from ..row_reductions import any_in_rows, max_rows, sum_rows
 from ..torque_sources import TorqueSplit
 
 RATE_TOLERANCE = 1e-12
@@ -571,7 +572,7 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
         delay_terms.append(alpha * _energy_in_transit(c, peer_motion))
     return FunctionalParts(
         kinetic=0.5 * r_M_r,
-        parameter=0.5 * scaled_squares.sum(axis=1),
+        parameter=0.5 * sum_rows(scaled_squares),
         position=0.5 * e_K_e,
         delay=np.sum(delay_terms, axis=0),
     )
@@ -582,9 +583,7 @@ def _dot_rows(x: Array, y: Array) -> Array:
 
     Both arguments have the shape (K, n), or one of them (n,) if it is the same in all rows.
     """
-    products = x * y
-    sums: Array = products.sum(axis=1)
-    return sums
+    return sum_rows(x * y)
 
 
 def _energy_in_transit(constants: SiteConstants, peer_motion: DelayedPeer) -> Array:
@@ -782,8 +781,7 @@ def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
 def _weighted_square(c: SiteConstants, x: Array) -> Array:
     """Returns |x|^2 = x'Kd x, weighted with the damping gain, of every row, shape (K,)."""
     weighted_squares = c.Kd * x**2
-    square: Array = weighted_squares.sum(axis=1)
-    return square
+    return sum_rows(weighted_squares)
 
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
@@ -972,7 +970,7 @@ def _torque_limit_work(site: SiteMotion) -> Increment:
     """
     records = site.records
     power = np.zeros(len(records.known))
-    is_limited = site.limited.any(axis=1)
+    is_limited = any_in_rows(site.limited)
     rows = np.flatnonzero(is_limited | site.rests)
     if len(rows):
         difference = records.tau[rows] - site.law_torque(rows)
@@ -1096,7 +1094,7 @@ def measure_torque_error(site: SiteMotion) -> Array:
     law_torque = site.law_torque(all_rows)
     limited_torque = np.clip(law_torque, low, high)
     errors = np.abs(records.tau - limited_torque)
-    largest: Array = errors.max(axis=1)
+    largest = max_rows(errors)
     is_comparable = records.known & ~site.rests
     return np.where(is_comparable, largest, 0.0)
 
@@ -1123,7 +1121,7 @@ def _estimate_work(site: SiteMotion) -> Increment:
 
     # while a site rests, it keeps its estimates
     change = np.diff(parameter_error, axis=0)
-    is_unchanged = (change == 0.0).all(axis=1)
+    is_unchanged = ~any_in_rows(change)
     keeps_estimates = np.concatenate([[False], is_unchanged])
     is_frozen_row = keeps_estimates & site.rests
     is_frozen = is_frozen_row[:, np.newaxis]
@@ -1145,11 +1143,11 @@ def _estimate_work(site: SiteMotion) -> Increment:
     with np.errstate(divide="ignore", invalid="ignore"):
         correction_work = mean_error * correction / c.Gamma
     held_work = np.where(is_held, correction_work, 0.0)
-    jump = held_work.sum(axis=1)
+    jump = sum_rows(held_work)
 
     error_power = site.Yr * parameter_error
     fixed_power = np.where(is_fixed, error_power, 0.0)
-    power = fixed_power.sum(axis=1)
+    power = sum_rows(fixed_power)
     return _integrate_power(site, power, jump)
 
 
@@ -1215,7 +1213,7 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     qd_des_next = records.qd_des[1:]
     jump_of_rate = np.abs(ends.qd_des_right - qd_des_next)
     jumps = jump_of_e + jump_of_rate > JUMP_TOLERANCE
-    periods_with_jump = np.flatnonzero(jumps.any(axis=1))
+    periods_with_jump = np.flatnonzero(any_in_rows(jumps))
 
     e = e_right[periods_with_jump]
     ed = ed_right[periods_with_jump]
@@ -1235,7 +1233,7 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     # a torque at its rate limit, or of a resting site, does not move with a jump of e
     is_finite = np.isfinite(c.tau_rate)
     has_rate_limit = np.any(is_finite)
-    is_rate_limited = site.limited.any(axis=1) & has_rate_limit
+    is_rate_limited = any_in_rows(site.limited) & has_rate_limit
     is_unaffected = site.rests | is_rate_limited
     keeps_torque = is_unaffected[rows, np.newaxis]
     tau[periods_with_jump] = np.where(keeps_torque, tau[periods_with_jump], limited_torque)

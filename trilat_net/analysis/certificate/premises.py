@@ -37,6 +37,7 @@ from ..dominance_history import (
     list_losses,
 )
 from ..following import TaskFollowing
+from ..row_reductions import any_in_rows
 from ..timeline import find_mode_intervals, recorded_end_s
 from ..torque_sources import find_wall_energies, list_sampled_walls
 from .energy_balance import (
@@ -425,7 +426,7 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
     for site, energy in run.energies.items():
         limited = energy.motion.limited
         if limited.any():
-            ticks = int(np.count_nonzero(limited.any(axis=1)))
+            ticks = int(np.count_nonzero(any_in_rows(limited)))
             cut_off.append(CutTorque(site, _find_joints(run, site, limited), ticks))
     return Premise("torque", not cut_off, TorqueQuantities(tuple(cut_off)))
 
@@ -470,7 +471,7 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
         records = energy.motion.records
         touches_stop = energy.motion.constants.arm.stop_torque(records.q, records.qd) != 0.0
         if touches_stop.any():
-            first_row = int(np.argmax(touches_stop.any(axis=1)))
+            first_row = int(np.argmax(any_in_rows(touches_stop)))
             first_s = float(records.t_s[first_row])
             touched.append(TouchedStop(site, _find_joints(run, site, touches_stop), first_s))
     return Premise("stops", not touched, StopQuantities(tuple(touched)))
@@ -546,7 +547,7 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     push_times_s = {}
     for site, energy in energies.items():
         records = energy.motion.records
-        t_s = records.t_s[records.tau_x.any(axis=1)]
+        t_s = records.t_s[any_in_rows(records.tau_x)]
         if len(t_s):
             push_times_s[site] = t_s
 

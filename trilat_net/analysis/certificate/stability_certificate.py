@@ -31,6 +31,7 @@ from ...core import Array
 from ...hooks import find_hook
 from ...log import MIN_COVERAGE, Log
 from ...results import JsonObject, Result, finite_or_none
+from ..row_reductions import max_rows
 from ..run_end import EndBehaviour, RunEnd, Stability
 from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability
 from ..twins.twin_growth import TwinGrowth
@@ -434,7 +435,7 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
     for site, energy in run.energies.items():
         records = energy.motion.records
         error_nm = energy_terms.measure_torque_error(energy.motion)
-        largest_nm = np.abs(records.tau).max(axis=1)
+        largest_nm = max_rows(np.abs(records.tau))
         is_wrong = error_nm > TORQUE_TOLERANCE * (1.0 + largest_nm)
         if is_wrong.any():
             first_row = int(np.argmax(is_wrong))

@@ -32,6 +32,7 @@ from ...scenario import Scenario, identify_law
 from ..aligned import Bools, find_latest_rows
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector
+from ..row_reductions import any_in_rows, max_rows
 from ..run_end import STATIC_SPEED_RAD_S
 from ..run_view import RunView, SiteRun
 from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric
@@ -138,14 +139,14 @@ def _find_resting_rows(run: SiteRun) -> Bools:
         True for each such tick, shape (K,).
     """
     records = run.records
-    largest_speed = np.abs(records.qd).max(axis=1)
+    largest_speed = max_rows(np.abs(records.qd))
     is_slow = largest_speed < STATIC_SPEED_RAD_S
-    shares_change = run.dominance.rate.any(axis=1)
+    shares_change = any_in_rows(run.dominance.rate)
     resting: Bools = records.follows & is_slow & ~shares_change
     plan = run.torque.script
     # without a known plan, only the variation of the torque decides
     if plan is not None:
-        largest_change = np.abs(np.diff(plan, axis=0)).max(axis=1)
+        largest_change = max_rows(np.abs(np.diff(plan, axis=0)))
         plan_changes = largest_change > MOVING_SCRIPT_NM
         changes_after = np.append(plan_changes, False)
         changes_before = np.append(False, plan_changes)

@@ -534,5 +534,6 @@ def _report_system_error(error: Exception) -> int:
     print_error(f"{prefix}{error.strerror or error}")
     if error.errno in DISK_ERRNOS:
         return LogRefused.exit_code
+
     is_bad_name = is_invalid or error.errno == errno.ENAMETOOLONG
     return 2 if is_bad_name else 1

@@ -101,6 +101,7 @@ def scenario_check_command(
     if as_json:
         facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}
         return terminal.print_json(facts)
+
     terminal.print_texts(lines)
     return None
 
@@ -229,6 +230,7 @@ def trace_import_command(
     if as_json:
         terminal.print_json({**trace.to_dict(), "file": str(path)})
         return
+
     terminal.print_line(trace.summary())
     terminal.print_line(f"{path}: use it with --set link.model=trace --set link.file={path}")
 

@@ -247,6 +247,7 @@ def log_view_command(
     needs_rerun = full or web or save
     if not needs_rerun and find_spec("rerun") is None:
         return _open_page(files)
+
     with stage_output(save, force=force) if save is not None else nullcontext() as output_path:
         open_rerun(
             files,
@@ -261,6 +262,8 @@ def log_view_command(
 
 def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
     """Writes the files with which other viewers show a log, and prints how to use them.
+
+    A viewer then opens with the plots of all arms, which need not be arranged by hand.
 
     Args:
         file: The log, its first part, or an exported bag.

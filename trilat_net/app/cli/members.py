@@ -204,6 +204,7 @@ def record_command(
     storage.find_first_part()
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
+
     page = path.parent / "report.html"
     if concluded:
         refuse_existing(page, force=force)
@@ -260,10 +261,12 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
     if not concluded:
         return output if output is not None else Path(f"{session}.mcap")
+
     require_libraries()
 
     if output is None:
         return make_results_folder(None, session, force=False) / "run.mcap"
+
     make_folder(output.parent)
     return output
 
@@ -358,6 +361,7 @@ def replay_command(
 
     if preload < 0:
         raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
+
     selection = parse_selection(
         include=include or (),
         exclude=exclude or (),
@@ -409,6 +413,7 @@ def replay_command(
 
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
+
     if as_json:
         terminal.print_json({"session": name, **_describe_playback(outcome, speed)})
     else:
@@ -459,6 +464,7 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
     """
     if not terminal.err.is_interactive:
         return lambda _: None
+
     shown_at_ns: int | None = None
     shown_position_ns = 0
 

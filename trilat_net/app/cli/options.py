@@ -457,6 +457,7 @@ def check_picture(path: Path | None, *, force: bool) -> None:
     """
     if path is None:
         return
+
     from ...files import refuse_existing
     from ...presentation import FIGURE_FORMATS
 
@@ -464,6 +465,7 @@ def check_picture(path: Path | None, *, force: bool) -> None:
         raise UsageError(
             f"{path}: the name of a figure must end in one of .{', .'.join(FIGURE_FORMATS)}"
         )
+
     refuse_existing(path, force=force)
     if not path.parent.is_dir():
         raise UsageError(f"{path}: the folder {path.parent} does not exist")
@@ -832,6 +834,7 @@ def parse_viz_rate(text: str) -> float:
     keywords = {"off": 0.0, "full": FULL_RATE_HZ}
     if text in keywords:
         return keywords[text]
+
     try:
         rate_hz = float(text)
     except ValueError:

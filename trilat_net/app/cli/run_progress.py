@@ -42,6 +42,7 @@ def show_progress(
         with terminal.progress_bar(label) as show:
             yield show
         return
+
     clock = SystemClock()
     first_call_ns = -1  # time of the first call of `show_line`, -1 before it
     done_at_first_call = 0
@@ -68,6 +69,7 @@ def show_progress(
         has_no_remaining_time = done in (total, done_at_first_call)
         if has_no_remaining_time or finished_tenths <= printed_tenths:
             return
+
         printed_tenths = finished_tenths
         elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
         remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)

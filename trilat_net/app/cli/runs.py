@@ -66,6 +66,7 @@ def sim_command(
             path=f"sites.{chosen.outside[0]}.plant",
             source=chosen.name,
         )
+
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
 
@@ -358,6 +359,7 @@ def figure_command(
     if listed:
         _list_figures(log, as_json=as_json)
         return
+
     from ...files import refuse_link
     from ...presentation import write_figures, write_overlay
 
@@ -387,6 +389,7 @@ def figure_command(
     if as_json:
         terminal.print_json([path.as_posix() for path in paths])
         return
+
     terminal.print_paths(paths)
 
 

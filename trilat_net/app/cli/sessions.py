@@ -604,11 +604,13 @@ def set_link_command(
         table["loss"] = _parse_share(loss)
     if not table:
         raise UsageError("nothing to change: give --delay, --loss, --preset or --to KEY=VALUE")
+
     _, arrow, receiver = name.partition("->")
     if not arrow:
         raise UsageError(
             f"a link must be written as FROM->TO in quotes, as in 'm1->s', not {name!r}"
         )
+
     _send_change(context, receiver, {"link": name, "to": table})
 
 
@@ -659,6 +661,7 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     reply = RunningSession(session, connection).change(site, ChangeRequest(**change))
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
+
     terminal.print_text(reply.text)
 
 

@@ -152,6 +152,7 @@ class MessageSource:
         """
         if self.ended or not self._ahead:
             return None
+
         item = self._ahead.popleft()
         if isinstance(item, LogError):
             raise item
@@ -181,6 +182,7 @@ class MessageSource:
         """
         if self._process is None or self._ahead_bytes > AHEAD_BYTES:
             return False
+
         try:
             data = os.read(self._pipe.fileno(), READ_BYTES)
         except BlockingIOError:
@@ -193,6 +195,7 @@ class MessageSource:
                     f"{self._process.exitcode}"
                 )
             return False
+
         self._received += data
         self._unpickle_received()
         return True

@@ -101,6 +101,9 @@ class PlaybackSummary(NamedTuple):
 class Playback:
     """One playback of a log, which other programs see as a session with a name of its own.
 
+    The object replies to other programs in place of the original sites, while its `Player`
+    publishes the messages.
+
     Attributes:
         bus: Network connection of the player.
         clock: Clock of the player.

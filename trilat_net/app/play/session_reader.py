@@ -216,6 +216,8 @@ class SessionHeader:
 class _PlayedChannel:
     """A channel of a file, which numbers its messages.
 
+    The numbers tell in which order the messages of the channel are played.
+
     Args:
         topic: Topic of the channel.
         header: Description of the session. The topic is added to it if the channel is played.
@@ -286,6 +288,7 @@ class _PlayedChannel:
         if not has_number:
             # Before version 3 of the schema, events have no number. They are counted instead.
             return event_index
+
         # A new boot belongs to the next start of the site: the first one has the index 0.
         start_index = self._starts.setdefault(header.boot, len(self._starts))
         # A damaged file may contain numbers that are too large.
@@ -380,6 +383,9 @@ class SessionReader:
     def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
         """Returns the time at which a message is played, in ns after the start of the session.
 
+        A message was sent at one time and arrived at a later one. The user chooses which of the
+        two counts.
+
         Args:
             item: The message.
             epoch_ns: Start of the session, in Unix time, in ns.
@@ -406,6 +412,7 @@ class SessionReader:
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
             raise LogError(f"{path}: is an MCAP file, but not a trilat-net log")
+
         try:
             text = reader.attachments[SCENARIO].decode()
             epoch_ns = int(metadata.get("epoch_unix_ns", "0"))
@@ -495,6 +502,7 @@ def _describe_empty_selection(
     """
     if header.last_ns < header.first_ns:
         return f"{path}: contains no message"
+
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"
 
     if selection.start_ns is not None and selection.start_ns > header.last_ns:

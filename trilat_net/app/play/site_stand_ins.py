@@ -256,6 +256,9 @@ class SiteStandIns:
     def start_session(self, epoch_mono_ns: int) -> None:
         """Announces the session as running, so that recorders and viewers join it.
 
+        A site is the process that ran an arm when the log was recorded. Its identity now names
+        the time at which the playback starts.
+
         Args:
             epoch_mono_ns: Start time of the session (tick 0) on the monotonic clock, in ns.
         """

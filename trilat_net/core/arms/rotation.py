@@ -14,7 +14,7 @@ Invariant:
 import math
 
 from ..step.jit import leaf
-from ..step.vectors import Array
+from ..step.vectors import Array, choose
 from .chain import Matrix, Three, add, cross, dot, scale
 from .elementary import sincos
 
@@ -32,11 +32,10 @@ def arctan(x: float) -> float:
 
     The method is a rational function P / Q of x^2. Numbers above 0.66 are transformed first.
     """
-    offset = 0.0
-    if x > 0.66:
-        # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
-        offset = 0.25 * math.pi
-        x = (x - 1.0) / (x + 1.0)
+    # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
+    is_large = x > 0.66
+    offset = choose(is_large, 0.25 * math.pi, 0.0)
+    x = choose(is_large, (x - 1.0) / (x + 1.0), x)
     z = x * x
     P = -8.750608600031904122785e-1
     P = P * z - 1.615753718733365076637e1
@@ -61,12 +60,11 @@ def rotation_matrix(vector: Three) -> Matrix:
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
     s, c = sincos(angle)
-    # The limits of the quotients for small angles.
-    by_sine = 1.0
-    by_cosine = 0.5
-    if angle > _SMALL:
-        by_sine = s / angle
-        by_cosine = (1.0 - c) / (angle * angle)
+    # The quotients have limits for small angles.
+    has_angle = angle > _SMALL
+    divisor = choose(has_angle, angle, 1.0)
+    by_sine = choose(has_angle, s / divisor, 1.0)
+    by_cosine = choose(has_angle, (1.0 - c) / (divisor * divisor), 0.5)
     xx = by_cosine * x * x
     yy = by_cosine * y * y
     zz = by_cosine * z * z
@@ -83,6 +81,25 @@ def rotation_matrix(vector: Three) -> Matrix:
 
 
 @leaf
+def _choose_component(
+    trace: float, xx: float, yy: float, zz: float, components: tuple[float, float, float, float]
+) -> float:
+    """Returns one of four values, by the largest component of a quaternion.
+
+    Args:
+        trace: Trace of the rotation matrix.
+        xx: First number of its diagonal.
+        yy: Second number of its diagonal.
+        zz: Third number of its diagonal.
+        components: Values if w, x, y or z is the largest component.
+    """
+    by_w, by_x, by_y, by_z = components
+    by_others = choose(yy >= zz, by_y, by_z)
+    by_axis = choose(xx >= yy, choose(xx >= zz, by_x, by_others), by_others)
+    return choose(trace >= max(max(xx, yy), zz), by_w, by_axis)
+
+
+@leaf
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     """Converts a rotation matrix to a quaternion (w, v), with the scalar part w >= 0.
 
@@ -93,23 +110,23 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     yx, yy, yz = R[1]
     zx, zy, zz = R[2]
     trace = xx + yy + zz
-    if trace >= max(xx, yy, zz):
-        w = 1.0 + trace
-        v = (zy - yz, xz - zx, yx - xy)
-    elif xx >= yy and xx >= zz:
-        w = zy - yz
-        v = (1.0 + xx - yy - zz, xy + yx, xz + zx)
-    elif yy >= zz:
-        w = xz - zx
-        v = (xy + yx, 1.0 + yy - xx - zz, yz + zy)
-    else:
-        w = yx - xy
-        v = (xz + zx, yz + zy, 1.0 + zz - xx - yy)
-    x, y, z = v
+    x_difference = zy - yz
+    y_difference = xz - zx
+    z_difference = yx - xy
+    xy_sum = xy + yx
+    xz_sum = xz + zx
+    yz_sum = yz + zy
+    all_w = (1.0 + trace, x_difference, y_difference, z_difference)
+    all_x = (x_difference, 1.0 + xx - yy - zz, xy_sum, xz_sum)
+    all_y = (y_difference, xy_sum, 1.0 + yy - xx - zz, yz_sum)
+    all_z = (z_difference, xz_sum, yz_sum, 1.0 + zz - xx - yy)
+    w = _choose_component(trace, xx, yy, zz, all_w)
+    x = _choose_component(trace, xx, yy, zz, all_x)
+    y = _choose_component(trace, xx, yy, zz, all_y)
+    z = _choose_component(trace, xx, yy, zz, all_z)
     length = math.sqrt(w * w + x * x + y * y + z * z)
-    if w < 0.0:
-        length = -length
-    return w / length, scale(1.0 / length, v)
+    length = choose(w < 0.0, -length, length)
+    return w / length, scale(1.0 / length, (x, y, z))
 
 
 @leaf
@@ -125,13 +142,15 @@ def rotation_vector(R: Array | Matrix) -> Three:
     w, v = _quaternion(R)
     x, y, z = v
     square = x * x + y * y + z * z
-    sine = math.sqrt(square)
-    if sine < _SMALL:
-        return scale(2.0 / w, v)
+    n = math.sqrt(square)
     # `arctan` takes arguments up to 1.
-    half_angle = arctan(sine / w) if sine <= w else 0.5 * math.pi - arctan(w / sine)
+    is_flat = n <= w
+    part = arctan(choose(is_flat, n, w) / choose(is_flat, w, n))
+    half_angle = choose(is_flat, part, 0.5 * math.pi - part)
     angle = 2.0 * half_angle
-    return scale(angle / sine, v)
+    is_small = n < _SMALL
+    factor = choose(is_small, 2.0, angle) / choose(is_small, w, n)
+    return scale(factor, v)
 
 
 @leaf

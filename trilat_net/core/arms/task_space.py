@@ -33,7 +33,7 @@ Invariant:
 """
 
 from ..step.jit import leaf
-from ..step.vectors import Array, Row, RowArray
+from ..step.vectors import Array, Row, RowArray, choose, holds_anywhere
 from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
 from .rotation import compose_rotations, relative_rotation, rotation_matrix
 
@@ -209,6 +209,13 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 
 
 @leaf
+def _divide(number: float, pivot: float) -> float:
+    """Returns a number divided by a pivot of J J', or 0 if the pivot vanishes."""
+    has_pivot = pivot > TINY
+    return choose(has_pivot, number / choose(has_pivot, pivot, 1.0), 0.0)
+
+
+@leaf
 def _factor(s: Row, damping: float) -> None:
     """Factors the matrix J J' + damping I as L D L', so that `_solve` can divide by it.
 
@@ -242,8 +249,7 @@ def _factor(s: Row, damping: float) -> None:
                 product = A[j, p] * A[k, p]
                 entry -= product * pivot
             if k < j:
-                pivot = A[k, k]
-                entry = entry / pivot if pivot > TINY else 0.0
+                entry = _divide(entry, A[k, k])
             A[j, k] = entry
 
 
@@ -264,11 +270,8 @@ def _solve(s: Row, b: Array, y: Array) -> None:
         y[j] = b[j]
         for k in range(j):
             y[j] -= A[j, k] * y[k]
-
-    # Divide by D, and substitute backwards.
     for j in range(coordinates - 1, -1, -1):
-        pivot = A[j, j]
-        y[j] = y[j] / pivot if pivot > TINY else 0.0
+        y[j] = _divide(y[j], A[j, j])
         for k in range(j + 1, coordinates):
             y[j] -= A[k, j] * y[k]
 
@@ -296,13 +299,11 @@ def _factor_damped(s: Row) -> None:
 
     _factor(s, 0.0)
     limit = s.singular_value * s.singular_value
-    trace = 0.0
+    trace = 0.0 * limit  # zero, also as one number for each of several runs
     for j in range(s.shared):
-        pivot = s.A[j, j]
-        is_singular = not pivot > TINY  # also for NaN
-        if is_singular:
-            # The true trace is infinite. This value makes the lower bound practically zero.
-            trace = 1.0 / TINY
+        # With a pivot that vanishes or is NaN, the true trace is infinite. This value makes the
+        # lower bound practically zero.
+        trace = choose(s.A[j, j] > TINY, trace, 1.0 / TINY)
         # Solving for a unit vector gives a column of the inverse.
         for k in range(s.shared):
             s.b[k] = 1.0 if k == j else 0.0
@@ -310,10 +311,12 @@ def _factor_damped(s: Row) -> None:
         diagonal = s.y[j]
         trace += diagonal * s.axes[j]
 
-    lower_bound = 1.0 / trace if trace > 0.0 else limit
-    if lower_bound < limit:
-        damping = limit - lower_bound
-        _factor(s, damping)
+    has_trace = trace > 0.0
+    lower_bound = choose(has_trace, 1.0 / choose(has_trace, trace, 1.0), limit)
+    is_near_singular = lower_bound < limit
+    if holds_anywhere(is_near_singular):
+        # Without damping, the factors stay the same.
+        _factor(s, choose(is_near_singular, limit - lower_bound, 0.0))
 
 
 @leaf

@@ -202,7 +202,7 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 
 
 @leaf
-def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
+def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
     """Turns the torque of the control law into the torque that the motors get.
 
     This is the last part of stage 6 of a tick, after the law has written the torque `tau`. The
@@ -526,6 +526,32 @@ def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
 
 
 @leaf
+def error_stages(
+    k: int,
+    t_ns: int,
+    s: SiteRow,
+    chain: RowArray | None,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> None:
+    """Computes tracking errors, parameter estimate and external torque (stages 4 and 5).
+
+    Args:
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        s: State of the site (the process that runs the arm), with the reference; written.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments.
+    """
+    # 4 errors
+    _update_errors(s, chain)
+    # 5 estimate
+    _update_estimate(k, s, chain)
+    _update_external_torque(t_s=t_ns * 1e-9, s=s, chain=chain, actors=actors, table=table)
+
+
+@leaf
 def reference_stages(
     k: int,
     t_ns: int,
@@ -557,11 +583,7 @@ def reference_stages(
     update_reference(t_ns, s, links, ramps)
     _place_arm(s, chain, links, True)
     guard_reference(k, t_ns, s, links)
-    # 4 errors
-    _update_errors(s, chain)
-    # 5 estimate
-    _update_estimate(k, s, chain)
-    _update_external_torque(t_s=t_ns * 1e-9, s=s, chain=chain, actors=actors, table=table)
+    error_stages(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)
 
 
 @leaf
@@ -614,26 +636,21 @@ def sense_stages(
 
 
 @leaf
-def emit_stages(k: int, t_ns: int, s: SiteRow, chain: RowArray | None, record: Array) -> None:
-    """Limits the torque of the law, and writes the record (stages 6 and 7).
+def emit_stage(s: SiteRow, record: Array) -> None:
+    """Writes the record of a tick, stage 7.
 
     If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the rule
     `glide` the arm comes to rest instead, see `session_life`.
 
     Args:
-        k: Number of the tick, a period of the control loop.
-        t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm), with the torque of the law;
+        s: State of the site (the process that runs the arm), with the torque of the motors;
             written.
-        chain: Data of the joints, one row per joint. None for the planar two-link arm.
         record: Receives the floating-point numbers of the record, the results of the tick.
     """
-    _guard_torque(k, t_ns, s, chain)
     for i in range(s.joints):
         is_within_limit = abs(s.qd[i]) <= s.qd_limit[i]  # False for NaN
         if s.on_stale != _GLIDE and not is_within_limit:
             s.mode = _DIVERGED
-    # 7 emit
     _write_record(s, record)
 
 
@@ -650,7 +667,7 @@ def act_stages(
     """Computes the part of a control period that follows the control law.
 
     The torque is limited, the record is written, and the arm moves to the next period (stages 6
-    to 8). See `emit_stages` for a joint that is faster than its limit.
+    to 8). See `emit_stage` for a joint that is faster than its limit.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -663,7 +680,9 @@ def act_stages(
         record: Receives the floating-point numbers of the record, the results of the tick.
     """
     s: SiteRow = site[0]
-    emit_stages(k=k, t_ns=t_ns, s=s, chain=chain, record=record)
+    guard_torque(k, t_ns, s, chain)
+    # 7 emit
+    emit_stage(s, record)
     # 8 advance
     if s.mode != _DIVERGED:
         _advance(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)

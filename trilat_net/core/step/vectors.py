@@ -91,6 +91,15 @@ def choose(condition: bool, if_true: float, if_false: float) -> float:
 
 
 @leaf
+def holds_anywhere(condition: bool) -> bool:
+    """Returns the condition. With the numbers of several runs, it must hold in one of them.
+
+    Compiled code may skip an operation if no run needs it, see `choose`.
+    """
+    return condition
+
+
+@leaf
 def round_down(number: float) -> float:
     """Returns the largest whole number that is not above a number."""
     return float(np.floor(number))

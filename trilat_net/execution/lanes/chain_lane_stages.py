@@ -15,32 +15,38 @@ from collections.abc import Callable
 from typing import Any
 
 from ...core import (
+    POSE,
     Array,
     IntArray,
+    Law,
+    StaleAction,
     TorqueTable,
     adapts,
-    add_task_torque,
     chain_stages,
-    emit_stages,
+    emit_stage,
     finish_advance,
+    first_sent_column,
     guard_reference,
+    guard_torque,
     hold_motor_torque,
     lane_leaf,
     place_joints,
     set_lane_form,
     sum_trapezoid,
+    task_space,
     update_peaks,
-    update_pose,
     update_reference,
     update_sums,
-    update_task_errors,
     updates_estimate,
 )
 from ...records import Mode
+from .lane_laws import compute_law
 from .lane_rows import LaneRow, RowsInLane, in_lane
-from .lane_vectors import GROUP, RowInGroup, in_group
+from .lane_vectors import GROUP, in_group
 
 _DIVERGED = int(Mode.DIVERGED)
+_USER = int(Law.USER)
+_GLIDE = int(StaleAction.GLIDE)
 
 
 def _place_nothing(_chain: Any, _q: Any) -> None:
@@ -77,23 +83,22 @@ def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     return _put_no_gravity if is_one_lane else dispatcher.py_func
 
 
-def _skip_pose(_s: Any, _chain: Any) -> None:
-    """Does nothing in place of `update_pose`: runs in task space are not computed together."""
+def _skip(_s: Any) -> None:
+    """Version of a function with one argument that does nothing."""
 
 
-def _skip_task_errors(_s: Any) -> None:
-    """Does nothing in place of `update_task_errors`, which only runs in task space need."""
+def _skip_two(_s: Any, _rows: Any) -> None:
+    """Version of a function with two arguments that does nothing."""
 
 
 def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torque: Any) -> None:
-    """Does nothing in place of `add_task_torque`, which only runs in task space need."""
+    """Version of `add_task_torque` that does nothing."""
 
 
-def _skip_group(function: Any, skipped: Callable[..., None]) -> None:
-    """Makes the compiler leave out a function when it compiles code for eight runs at once.
+def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
+    """Leaves out a function of task space if runs have none, as Numba types all branches.
 
-    Functions of task space are never called in such runs. But the compiler also compiles
-    branches that are never taken, and it cannot compile these functions for eight runs.
+    Functions of task space are called for eight runs only.
 
     Args:
         function: The function, whose first argument is the state of a site (arm controller).
@@ -101,15 +106,30 @@ def _skip_group(function: Any, skipped: Callable[..., None]) -> None:
     """
 
     def choose_form(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-        is_group = isinstance(argument_types[0], RowInGroup)
-        return skipped if is_group else function.py_func
+        site = argument_types[0]
+        is_skipped = isinstance(site, LaneRow) or site.find_constant("task") == 0
+        return skipped if is_skipped else function.py_func
 
     set_lane_form(function, choose_form)
 
 
-_skip_group(update_pose, _skip_pose)
-_skip_group(update_task_errors, _skip_task_errors)
-_skip_group(add_task_torque, _skip_task_torque)
+def _choose_model(argument_types: tuple[Any, ...]) -> Callable[..., None]:
+    """Returns the version of `update_model`, which only users' laws need.
+
+    The model is computed for eight runs at a time.
+    """
+    dispatcher: Any = chain_stages.update_model
+    site = argument_types[0]
+    is_skipped = isinstance(site, LaneRow) or site.find_constant("law") != _USER
+    return _skip_two if is_skipped else dispatcher.py_func
+
+
+_skip_without_task(task_space.update_pose, _skip_two)
+_skip_without_task(task_space.update_task_errors, _skip)
+_skip_without_task(task_space.update_orientation_reference, _skip_two)
+_skip_without_task(task_space.update_wrench, _skip)
+_skip_without_task(task_space.add_task_torque, _skip_task_torque)
+set_lane_form(chain_stages.update_model, _choose_model)
 set_lane_form(place_joints, _choose_place)
 set_lane_form(chain_stages.put_gravity_torque, _choose_gravity)
 
@@ -135,14 +155,14 @@ def advance_chain_site(
     sums: Any,
     progress: Any,
     _scratch: Any,
-    _law: Any,
-    _received: Any,
-    _sent: Any,
-    _code: Any,
+    law: Any,
+    received: Any,
+    sent: Any,
+    code: Any,
     chain: Any,
     states: Array,
     used: IntArray,
-    _columns: IntArray,
+    columns: IntArray,
     table: TorqueTable,
 ) -> None:
     """Computes one tick of a site for several runs, see `advance_site`.
@@ -168,9 +188,14 @@ def advance_chain_site(
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
+        law: Row with the numbers of the site's compiled law.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that the law sends.
+        code: Stands for the code of the law, see `LawCode`.
         chain: Rows of the joints.
         states: The latest states of all sites, see `advance_site`.
         used: Sample in use by peer, lane and tick of a block; -1: none yet.
+        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
     groups = (lanes + GROUP - 1) // GROUP
@@ -178,18 +203,34 @@ def advance_chain_site(
     # 2 release: the state of each peer that is in use
     for lane in range(lanes):
         rows = in_lane(links, lane)
-        joints = in_lane(site, lane)[0].joints
+        s = in_lane(site, lane)[0]
+        shared = s.shared
         for p in range(rows.shape[0]):
             link = rows[p]
             sample = used[p, lane, block_row]
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
+            if s.law == _USER or s.on_stale == _GLIDE:
+                link.new = sample > link.used
+                link.used_ns = t_ns if sample > link.used else link.used_ns
             link.used = sample
-            for c in range(joints):
+            for c in range(shared):
                 link.q[c] = states[peer, page, lane, c]
-                link.qd[c] = states[peer, page, lane, joints + c]
-                link.tau_x[c] = states[peer, page, lane, 2 * joints + c]
+                link.qd[c] = states[peer, page, lane, shared + c]
+                link.tau_x[c] = states[peer, page, lane, 2 * shared + c]
+
+    for p in range(columns.shape[0]):
+        peer = p if p < i else p + 1
+        for c in range(columns.shape[1]):
+            column = columns[p, c]
+            for lane in range(lanes):
+                sample = used[p, lane, block_row]
+                number = 0.0
+                if sample >= 0 and column >= 0:
+                    first_sent = 3 * in_lane(site, lane)[0].shared
+                    number = states[peer, sample & (pages - 1), lane, first_sent + column]
+                in_lane(received, lane)[p].numbers[c] = number
 
     # 3 reference
     for lane in range(lanes):
@@ -200,7 +241,10 @@ def advance_chain_site(
             in_lane(ramps, lane)[0].rows,
         )
     for group in range(groups):
-        chain_stages.place_chain(in_group(site, group)[0], in_group(chain, group))
+        group_site = in_group(site, group)[0]
+        chain_stages.place_chain(group_site, in_group(chain, group))
+        if group_site.task and group_site.shared == POSE:
+            task_space.update_orientation_reference(group_site, in_group(links, group))
     for lane in range(lanes):
         guard_reference(k, t_ns, in_lane(site, lane)[0], in_lane(links, lane))
 
@@ -208,10 +252,16 @@ def advance_chain_site(
     for group in range(groups):
         group_site = in_group(site, group)[0]
         chain_stages.update_errors(group_site, in_group(chain, group))
-        if updates_estimate(k, group_site):
+        if group_site.on_stale != _GLIDE and updates_estimate(k, group_site):
             sum_trapezoid(group_site)
             half_s = 0.5 / group_site.rate_hz
             chain_stages.advance_estimate(group_site, half_s, group_site.Yr_before)
+    if in_lane(site, 0)[0].on_stale == _GLIDE:
+        for lane in range(lanes):
+            s = in_lane(site, lane)[0]
+            if updates_estimate(k, s) and adapts(s):
+                sum_trapezoid(s)
+                chain_stages.advance_estimate(s, 0.5 / s.rate_hz, s.Yr_before)
     t_s = t_ns * 1e-9
     for lane in range(lanes):
         chain_stages.update_external_torque(
@@ -224,17 +274,52 @@ def advance_chain_site(
 
     # 6 torque, 7 emit
     for group in range(groups):
-        chain_stages.update_torque(in_group(site, group)[0], in_group(chain, group))
+        group_site = in_group(site, group)[0]
+        if group_site.task:
+            task_space.update_wrench(group_site)
+        if group_site.law != _USER:
+            chain_stages.update_torque(group_site, in_group(chain, group))
+        elif group_site.theta_known != 0:
+            chain_stages.update_model(group_site, in_group(chain, group))
+    for lane in range(lanes):
+        compute_law(
+            code,
+            k,
+            t_ns,
+            in_lane(site, lane),
+            in_lane(links, lane),
+            in_lane(chain, lane),
+            in_lane(law, lane),
+            in_lane(received, lane),
+            in_lane(sent, lane),
+        )
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         floats = in_lane(record, lane)[record_row].floats
-        emit_stages(k=k, t_ns=t_ns, s=s, chain=in_lane(chain, lane), record=floats)
+        guard_torque(k, t_ns, s, in_lane(chain, lane))
+        emit_stage(s, floats)
         joints = s.joints
+        shared = s.shared
         page = k & (pages - 1)
-        for c in range(joints):
-            states[i, page, lane, c] = floats[c]
-            states[i, page, lane, joints + c] = floats[joints + c]
-            states[i, page, lane, 2 * joints + c] = floats[5 * joints + c]
+        q_column = 0
+        qd_column = joints
+        tau_x_column = 3 * joints + 2 * shared
+        if s.task:
+            q_column = first_sent_column(s) - 3 * shared
+            qd_column = q_column + shared
+            tau_x_column = qd_column + shared
+        for c in range(shared):
+            states[i, page, lane, c] = floats[q_column + c]
+            states[i, page, lane, shared + c] = floats[qd_column + c]
+            states[i, page, lane, 2 * shared + c] = floats[tau_x_column + c]
+
+    for c in range(in_lane(site, 0)[0].sent):
+        for lane in range(lanes):
+            s = in_lane(site, lane)[0]
+            number = in_lane(sent, lane)[0].numbers[c]
+            floats = in_lane(record, lane)[record_row].floats
+            floats[first_sent_column(s) + c] = number
+            states[i, k & (pages - 1), lane, 3 * s.shared + c] = number
 
     # 8 advance
     h_s = 1.0 / in_lane(site, 0)[0].rate_hz

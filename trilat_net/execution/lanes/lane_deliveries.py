@@ -8,8 +8,8 @@ before the arms move. Random numbers are then drawn for many samples in one call
 Example: with a delay of 3 ticks, tick 10 uses sample 7, whatever the arms do.
 
 Invariant:
-    - The samples in use are those of `accept_sample` and `release_sample`, if all sites have
-      the same tick rate and each sample arrives at the first tick after it was sent.
+    - The samples in use are those of `accept_sample` and `release_sample`, if each sample
+      arrives at the first tick of the receiver after it was sent.
 """
 
 from collections.abc import Sequence
@@ -23,6 +23,7 @@ from ...core import (
     LINK_MODEL_DTYPE,
     LOSS,
     LOST,
+    MAX_ARRIVALS,
     Array,
     ChannelArrays,
     DelayKind,
@@ -57,6 +58,8 @@ from ...core import (
 
 BLOCK_TICKS = 500
 """Number of ticks whose deliveries are computed together."""
+_MOST_SAMPLES = BLOCK_TICKS + MAX_ARRIVALS + 2
+"""Largest number of samples of a link in a block, if the sender has a higher tick rate."""
 _CONSTANT = int(DelayKind.CONSTANT)
 _UNIFORM = int(DelayKind.UNIFORM)
 
@@ -86,13 +89,15 @@ class LinkStates(NamedTuple):
     Attributes:
         links: States of the links, shape (L, N, P), see `LinkRow`.
         models: Models of delay and loss, shape (L, N, P, M).
-        points: Recorded delays (traces) and outages of each run, shape (L, n, 2).
-        releases: For each tick, the newest sample that comes into use in this tick, or -1,
-            shape (L, N, P, R). It is a ring buffer, and R is a power of two.
-        newest: Sample in use in the last computed tick, or -1, shape (L, N, P).
-        uniforms: Memory for two random numbers of each sample of a block.
-        delays_us: Memory for the delay of each sample of a block, us.
-        stamps_ns: Memory for the time stamp of each sample of a block, ns.
+        points: Traces and outages of each run, shape (L, n, 2).
+        releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
+            R), a ring buffer. R is a power of two.
+        newest: Sample in use at the last tick, or -1, shape (L, N, P).
+        uniforms: Room for two random numbers of each sample of a block.
+        delays_us: Room for the delay of each sample of a block, us.
+        stamps_ns: Room for the stamp of each sample of a block, ns.
+        times_ns: Room for the nominal time of each tick of a block, ns.
+        made: Room for the number of samples that a peer has made at each tick of a block.
     """
 
     links: RowArray
@@ -103,6 +108,8 @@ class LinkStates(NamedTuple):
     uniforms: Array
     delays_us: IntArray
     stamps_ns: IntArray
+    times_ns: IntArray
+    made: IntArray
 
 
 def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
@@ -131,9 +138,11 @@ def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
         points=points,
         releases=np.full((len(tables), sites, peers, kept), -1),
         newest=np.full((len(tables), sites, peers), -1),
-        uniforms=np.zeros((2, BLOCK_TICKS)),
-        delays_us=np.zeros(BLOCK_TICKS, np.int64),
-        stamps_ns=np.zeros(BLOCK_TICKS, np.int64),
+        uniforms=np.zeros((2, _MOST_SAMPLES)),
+        delays_us=np.zeros(_MOST_SAMPLES, np.int64),
+        stamps_ns=np.zeros(_MOST_SAMPLES, np.int64),
+        times_ns=np.zeros(BLOCK_TICKS, np.int64),
+        made=np.zeros(BLOCK_TICKS, np.int64),
     )
 
 
@@ -152,6 +161,15 @@ def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
         releases=states.releases[chosen],
         newest=states.newest[chosen],
     )
+
+
+@leaf
+def _constant_delay_ns(model: Row) -> int:
+    """Returns the time from the stamp of a sample to its use, on a link that only delays.
+
+    A sample is never used at the time when it was sent.
+    """
+    return int(max(max(clamp_delay_us(model.location), model.playout_us) * 1000, 1))
 
 
 @leaf
@@ -185,8 +203,7 @@ def _use_after_constant_delay(
     Returns:
         The sample in use at the end of the block.
     """
-    delay_ns = max(clamp_delay_us(model.location), model.playout_us) * 1000
-    wait = first_tick_at(max(delay_ns, 1), rate_hz)
+    wait = first_tick_at(_constant_delay_ns(model), rate_hz)
     for index in range(count):
         used[index] = max(first + index - wait, -1)
     return int(max(first + count - 1 - wait, -1))
@@ -262,6 +279,7 @@ def _release_samples(
     first: int,
     count: int,
     rate_hz: int,
+    least_release: int,
     fresh: bool,
     stamps_ns: IntArray,
     link: LinkRow,
@@ -278,7 +296,8 @@ def _release_samples(
     Args:
         first: Index of the first sample.
         count: Number of samples.
-        rate_hz: Tick rate of both sites, Hz.
+        rate_hz: Tick rate of the receiver, Hz.
+        least_release: First tick that can still use a sample.
         fresh: True if the first sample is the first one of the model.
         stamps_ns: Stamps of the samples, ns since the epoch.
         link: Row of the link; changed.
@@ -340,9 +359,89 @@ def _release_samples(
             if due_ns == LOST:
                 continue
         # A sample is never used at the time when it was sent.
-        release = first_tick_at(max(due_ns, stamp_ns + 1), rate_hz)
+        release = max(first_tick_at(max(due_ns, stamp_ns + 1), rate_hz), least_release)
         # Later samples are newer.
         releases[release & mask] = sample
+
+
+@leaf
+def _release_all_samples(
+    first_sample: int,
+    end_sample: int,
+    rate_hz: int,
+    least_release: int,
+    link: LinkRow,
+    models: RowArray,
+    points: Points,
+    releases: IntArray,
+    states: LinkStates,
+    draws: DrawAddresses,
+) -> None:
+    """Computes in which ticks samples are released, each delayed by the model of its time.
+
+    Args:
+        first_sample: Index of the first sample, whose stamp is `states.stamps_ns[0]`.
+        end_sample: Index after that of the last sample.
+        rate_hz: Tick rate of the receiver, Hz.
+        least_release: First tick that can still use a sample.
+        link: Row of the link; changed.
+        models: Models of the link.
+        points: Traces and outages.
+        releases: Newest sample that each tick releases, a ring buffer; changed.
+        states: Contains the stamps, and provides room for random numbers.
+        draws: Functions that draw random numbers.
+    """
+    sample = first_sample
+    while sample < end_sample:
+        stamps_ns = states.stamps_ns[sample - first_sample :]
+        fresh = select_model(sample, stamps_ns[0], link, models)
+        model: Row = models[link.model]
+        model_end = end_sample
+        if link.model + 1 < link.models:
+            following_ns = models[link.model + 1].from_ns
+            # The first sample with this stamp or a later one belongs to the next model.
+            following = first_tick_at(following_ns, link.rate_hz)
+            model_end = min(end_sample, max(following, sample + 1))
+        _release_samples(
+            first=sample,
+            count=model_end - sample,
+            rate_hz=rate_hz,
+            least_release=least_release,
+            fresh=fresh,
+            stamps_ns=stamps_ns,
+            link=link,
+            model=model,
+            points=points,
+            releases=releases,
+            states=states,
+            draws=draws,
+        )
+        sample = model_end
+
+
+@leaf
+def _use_released_samples(
+    first: int, count: int, newest: int, releases: IntArray, used: IntArray
+) -> int:
+    """Finds the samples in use from the ticks in which samples are released.
+
+    Args:
+        first: First tick of the block.
+        count: Number of ticks.
+        newest: Sample in use before the block, or -1.
+        releases: Newest sample that each tick releases, a ring buffer; the ticks are emptied.
+        used: Written, one entry per tick.
+
+    Returns:
+        The sample in use at the end of the block.
+    """
+    mask = releases.shape[0] - 1
+    for index in range(count):
+        page = (first + index) & mask
+        newest = max(newest, releases[page])
+        releases[page] = -1
+        used[index] = newest
+    return newest
 
 
 @leaf
@@ -377,39 +476,20 @@ def _use_samples_of_link(
     Returns:
         The sample in use at the end of the block.
     """
-    mask = releases.shape[0] - 1
     # Sample k - 1 arrives at tick k.
-    first_sample = max(first - 1, 0)
-    sample = first_sample
-    end = first + count - 1
-    while sample < end:
-        fresh = select_model(sample, tick_ns(sample, rate_hz), link, models)
-        model: Row = models[link.model]
-        model_end = end
-        if link.model + 1 < link.models:
-            following_ns = models[link.model + 1].from_ns
-            # The first sample with this stamp or a later one belongs to the next model.
-            model_end = min(end, max(first_tick_at(following_ns, rate_hz), sample + 1))
-        _release_samples(
-            first=sample,
-            count=model_end - sample,
-            rate_hz=rate_hz,
-            fresh=fresh,
-            stamps_ns=states.stamps_ns[sample - first_sample :],
-            link=link,
-            model=model,
-            points=points,
-            releases=releases,
-            states=states,
-            draws=draws,
-        )
-        sample = model_end
-    for index in range(count):
-        page = (first + index) & mask
-        newest = max(newest, releases[page])
-        releases[page] = -1
-        used[index] = newest
-    return newest
+    _release_all_samples(
+        first_sample=max(first - 1, 0),
+        end_sample=first + count - 1,
+        rate_hz=rate_hz,
+        least_release=first,
+        link=link,
+        models=models,
+        points=points,
+        releases=releases,
+        states=states,
+        draws=draws,
+    )
+    return _use_released_samples(first, count, newest, releases, used)
 
 
 @leaf
@@ -476,10 +556,139 @@ def use_samples(
 
 
 @leaf
+def _use_after_delay(
+    count: int, delay_ns: int, rate_hz: int, newest: int, states: LinkStates, used: IntArray
+) -> int:
+    """Finds the samples in use on a link with a constant delay between different tick rates.
+
+    Args:
+        count: Number of ticks.
+        delay_ns: Time from the stamp of a sample to its use, ns.
+        rate_hz: Tick rate of the peer, Hz.
+        newest: Sample in use before the block, or -1.
+        states: Contains for each tick its time and the number of samples that the peer has
+            made.
+        used: Written, one entry per tick.
+
+    Returns:
+        The sample in use at the end of the block.
+    """
+    next_ns = tick_ns(newest + 1, rate_hz) + delay_ns
+    for index in range(count):
+        while next_ns <= states.times_ns[index] and newest + 1 < states.made[index]:
+            newest += 1
+            next_ns = tick_ns(newest + 1, rate_hz) + delay_ns
+        used[index] = newest
+    return newest
+
+
+@leaf
+def use_samples_of_rates(
+    first: IntArray,
+    end: IntArray,
+    rates_hz: IntArray,
+    next_samples: IntArray,
+    ended: IntArray,
+    states: LinkStates,
+    draws: DrawAddresses,
+    used: IntArray,
+) -> int:
+    """Computes the same as `use_samples` for sites whose tick rates differ.
+
+    The block contains the ticks of all sites in an interval of time. A site makes its tick
+    before a later tick of another site.
+
+    Args:
+        first: First tick of each site in the block, shape (N,).
+        end: Tick of each site after the block, shape (N,).
+        rates_hz: Tick rates, Hz, shape (N,).
+        next_samples: Next sample that each site accepts from each peer, shape (N, P); changed.
+        ended: See `use_samples`.
+        states: State of the links of the runs; changed.
+        draws: Functions that draw random numbers.
+        used: Written, see `use_samples`. The ticks are counted from `first`.
+
+    Returns:
+        The largest age of a sample in use, see `use_samples`, in ticks of its sender.
+    """
+    largest_age = 0
+    for i in range(states.links.shape[1]):
+        count = end[i] - first[i]
+        if count == 0:
+            # The peers go on, and all samples since the one in use are kept.
+            for p in range(states.links.shape[2]):
+                j = p if p < i else p + 1
+                for lane in range(states.links.shape[0]):
+                    if ended[lane] < 0:
+                        age = end[j] - 1 - states.newest[lane, i, p]
+                        largest_age = max(largest_age, age)
+            continue
+        rate_hz = rates_hz[i]
+        for index in range(count):
+            states.times_ns[index] = tick_ns(first[i] + index, rate_hz)
+        last_ns = states.times_ns[count - 1]
+        for p in range(states.links.shape[2]):
+            # The peers of a site are all other sites, in scenario order.
+            j = p if p < i else p + 1
+            peer_hz = rates_hz[j]
+            first_sample = next_samples[i, p]
+            # A sample arrives after the time at which it was sent.
+            end_sample = max(min(first_tick_at(last_ns, peer_hz), end[j]), first_sample)
+            next_samples[i, p] = end_sample
+            for index in range(end_sample - first_sample):
+                states.stamps_ns[index] = tick_ns(first_sample + index, peer_hz)
+            made = first_tick_at(states.times_ns[0] + 1, peer_hz)
+            for index in range(count):
+                while tick_ns(made, peer_hz) <= states.times_ns[index]:
+                    made += 1
+                # The peer may be ahead: a tick may be planned after later ticks of the peer.
+                states.made[index] = max(min(made, end[j]), first[j])
+            for lane in range(states.links.shape[0]):
+                if ended[lane] >= 0:
+                    continue
+                link: LinkRow = states.links[lane, i, p]
+                model: Row = states.models[lane, i, p, 0]
+                newest = states.newest[lane, i, p]
+                if _is_constant(link, model):
+                    newest = _use_after_delay(
+                        count,
+                        _constant_delay_ns(model),
+                        peer_hz,
+                        newest,
+                        states,
+                        used[i, p, lane],
+                    )
+                else:
+                    releases = states.releases[lane, i, p]
+                    _release_all_samples(
+                        first_sample=first_sample,
+                        end_sample=end_sample,
+                        rate_hz=rate_hz,
+                        least_release=first[i],
+                        link=link,
+                        models=states.models[lane, i, p],
+                        points=states.points[lane],
+                        releases=releases,
+                        states=states,
+                        draws=draws,
+                    )
+                    newest = _use_released_samples(
+                        first[i], count, newest, releases, used[i, p, lane]
+                    )
+                states.newest[lane, i, p] = newest
+                # Before the next tick of the site, the peer goes on to the end of the block.
+                largest_age = max(largest_age, end[j] - 1 - newest)
+                for index in range(count):
+                    age = states.made[index] - 1 - used[i, p, lane, index]
+                    largest_age = max(largest_age, age)
+    return largest_age
+
+
+@leaf
 def use_recorded_samples(
-    first: int,
-    count: int,
-    rate_hz: int,
+    first: IntArray,
+    end: IntArray,
+    rates_hz: IntArray,
     feed: ReplayedInputs,
     links: RowArray,
     models: RowArray,
@@ -493,9 +702,9 @@ def use_recorded_samples(
     """Computes the same as `use_samples` for a run from a log, in which all arrivals are known.
 
     Args:
-        first: First tick of the block.
-        count: Number of ticks.
-        rate_hz: Tick rate of all sites, Hz.
+        first: First tick of each site in the block, shape (N,).
+        end: Tick of each site after the block, shape (N,).
+        rates_hz: Tick rates, Hz, shape (N,).
         feed: Inputs of the recorded run.
         links: Rows of the links, shape (N, P); changed.
         models: Models of the links, shape (N, P, M).
@@ -505,24 +714,26 @@ def use_recorded_samples(
         points: Traces and outages.
         channel: Numbers that laws receive, or None; changed.
         state: Any numbers, at least as many as a site sends.
-        used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks).
+        used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks). The ticks are
+            counted from `first`.
 
     Returns:
-        The largest age of a sample in use, ticks, see `use_samples`.
+        The largest age of a sample in use, in ticks of its sender, see `use_samples_of_rates`.
     """
     largest_age = 0
-    for index in range(count):
-        k = first + index
-        for i in range(links.shape[0]):
-            for p in range(links.shape[1]):
-                link = LinkArrays(
-                    state=links[i, p : p + 1],
-                    models=models[i, p],
-                    dues=dues[i, p],
-                    calendar=calendars[i, p],
-                    points=points,
-                    channel=channel_of(channel_of(channel, i), p),
-                )
+    for i in range(links.shape[0]):
+        rate_hz = rates_hz[i]
+        for p in range(links.shape[1]):
+            link = LinkArrays(
+                state=links[i, p : p + 1],
+                models=models[i, p],
+                dues=dues[i, p],
+                calendar=calendars[i, p],
+                points=points,
+                channel=channel_of(channel_of(channel, i), p),
+            )
+            peer = p if p < i else p + 1
+            for k in range(first[i], end[i]):
                 for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
                     accept_sample(
                         k=k,
@@ -536,16 +747,21 @@ def use_recorded_samples(
                     )
                 release_sample(k, rate_hz, link)
                 sample = links[i, p].used
-                used[i, p, 0, index] = sample
-                largest_age = max(largest_age, k - sample)
+                used[i, p, 0, k - first[i]] = sample
+                made = first_tick_at(tick_ns(k, rate_hz) + 1, rates_hz[peer])
+                made = max(min(made, end[peer]), first[peer])
+                largest_age = max(largest_age, made - 1 - sample)
+            # Before the next tick of the site, the peer goes on to the end of the block.
+            largest_age = max(largest_age, end[peer] - 1 - links[i, p].used)
     return largest_age
 
 
 @leaf
 def repeat_deliveries(
-    first: int,
-    end: int,
-    rate_hz: int,
+    first: IntArray,
+    end: IntArray,
+    rates_hz: IntArray,
+    next_samples: IntArray,
     links: RowArray,
     models: RowArray,
     dues: IntArray,
@@ -565,9 +781,10 @@ def repeat_deliveries(
     overwritten long ago have the wrong content, but the right index.
 
     Args:
-        first: First tick.
-        end: Tick before which the links stop.
-        rate_hz: Tick rate of all sites, Hz.
+        first: First tick of each site, shape (N,).
+        end: Tick of each site before which its links stop, shape (N,).
+        rates_hz: Tick rates, Hz, shape (N,).
+        next_samples: Next sample that each site accepts from each peer, shape (N, P); changed.
         links: Rows of the links before the first tick, shape (N, P); changed.
         models: Models of the links, shape (N, P, M).
         dues: Due times, shape (N, P, D); changed.
@@ -579,28 +796,34 @@ def repeat_deliveries(
             shape (N, R + 1, width). The state of tick k is at k modulo R. R is a power of two.
     """
     mask = states.shape[1] - 2
-    for k in range(first, end):
-        for i in range(links.shape[0]):
-            for p in range(links.shape[1]):
-                link = LinkArrays(
-                    state=links[i, p : p + 1],
-                    models=models[i, p],
-                    dues=dues[i, p],
-                    calendar=calendars[i, p],
-                    points=points,
-                    channel=channel_of(channel_of(channel, i), p),
-                )
-                if k > 0:
-                    peer = p if p < i else p + 1
-                    state = states[peer, (k - 1) & mask]
+    for i in range(links.shape[0]):
+        rate_hz = rates_hz[i]
+        for p in range(links.shape[1]):
+            link = LinkArrays(
+                state=links[i, p : p + 1],
+                models=models[i, p],
+                dues=dues[i, p],
+                calendar=calendars[i, p],
+                points=points,
+                channel=channel_of(channel_of(channel, i), p),
+            )
+            # The peers of a site are all other sites, in scenario order.
+            peer = p if p < i else p + 1
+            sample = next_samples[i, p]
+            for k in range(first[i], end[i]):
+                t_ns = tick_ns(k, rate_hz)
+                while sample < end[peer] and tick_ns(sample, rates_hz[peer]) < t_ns:
+                    state = states[peer, sample & mask]
                     accept_sample(
                         k=k,
                         rate_hz=rate_hz,
-                        tick=k - 1,
+                        tick=sample,
                         q=state,
                         qd=state[joints:],
                         tau_x=state[2 * joints :],
                         sent=state[3 * joints :],
                         link=link,
                     )
+                    sample += 1
                 release_sample(k, rate_hz, link)
+            next_samples[i, p] = sample

@@ -30,7 +30,7 @@ from ...core import (
 from ..fused import FusedRun
 from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
 from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
-from .lane_run import LaneRun, explain_uncompilable, put_rows, view_rows
+from .lane_run import LaneRun, explain_uncompilable, find_words, put_rows, view_rows
 from .lane_stages import EndedRuns, copy_lane, keep_ended_runs
 from .lane_structure import RunStructure, find_obstacle, find_structure
 from .run_groups import LEAST_RUNS
@@ -76,6 +76,8 @@ def _use_samples_of_lanes(
             states.uniforms,
             states.delays_us,
             states.stamps_ns,
+            states.times_ns,
+            states.made,
         )
         age = use_samples(
             first=first[lane],
@@ -133,6 +135,7 @@ def _run_span(
     used: IntArray,
     received_columns: IntArray,
     table: Array,
+    latest: IntArray,
     peaks: Words,
     present: EndedRuns,
     ended: EndedRuns,
@@ -159,6 +162,7 @@ def _run_span(
         used: Samples in use, see `use_samples`.
         received_columns: Indices of the numbers that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
+        latest: Zeros, shape (3, N), see `keep_ended_runs`: there is one bucket and one record.
         peaks: Room for the peaks of all sites in one bucket, which are not used.
         present: The numbers of all runs.
         ended: Numbers of the runs of which an arm left its limits; changed.
@@ -215,8 +219,7 @@ def _run_span(
             ticks=clock[0, 0],
             runs=runs,
             mode_word=mode_word,
-            bucket=0,
-            record_row=0,
+            latest=latest,
             peaks=peaks,
             present=present,
             ended=ended,
@@ -256,9 +259,11 @@ class LaneEpisodes(LaneRun):
     def __init__(
         self, run: FusedRun, count: int, *, hand_site: int, hand_row: int, period_ticks: int
     ) -> None:
+        """Fills all lanes with the same run, until `load` replaces it by the first episodes."""
         super().__init__([run] * count)
         self.structure = self.find_structure(run)
         self.ticks = np.zeros(LANES, np.int64)
+        self._rate_hz = int(self._rates_hz[0])
         self.hands = SeveralHands(LANES, BLOCK_TICKS, self._rate_hz, period_ticks)
         self._hand_site = hand_site
         self._clock_words = allocate_words(2, 1)
@@ -303,6 +308,8 @@ class LaneEpisodes(LaneRun):
             hand_site: Index of the site whose arm a program moves.
         """
         obstacle = find_obstacle(run, hand_site=hand_site)
+        if len(set(run.memory.tables.site["rate_hz"].ravel().tolist())) > 1:
+            obstacle = obstacle or "tick rates that differ between sites"
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
@@ -475,6 +482,7 @@ class LaneEpisodes(LaneRun):
             used=self._used,
             received_columns=self._columns,
             table=self._table,
+            latest=np.zeros_like(self._latest),
             peaks=self._peaks,
             present=self._list_present(),
             ended=self._ended,
@@ -586,15 +594,3 @@ class LaneEpisodes(LaneRun):
         if has_ended:
             last_ns = tick_ns(int(self._ended.ticks[lane]) - 1, self._rate_hz)
             memory.progress["diverged_ns"][0] = last_ns
-
-
-def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns the indices of a field's numbers among all numbers of a row.
-
-    Args:
-        layout: Data type of the row.
-        name: Name of the field.
-    """
-    fields: Any = layout.fields
-    dtype, offset, *_ = fields[name]
-    return range(offset // 8, (offset + dtype.itemsize) // 8)

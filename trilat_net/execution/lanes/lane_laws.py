@@ -217,6 +217,7 @@ def compute_law(
     t_ns: int,
     site: RowArray,
     links: RowArray,
+    chain: RowArray | None,
     law: RowArray,
     received: RowArray,
     sent: RowArray,
@@ -231,11 +232,13 @@ def compute_law(
         code: Tells the compiler which law to call.
         k: Number of the tick (period of the control loop).
         t_ns: Nominal time of the tick, ns since the epoch.
-        site: State of the site, the arm with its controller. It receives the torque.
-        links: States of the links from other sites (peers).
-        law: Numbers of the law (gains and memory), of which the memory is changed.
-        received: Numbers that the laws of the peers sent.
-        sent: Receives the numbers that this law sends.
+        site: Row of the site, in which the torque is written.
+        links: Rows of the site's links.
+        chain: Rows of the chain of joints, or None for the planar arm. Its model is
+            in the row of the site already.
+        law: Row with the numbers of the law; changed.
+        received: Rows with the numbers that the peers' laws sent.
+        sent: Row with the numbers that this law sends; written.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -249,6 +252,7 @@ def _compute_nothing(
     _t_ns: int,
     _site: Any,
     _links: Any,
+    _chain: Any,
     _law: Any,
     _received: Any,
     _sent: Any,
@@ -281,6 +285,7 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
         t_ns: int,
         site: Any,
         links: Any,
+        chain: Any,
         law: Any,
         received: Any,
         sent: Any,
@@ -289,7 +294,7 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
         s = site[0]
         if s.mode == _DIVERGED:
             return
-        update_law_view(k, t_ns, site, links, None)
+        update_law_view(k, t_ns, site, links, chain)
         now = collect_law_input(
             s,
             links,

@@ -25,8 +25,10 @@ from ...core import (
     NEVER_NS,
     Array,
     IntArray,
+    ReplayedInputs,
     SiteArrays,
     find_lane_address,
+    first_tick_at,
     is_lane_code_stored,
     leaf,
     read_lane_assembly,
@@ -42,10 +44,11 @@ from .lane_deliveries import (
     keep_link_states,
     repeat_deliveries,
     use_samples,
+    use_samples_of_rates,
 )
 from .lane_laws import LawCode
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
-from .lane_stages import STAGES_DTYPE, EndedRuns, advance_site, run_block
+from .lane_stages import STAGES_DTYPE, EndedRuns, RecordedHands, advance_site, run_block
 from .lane_structure import RunStructure, SiteStructure, find_structure
 
 _FIRST_PAGES = 256
@@ -181,9 +184,10 @@ def list_argument_types(
     actors = site.actors
     chain = _type_numbers(0, 1)
     if layout.chain is not None:
-        # The actors of a chain are selected by the variable of a loop.
+        # The actors and the joints of a chain are selected by the variable of a loop.
         actors = ((),) * len(actors)
-        chain = LaneTable(layout.chain, ((("prismatic", 0),),) * layout.joints)
+        constants = () if any(site.prismatic) else (("prismatic", 0),)
+        chain = LaneTable(layout.chain, (constants,) * len(site.prismatic))
     environments = actors[first:] if first >= 0 else ()
     tables = SiteTables(
         site=LaneTable(layout.site, (site.constants,)),
@@ -283,22 +287,19 @@ def read_assembly(run: FusedRun, i: int) -> str:
 
 
 @leaf
-def _copy_records(first: int, kept: Array, records: Array) -> None:
-    """Copies records from the common array of all runs to an array in the order of the runs.
-
-    A record has the results of one tick (control period). In the common array, the same number
-    of all runs is adjacent in memory (each run has a lane), as vector instructions require.
+def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
+    """Copies records from the lanes to arrays of each run.
 
     Args:
-        first: First tick.
-        kept: Latest records of all N sites (arm controllers), shape (N, rows, floats, LANES).
-            The record of tick k is in row k modulo the number of rows, which is a power of two.
-        records: Receives the records, shape (runs, N, ticks, floats).
+        first: First tick of each site, shape (N,).
+        kept: Latest records of all sites, shape (N, rows, floats, LANES). The record of tick k
+            is in row k modulo the number of rows.
+        records: Written, shape (runs, N, ticks, floats).
     """
     # The numbers of all lanes in a record lie in few cache lines.
     for i in range(records.shape[1]):
         for tick in range(records.shape[2]):
-            row = (first + tick) & (kept.shape[1] - 1)
+            row = (first[i] + tick) & (kept.shape[1] - 1)
             for lane in range(records.shape[0]):
                 for column in range(records.shape[3]):
                     records[lane, i, tick, column] = kept[i, row, column, lane]
@@ -333,47 +334,46 @@ class _LinksOfRun:
 
     def __init__(self, run: FusedRun) -> None:
         self._run = run
-        self._ticks = 0
+        self._ticks: IntArray = np.zeros_like(run.memory.progress["tick"])
+        # A sample of a tick that was planned late arrives at a later tick of the receiver.
+        self._ends: list[IntArray] = []
 
     def set_pending(
-        self, ticks: int, links: NDArray[Any], states: Array, received: Array
+        self, ticks: IntArray, links: NDArray[Any], states: Array, received: Array
     ) -> None:
         """Stores the results of the latest ticks, with which the links can be updated later.
 
         Args:
-            ticks: Number of ticks (control periods) that the run has made.
-            links: Rows of its links after these ticks. Only some fields are up to date: those
-                of the sample in use, and those that the computation of references writes.
-            states: The latest states of its sites (arm controllers), see `repeat_deliveries`.
-            received: Numbers of control laws that came with the samples in use, shape (N P, C),
-                for N sites with P peers each.
+            ticks: Number of ticks that each site has made.
+            links: Rows of its links after these ticks. Only fields of the sample in use, and
+                fields that stage 3 of a tick writes, are up to date.
+            states: The latest states of its sites, see `repeat_deliveries`.
+            received: Numbers of laws that came with the samples in use, shape (N P, C).
         """
-        self._run.pending_deliveries = partial(self._update, ticks, links, states, received)
+        self._ends.append(ticks.copy())
+        self._run.pending_deliveries = partial(self._update, links, states, received)
 
-    def _update(self, ticks: int, links: NDArray[Any], states: Array, received: Array) -> None:
-        """Computes the state of the links up to the tick that was passed to `set_pending`.
-
-        The run calls it before it continues alone, see `FusedRun.pending_deliveries`.
-        """
+    def _update(self, links: NDArray[Any], states: Array, received: Array) -> None:
+        """Computes the state of the links up to the ticks that `set_pending` noted."""
         memory = self._run.memory
         tables = memory.tables
-        repeat_deliveries(
-            first=self._ticks,
-            end=ticks,
-            rate_hz=int(tables.site["rate_hz"][0, 0]),
-            links=tables.links,
-            models=tables.models,
-            dues=tables.dues,
-            calendars=tables.calendars,
-            points=tables.points,
-            channel=tables.channel,
-            joints=tables.links["q"].shape[2],
-            states=states,
-        )
-
-        # Fields that `repeat_deliveries` cannot know come from the computed ticks.
-        self._ticks = ticks
-        memory.next_samples[:] = max(ticks - 1, 0)
+        for ticks in self._ends:
+            repeat_deliveries(
+                first=self._ticks,
+                end=ticks,
+                rates_hz=np.ascontiguousarray(tables.site["rate_hz"][:, 0]),
+                next_samples=memory.next_samples,
+                links=tables.links,
+                models=tables.models,
+                dues=tables.dues,
+                calendars=tables.calendars,
+                points=tables.points,
+                channel=tables.channel,
+                joints=tables.links["q"].shape[2],
+                states=states,
+            )
+            self._ticks = ticks
+        self._ends.clear()
         for name in (*_REFERENCE_FIELDS, *_STATE_FIELDS):
             tables.links[name] = links.reshape(tables.links.shape)[name]
         if tables.channel is not None:
@@ -411,9 +411,13 @@ class LaneRun:
         tables = [memory.tables for memory in memories]
         first = tables[0]
         self._sites = len(structure.sites)
-        self._rate_hz = int(first.site["rate_hz"][0, 0])
+        self._rates_hz: IntArray = np.ascontiguousarray(first.site["rate_hz"][:, 0])
+        self._has_equal_rates = len(set(self._rates_hz.tolist())) == 1
         self._table = first.table
-        self._ticks = 0
+        self._ticks: IntArray = np.zeros(self._sites, np.int64)
+        self._next_ns = np.zeros(self._sites, np.int64)
+        self._latest = np.zeros((3, self._sites), np.int64)
+        self._next_samples = np.zeros((self._sites, structure.peers), np.int64)
         self._deliveries = copy_link_states(tables)
         self._draws = find_draw_addresses()
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
@@ -462,6 +466,7 @@ class LaneRun:
         self._put_laws(memories)
         self._ended = EndedRuns(
             ticks=np.full(LANES, -1),
+            site_ticks=np.zeros((self._sites, LANES), np.int64),
             site_rows=np.zeros_like(self._site),
             links=np.zeros_like(self._links),
             records=np.zeros_like(self._records[:, 0]),
@@ -474,6 +479,8 @@ class LaneRun:
         for lane, arrays in enumerate(tables):
             self._put_first_states(lane, arrays)
         self._addresses = _find_addresses(runs[0], structure, self.clock)
+        most_sources = len(self._actors) // self._sites
+        self._hands = _find_recorded_hands(memories[0].feed, layout.actor, most_sources)
 
     def _put_first_states(self, lane: int, arrays: SiteArrays) -> None:
         """Copies the initial state of each site, as the other sites know it, into a lane.
@@ -558,18 +565,16 @@ class LaneRun:
         lanes = [lane for lane in range(len(self.runs)) if self._ended.ticks[lane] < 0]
         if not lanes:
             return
-
-        ticks = max(1, round(until_s * self._rate_hz))
+        ticks = [max(1, round(until_s * rate_hz)) for rate_hz in self._rates_hz.tolist()]
         for lane in lanes:
-            self.runs[lane].plan([ticks] * self._sites)
+            self.runs[lane].plan(ticks)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
-        first = self._ticks
-        self._step_to(ticks)
-
-        # The records of the latest ticks, in the order of the runs.
+        first = self._ticks.copy()
+        self._step_to(np.array(ticks))
         records = None
         if self._records.shape[1] > 1:
-            count = min(self._ticks - first, self._records.shape[1])
+            most_ticks = int((self._ticks - first).max())
+            count = min(most_ticks, self._records.shape[1])
             shape = (len(self.runs), self._sites, count, self._layout.floats)
             records = np.empty(shape)
             _copy_records(self._ticks - count, self._records.view(np.float64), records)
@@ -578,49 +583,75 @@ class LaneRun:
                 self._write_records(lane, self.runs[lane], records[lane])
             self._write_back(lane, self.runs[lane], until_s)
 
-    def _use_samples(self, first: int, count: int) -> int:
-        """Determines which samples (states of other sites) the sites use in a block of ticks.
-
-        The result is stored in `self._used`, see `use_samples`.
+    def _use_samples(self, end: IntArray) -> int:
+        """Finds the samples that are used in a block of ticks, see `use_samples`.
 
         Args:
-            first: First tick (control period) of the block.
-            count: Number of ticks.
+            end: Tick of each site after the block, shape (N,).
 
         Returns:
             The largest age of a sample in use, in ticks.
         """
+        if not self._has_equal_rates:
+            return use_samples_of_rates(
+                self._ticks,
+                end,
+                self._rates_hz,
+                self._next_samples,
+                self._ended.ticks,
+                self._deliveries,
+                self._draws,
+                self._used,
+            )
+        first = int(self._ticks[0])
         return use_samples(
             first,
-            count,
-            self._rate_hz,
+            int(end[0]) - first,
+            int(self._rates_hz[0]),
             self._ended.ticks,
             self._deliveries,
             self._draws,
             self._used,
         )
 
-    def _step_to(self, ticks: int) -> None:
-        """Simulates all runs in blocks of ticks, up to a tick or until all runs have ended.
-
-        For each block, the deliveries of the network are computed first, and then the motion.
+    def _find_block_end(self, ticks: IntArray) -> IntArray:
+        """Returns the tick of each site after the next block, an interval of time.
 
         Args:
-            ticks: Number of ticks (control periods) since the start of the runs.
+            ticks: Number of ticks of each site after all blocks.
+        """
+        ends_ns = [
+            tick_ns(first + BLOCK_TICKS, rate_hz)
+            for first, last, rate_hz in zip(
+                self._ticks.tolist(), ticks.tolist(), self._rates_hz.tolist(), strict=True
+            )
+            if first < last
+        ]
+        end_ns = min(ends_ns)
+        end = [first_tick_at(end_ns, rate_hz) for rate_hz in self._rates_hz.tolist()]
+        return np.clip(end, self._ticks, ticks)
+
+    def _step_to(self, ticks: IntArray) -> None:
+        """Simulates all runs until they have made a number of ticks, or have ended.
+
+        Args:
+            ticks: Number of ticks of each site since the start of the runs, shape (N,).
         """
         present = self._list_present()
         site_fields: Any = self._layout.site.fields
         _, mode_offset = site_fields["mode"]
         tables = self._find_tables()
-
-        running = 1  # number of runs that have not ended
-        while self._ticks < ticks and running:
-            count = min(BLOCK_TICKS, ticks - self._ticks)
-            self._keep_states(self._use_samples(self._ticks, count))
+        running = 1
+        while (self._ticks < ticks).any() and running:
+            end = self._find_block_end(ticks)
+            self._keep_states(self._use_samples(end))
             running = run_block(
-                first=self._ticks,
-                count=count,
-                rate_hz=self._rate_hz,
+                first=self._ticks.copy(),
+                ticks=self._ticks,
+                end=end,
+                rates_hz=self._rates_hz,
+                next_ns=self._next_ns,
+                latest=self._latest,
                 runs=len(self.runs),
                 settled_rad=self._structure.settled_rad,
                 pages=self._pages,
@@ -632,11 +663,12 @@ class LaneRun:
                 used=self._used,
                 columns=self._columns,
                 table=self._table,
+                hands=self._hands,
+                actors=self._actors.view(np.float64),
                 peaks=self._peaks,
                 present=present,
                 ended=self._ended,
             )
-            self._ticks += count
 
     def _list_present(self) -> EndedRuns:
         """Returns the present state of all runs, as views.
@@ -645,6 +677,7 @@ class LaneRun:
         """
         return EndedRuns(
             ticks=self._ended.ticks,
+            site_ticks=self._ended.site_ticks,
             site_rows=self._site,
             links=self._links,
             records=self._records,
@@ -670,8 +703,9 @@ class LaneRun:
             old_pages = self._pages
             self._pages *= 2
             states = np.zeros((self._sites, self._pages + 1, *self._states.shape[2:]))
-            kept = np.arange(max(self._ticks - old_pages, 0), self._ticks)
-            states[:, kept % self._pages] = self._states[:, kept % old_pages]
+            for i, ticks in enumerate(self._ticks.tolist()):
+                kept = np.arange(max(ticks - old_pages, 0), ticks)
+                states[i, kept % self._pages] = self._states[i, kept % old_pages]
             states[:, -1] = self._states[:, -1]
             self._states = states
 
@@ -722,14 +756,15 @@ class LaneRun:
                 periods), shape (N, ticks, floats).
         """
         sent = run.memory.sent
-        ended_ticks = int(self._ended.ticks[lane])
-        end = self._ticks if ended_ticks < 0 else ended_ticks
-        first = self._ticks - records.shape[1]
-        ticks = np.arange(max(first, end - sent.t_ns.shape[1]), end)
-        pages = ticks % sent.t_ns.shape[1]
-        # The nominal times of the ticks, by the equation of `tick_ns`.
-        sent.t_ns[:, pages] = ticks * NS_PER_S // self._rate_hz
-        sent.rows[:, pages] = records[:, ticks - first]
+        has_ended = self._ended.ticks[lane] >= 0
+        ends = self._ended.site_ticks[:, lane] if has_ended else self._ticks
+        for i, end in enumerate(ends.tolist()):
+            first = int(self._ticks[i]) - records.shape[1]
+            ticks = np.arange(max(first, end - sent.t_ns.shape[1], 0), end)
+            pages = ticks % sent.t_ns.shape[1]
+            # The equation of `tick_ns`.
+            sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
+            sent.rows[i, pages] = records[i, ticks - first]
 
     def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
         """Copies the state of a run that was simulated with others into its `FusedRun` object.
@@ -741,36 +776,40 @@ class LaneRun:
         """
         memory = run.memory
         tables = memory.tables
-        ended_ticks = int(self._ended.ticks[lane])
-        has_ended = ended_ticks >= 0
-        ticks = ended_ticks if has_ended else self._ticks
+        has_ended = bool(self._ended.ticks[lane] >= 0)
+        ticks = self._ended.site_ticks[:, lane] if has_ended else self._ticks
         site_rows = self._ended.site_rows if has_ended else self._site
-        record_row = (ticks - 1) & (self._records.shape[1] - 1)
-        records = self._ended.records if has_ended else self._records[:, record_row]
+        sites = np.arange(self._sites)
+        record_rows = (ticks - 1) & (self._records.shape[1] - 1)
+        records = self._ended.records if has_ended else self._records[sites, record_rows]
         sums = self._ended.sums if has_ended else self._sums
         progress = self._ended.progress if has_ended else self._progress
 
-        last_bucket = (ticks - 1) * BUCKETS_PER_S // self._rate_hz
         peaks = memory.peaks
-        new_peaks = self._peaks[:, : last_bucket + 1, :, lane].view(np.float64)
-        peaks[:, : last_bucket + 1] = new_peaks
+        last_buckets = (ticks - 1) * BUCKETS_PER_S // self._rates_hz
+        for i, last_bucket in enumerate(last_buckets.tolist()):
+            new_peaks = self._peaks[i, : last_bucket + 1, :, lane].view(np.float64)
+            peaks[i, : last_bucket + 1] = new_peaks
         if has_ended:
-            peaks[:, last_bucket] = self._ended.peaks[:, :, lane].view(np.float64)
+            peaks[sites, last_buckets] = self._ended.peaks[:, :, lane].view(np.float64)
 
         put_rows(tables.site, site_rows[:, :, lane])
         put_rows(memory.sums, sums[:, :, lane])
         unsettled_ns = progress[:, :, lane].copy()
         rows = unsettled_ns.view(memory.progress.dtype).reshape(-1)
         memory.progress["unsettled_ns"] = rows["unsettled_ns"]
-        _write_progress(memory.progress, ticks, self._rate_hz)
+        _write_progress(memory.progress, ticks, self._rates_hz)
+        # The equation of `tick_ns`.
+        last_ns = (ticks - 1) * NS_PER_S // self._rates_hz
         if has_ended:
-            last_ns = tick_ns(ticks - 1, self._rate_hz)
             diverged = tables.site["mode"][:, 0] == Mode.DIVERGED
-            memory.progress["diverged_ns"][diverged] = last_ns
+            memory.progress["diverged_ns"][diverged] = last_ns[diverged]
 
-        page = (ticks - 1) & (memory.sent.t_ns.shape[1] - 1)
-        memory.sent.t_ns[:, page] = tick_ns(ticks - 1, self._rate_hz)
-        memory.sent.rows[:, page] = records[:, :, lane].view(np.float64)
+        pages = (ticks - 1) & (memory.sent.t_ns.shape[1] - 1)
+        memory.sent.t_ns[sites, pages] = last_ns
+        if not self._has_equal_rates and not has_ended:
+            self._write_sent(lane, run)
+        memory.sent.rows[sites, pages] = records[:, :, lane].view(np.float64)
         if memory.laws is not None:
             laws = self._ended.laws if has_ended else self._laws
             sent = self._ended.sent if has_ended else self._sent
@@ -786,6 +825,58 @@ class LaneRun:
                 states=self._states[:, :, lane].copy(),
                 received=self._received[:, :, lane].view(np.float64),
             )
+
+    def _write_sent(self, lane: int, run: FusedRun) -> None:
+        """Writes the latest samples of a lane into the records of its run.
+
+        A slow site accepts several samples of a faster peer at once. A run that continues alone
+        reads from the records the samples that no site has accepted yet.
+
+        Args:
+            lane: The lane.
+            run: The run.
+        """
+        sent = run.memory.sent
+        kept = min(sent.t_ns.shape[1], self._pages)
+        joints = self._layout.joints
+        for i, name in enumerate(run.scenario.names):
+            layout = run.scenario.layout(name)
+            end = int(self._ticks[i])
+            ticks = np.arange(max(end - kept, 0), end)
+            pages = ticks % sent.t_ns.shape[1]
+            # The equation of `tick_ns`.
+            sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
+            states = self._states[i, ticks % self._pages, lane]
+            names = ("x", "xd", "wrench") if layout.task else ("q", "qd", "tau_x")
+            columns = layout.columns()
+            for n, vector in enumerate(names):
+                vectors = states[:, n * joints : n * joints + layout.shared]
+                sent.rows[i, pages, columns[vector]] = vectors
+            if layout.sent:
+                numbers = states[:, 3 * joints : 3 * joints + layout.sent]
+                sent.rows[i, pages, columns["ch"]] = numbers
+
+
+def _find_recorded_hands(
+    feed: ReplayedInputs, actor: np.dtype[Any], most_sources: int
+) -> RecordedHands:
+    """Returns what live operators did in a recorded run.
+
+    Args:
+        feed: Inputs of the recorded run.
+        actor: Data type of the row of an operator.
+        most_sources: Number of rows of operators and environments of each site.
+    """
+    coordinates = (feed.hands.shape[2] - 1) // 2
+    words = [*find_words(actor, "grip")]
+    columns = [0]
+    for name, first in (("a", 1), ("b", 1 + coordinates)):
+        words_of_vector = [*find_words(actor, name)][:coordinates]
+        words += words_of_vector
+        columns += range(first, first + len(words_of_vector))
+    first_rows = np.arange(len(feed.hand_indices)) * most_sources
+    rows = np.where(feed.hand_indices < 0, -1, first_rows + feed.hand_indices)
+    return RecordedHands(feed.hands, rows, np.array(words), np.array(columns))
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
@@ -821,17 +912,30 @@ def put_rows(rows: NDArray[Any], numbers: Words) -> None:
     rows[...] = new_rows.reshape(rows.shape)
 
 
-def _write_progress(progress: Any, ticks: int, rate_hz: int) -> None:
-    """Stores how far the sites of a run have been simulated: the number of ticks and the time.
+def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
+    """Writes how far the sites of a run are, after a number of ticks.
 
     Args:
-        progress: Receives the progress of all sites (arm controllers), see `ProgressRow`.
-        ticks: Number of ticks (control periods) that each site has executed.
-        rate_hz: Tick rate of all sites, Hz.
+        progress: Rows of all sites, see `ProgressRow`; written.
+        ticks: Number of ticks of each site, shape (N,).
+        rates_hz: Tick rates, Hz, shape (N,).
     """
     parts = ticks * BUCKETS_PER_S
     progress["tick"] = ticks
-    progress["bucket"] = parts // rate_hz
-    progress["part"] = parts % rate_hz
-    has_finished = ticks >= progress["ticks"][0]
-    progress["t_ns"] = NEVER_NS if has_finished else tick_ns(ticks, rate_hz)
+    progress["bucket"] = parts // rates_hz
+    progress["part"] = parts % rates_hz
+    has_finished = ticks >= progress["ticks"]
+    # The equation of `tick_ns`.
+    progress["t_ns"] = np.where(has_finished, NEVER_NS, ticks * NS_PER_S // rates_hz)
+
+
+def find_words(layout: np.dtype[Any], name: str) -> range:
+    """Returns the indices of a field's numbers among all numbers of a row.
+
+    Args:
+        layout: Data type of the row.
+        name: Name of the field.
+    """
+    fields: Any = layout.fields
+    dtype, offset, *_ = fields[name]
+    return range(offset // 8, (offset + dtype.itemsize) // 8)

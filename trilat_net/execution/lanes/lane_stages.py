@@ -17,32 +17,37 @@ import numpy as np
 
 from ...core import (
     BUCKETS_PER_S,
+    NEVER_NS,
     NO_TORQUE,
     Array,
     IntArray,
     Law,
     SourceTorque,
+    StaleAction,
     TorqueTable,
     Vector,
     adapts,
     add_source_torque,
     call_address,
-    emit_stages,
+    emit_stage,
+    error_stages,
     finish_advance,
     first_sent_column,
     five,
+    guard_reference,
+    guard_torque,
     hold_motor_torque,
     lane_leaf,
     leaf,
     pair,
     put_pair,
-    reference_stages,
     set_lane_form,
     tick_ns,
     torque_on_arm,
     torque_stage,
     two_link_stages,
     update_peaks,
+    update_reference,
     update_sums,
 )
 from ...records import Mode
@@ -51,6 +56,7 @@ from .lane_rows import Words, in_lane, number_of, pointer_to, select_row
 
 _DIVERGED = int(Mode.DIVERGED)
 _USER = int(Law.USER)
+_GLIDE = int(StaleAction.GLIDE)
 JOINTS = 2
 """Number of joints of the arms that lanes support."""
 TAU_X_COLUMN = 5 * JOINTS
@@ -232,7 +238,8 @@ def advance_site(
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             page = pages if sample < 0 else sample & (pages - 1)
-            if in_lane(site, lane)[0].law == _USER:
+            s = in_lane(site, lane)[0]
+            if s.law == _USER or s.on_stale == _GLIDE:
                 link.new = sample > link.used
                 link.used_ns = lane_ns if sample > link.used else link.used_ns
             link.used = sample
@@ -252,17 +259,37 @@ def advance_site(
                     number = states[peer, sample & (pages - 1), lane, 3 * JOINTS + column]
                 in_lane(received, lane)[p].numbers[c] = number
 
-    # 3 reference, 4 errors, 5 estimate
+    # 3 reference, 4 errors, 5 estimate. The branches of the rule `glide` have loops of their
+    # own, because a loop with branches does not use vector instructions.
+    glides = in_lane(site, 0)[0].on_stale == _GLIDE
+    if glides:
+        for lane in range(lanes):
+            update_reference(
+                number_of(t_ns, lane),
+                in_lane(site, lane)[0],
+                in_lane(links, lane),
+                in_lane(ramps, lane)[0].rows,
+            )
+        for lane in range(lanes):
+            guard_reference(
+                number_of(k, lane),
+                number_of(t_ns, lane),
+                in_lane(site, lane)[0],
+                in_lane(links, lane),
+            )
     for lane in range(lanes):
-        reference_stages(
+        s = in_lane(site, lane)[0]
+        if not glides:
+            rows = in_lane(links, lane)
+            update_reference(number_of(t_ns, lane), s, rows, in_lane(ramps, lane)[0].rows)
+            guard_reference(number_of(k, lane), number_of(t_ns, lane), s, rows)
+        error_stages(
             k=number_of(k, lane),
             t_ns=number_of(t_ns, lane),
-            site=in_lane(site, lane),
-            links=in_lane(links, lane),
-            ramps=in_lane(ramps, lane)[0].rows,
+            s=s,
+            chain=None,
             actors=in_lane(actors, lane),
             table=table,
-            chain=None,
         )
 
     # 6 torque
@@ -275,21 +302,23 @@ def advance_site(
             number_of(t_ns, lane),
             in_lane(site, lane),
             in_lane(links, lane),
+            None,
             in_lane(law, lane),
             in_lane(received, lane),
             in_lane(sent, lane),
         )
 
     # 6 limits of the torque, 7 emit
+    if glides:
+        for lane in range(lanes):
+            s = in_lane(site, lane)[0]
+            guard_torque(number_of(k, lane), number_of(t_ns, lane), s, None)
     for lane in range(lanes):
         floats = in_lane(record, lane)[record_row].floats
-        emit_stages(
-            k=number_of(k, lane),
-            t_ns=number_of(t_ns, lane),
-            s=in_lane(site, lane)[0],
-            chain=None,
-            record=floats,
-        )
+        s = in_lane(site, lane)[0]
+        if not glides:
+            guard_torque(number_of(k, lane), number_of(t_ns, lane), s, None)
+        emit_stage(s, floats)
         page = number_of(k, lane) & (pages - 1)
         for c in range(JOINTS):
             states[i, page, lane, c] = floats[c]
@@ -415,8 +444,9 @@ class EndedRuns(NamedTuple):
     N is the number of sites (arm controllers), and the last axis of each array is the lane.
 
     Attributes:
-        ticks: Number of ticks (control periods) that each run has made, shape (LANES,). -1 if
-            the run has not ended.
+        ticks: Number of ticks that the first site of each run has made, shape (LANES,). -1: the
+            run has not ended.
+        site_ticks: Number of ticks that each site has made, shape (N, LANES).
         site_rows: Rows of the sites, shape (N, words of a row, LANES).
         links: Rows of the links, shape (N P, words of a row, LANES). Only `LaneEpisodes` keeps
             them: in `keep_ended_runs` their copy makes all ticks slower by half.
@@ -429,6 +459,7 @@ class EndedRuns(NamedTuple):
     """
 
     ticks: IntArray
+    site_ticks: IntArray
     site_rows: Words
     links: Words
     records: Words
@@ -458,8 +489,7 @@ def keep_ended_runs(
     ticks: Any,
     runs: int,
     mode_word: int,
-    bucket: int,
-    record_row: int,
+    latest: IntArray,
     peaks: Words,
     present: EndedRuns,
     ended: EndedRuns,
@@ -469,11 +499,11 @@ def keep_ended_runs(
     The other runs continue, so the numbers in the lane of an ended run are overwritten later.
 
     Args:
-        ticks: Number of ticks that the runs have made, of all runs or of each run.
+        ticks: Number of ticks that the first site has made, of all runs or of each run.
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
-        bucket: The present bucket.
-        record_row: Row of the latest record.
+        latest: For each site the number of its ticks, the bucket of the latest tick and the row
+            of its record, shape (3, N).
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: Numbers of all runs now, with several rows of records per site. Its peaks are
             not used.
@@ -494,20 +524,63 @@ def keep_ended_runs(
             continue
         ended.ticks[lane] = number_of(ticks, lane)
         copy_lane(lane, present.site_rows, ended.site_rows)
-        copy_lane(lane, present.records[:, record_row], ended.records)
         copy_lane(lane, present.sums, ended.sums)
         copy_lane(lane, present.progress, ended.progress)
         copy_lane(lane, present.laws, ended.laws)
         copy_lane(lane, present.sent, ended.sent)
-        copy_lane(lane, peaks[:, bucket], ended.peaks)
+        for i in range(ended.site_ticks.shape[0]):
+            ended.site_ticks[i, lane] = latest[0, i]
+            copy_lane(lane, peaks[i : i + 1, latest[1, i]], ended.peaks[i : i + 1])
+            record = present.records[i : i + 1, latest[2, i]]
+            copy_lane(lane, record, ended.records[i : i + 1])
     return running
+
+
+class RecordedHands(NamedTuple):
+    """What live operators did in a recorded run, see `ReplayedInputs`.
+
+    Attributes:
+        actions: Numbers of the operators, shape (N, ticks, C).
+        rows: Row of the operator of each site among all operators and environments; -1: none.
+        words: Words of the row that the numbers replace.
+        columns: Index of the number for each of these words.
+    """
+
+    actions: Array
+    rows: IntArray
+    words: IntArray
+    columns: IntArray
+
+
+@leaf
+def _apply_recorded_hand(
+    i: int, k: int, lanes: int, hands: RecordedHands, actors: Array
+) -> None:
+    """Repeats what the live operator of a site did in a tick of a recorded run, in all lanes.
+
+    Args:
+        i: Index of the site.
+        k: The tick.
+        lanes: Number of lanes.
+        hands: What the operators did.
+        actors: Rows of operators and environments, seen as floats; written.
+    """
+    if hands.rows[i] < 0 or k >= hands.actions.shape[1]:
+        return
+    for n in range(hands.words.shape[0]):
+        for lane in range(lanes):
+            action = hands.actions[i, k, hands.columns[n]]
+            actors[hands.rows[i], hands.words[n], lane] = action
 
 
 @leaf
 def run_block(
-    first: int,
-    count: int,
-    rate_hz: int,
+    first: IntArray,
+    ticks: IntArray,
+    end: IntArray,
+    rates_hz: IntArray,
+    next_ns: IntArray,
+    latest: IntArray,
     runs: int,
     settled_rad: float,
     pages: int,
@@ -519,6 +592,8 @@ def run_block(
     used: IntArray,
     columns: IntArray,
     table: Array,
+    hands: RecordedHands,
+    actors: Array,
     peaks: Words,
     present: EndedRuns,
     ended: EndedRuns,
@@ -526,9 +601,12 @@ def run_block(
     """Simulates several runs for a block of ticks, or until all of them have ended.
 
     Args:
-        first: First tick of the block.
-        count: Number of ticks.
-        rate_hz: Tick rate of all sites, Hz.
+        first: First tick of each site in the block, shape (N,).
+        ticks: Number of ticks that each site has made, shape (N,); changed.
+        end: Tick of each site after the block, shape (N,).
+        rates_hz: Tick rates, Hz, shape (N,).
+        next_ns: Room for the time of the next tick of each site, ns, shape (N,).
+        latest: Room for the numbers of the latest tick, see `keep_ended_runs`.
         runs: Number of runs.
         settled_rad: Position error below which an arm counts as settled, rad.
         pages: Number of latest states of each site, a power of two.
@@ -542,6 +620,8 @@ def run_block(
         used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
         columns: Indices of the numbers that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
+        hands: What live operators did in a recorded run.
+        actors: Rows of operators and environments, seen as floats.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: The numbers of all runs.
         ended: Numbers of the runs that have ended; changed.
@@ -553,12 +633,23 @@ def run_block(
     # Whole vector registers: the numbers of lanes without a run have no meaning. One or two
     # lanes more are faster without vectors.
     lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
-    for block_row in range(count):
-        k = first + block_row
-        t_ns = tick_ns(k, rate_hz)
-        bucket = k * BUCKETS_PER_S // rate_hz
-        record_row = k & (record_rows - 1)
+    for i in range(addresses.shape[0]):
+        next_ns[i] = tick_ns(ticks[i], rates_hz[i]) if ticks[i] < end[i] else NEVER_NS
+    while True:
+        # As `run_until`: by nominal time, and at equal times in the order of the sites.
+        t_ns = NEVER_NS
         for i in range(addresses.shape[0]):
+            t_ns = min(t_ns, next_ns[i])
+        if t_ns == NEVER_NS:
+            return running
+        for i in range(addresses.shape[0]):
+            if next_ns[i] != t_ns:
+                continue
+            k = ticks[i]
+            latest[0, i] = k + 1
+            latest[1, i] = k * BUCKETS_PER_S // rates_hz[i]
+            latest[2, i] = k & (record_rows - 1)
+            _apply_recorded_hand(i, k, lanes, hands, actors)
             call_address(
                 addresses[i],
                 (
@@ -567,10 +658,10 @@ def run_block(
                     lanes,
                     settled_rad,
                     i,
-                    block_row,
+                    k - first[i],
                     pages,
-                    bucket,
-                    record_row,
+                    latest[1, i],
+                    latest[2, i],
                     pointer_to(tables[i, 0]),
                     pointer_to(tables[i, 1]),
                     pointer_to(tables[i, 2]),
@@ -592,16 +683,16 @@ def run_block(
                     table,
                 ),
             )
+            ticks[i] = k + 1
+            next_ns[i] = tick_ns(k + 1, rates_hz[i]) if k + 1 < end[i] else NEVER_NS
         running = keep_ended_runs(
-            ticks=k + 1,
+            ticks=ticks[0],
             runs=runs,
             mode_word=mode_word,
-            bucket=bucket,
-            record_row=record_row,
+            latest=latest,
             peaks=peaks,
             present=present,
             ended=ended,
         )
         if running == 0:
             return running
-    return running

@@ -15,17 +15,19 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from ...core import LIVE_KINDS, OWN_KINDS, SiteArrays, StaleAction
+from ...core import OWN_KINDS, StaleAction
 from ..fused import FusedRun
 from .lane_laws import LaneLaw, describe_lane_law
 from .lane_rows import Constants
 
-SITE_CONSTANTS = (
+SITE_CONSTANTS: tuple[str, ...] = (
     *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "theta_known"),
     *("needs_model", "remembered", "asked", "order", "skipped", "degrades", "regrouped"),
     *("holds", "joints", "shared", "parameters", "task", "sent", "reason"),
 )
 """Fields of a site's row that are equal in runs of one structure and constant in each run."""
+_CHANGED_BY_GLIDE = ("reason", "regrouped")
+"""Fields among them that are not constant under the rule `glide`."""
 _ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
 """Fields of the row of an operator or environment that are equal in runs of one structure."""
 
@@ -36,16 +38,18 @@ class SiteStructure(NamedTuple):
     A site is a simulated arm with its controller. Sites with equal properties share code.
 
     Attributes:
-        constants: Values of the fields of the site that select equations, by name.
-        actors: The same for each operator and environment of the arm, the operators first.
-        first_environment: Index of the first environment. -1 if there is none.
-        law: Properties of a compiled control law.
+        constants: Constants of the site.
+        actors: Constants of each operator and environment, the operators first.
+        first_environment: Index of the first environment; -1: none.
+        law: Compiled law of the site.
+        prismatic: For each joint of a chain 1 for a prismatic joint, else 0.
     """
 
     constants: Constants
     actors: tuple[Constants, ...]
     first_environment: int
     law: LaneLaw
+    prismatic: tuple[int, ...]
 
 
 class RunStructure(NamedTuple):
@@ -95,44 +99,20 @@ def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
     tables = run.memory.tables
     if config.DISABLE_JIT:
         return "Numba is disabled"
-    if tables.chain is not None:
-        obstacle = _find_obstacle_of_chains(tables)
-        if obstacle:
-            return obstacle
     if run.memory.has_plain_law:
         return "control laws in plain Python"
     if run.programmed_sites - {hand_site}:
         return "programs that move an arm"
 
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
-    # Live operators whom no program replaces do nothing.
-    if hand_site < 0 and kinds.intersection(LIVE_KINDS):
-        return "hands that move an arm live"
     if kinds.intersection(OWN_KINDS):
         return "operators or environments that users wrote"
-    if (tables.site["on_stale"] == StaleAction.GLIDE).any():
-        return "on_stale.action 'glide'"
-    if len(set(tables.site["rate_hz"].ravel().tolist())) > 1:
-        return "tick rates that differ between sites"
     return ""
 
 
-def _find_obstacle_of_chains(tables: SiteArrays) -> str:
-    """Explains why runs with chains of joints cannot be computed together.
-
-    Args:
-        tables: Arrays of all sites (arm controllers) of a run.
-    """
-    if tables.channel is not None:
-        return "compiled laws of arms that are chains of joints"
-    counts = set(tables.site["joints"].ravel().tolist())
-    if tables.site["task"].any():
-        return "chains of joints whose sites share poses"
-    if counts != {tables.links["q"].shape[2]}:
-        return "chains with different numbers of joints"
-    if tables.chain is not None and tables.chain["prismatic"].any():
-        return "chains with prismatic joints"
-    return ""
+def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:
+    """Returns for each joint of a site 1 for a prismatic joint; nothing for planar arms."""
+    return () if chain is None else tuple(chain["prismatic"][i, :joints].tolist())
 
 
 def find_structure(run: FusedRun) -> RunStructure:
@@ -150,11 +130,15 @@ def find_structure(run: FusedRun) -> RunStructure:
     for i, (site, actors, sums) in enumerate(pairs):
         rows = _list_actors(actors)
         columns = None if tables.channel is None else tables.channel.columns[i]
+        names = SITE_CONSTANTS
+        if site[0]["on_stale"] == StaleAction.GLIDE:
+            names = tuple(name for name in names if name not in _CHANGED_BY_GLIDE)
         structure = SiteStructure(
-            constants=_read_constants(site[0], SITE_CONSTANTS),
+            constants=_read_constants(site[0], names),
             actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
             first_environment=int(sums["first_environment"]),
             law=describe_lane_law(memory.compiled_laws.get(i), columns),
+            prismatic=_list_prismatic(tables.chain, i, int(site[0]["joints"])),
         )
         sites.append(structure)
     return RunStructure(

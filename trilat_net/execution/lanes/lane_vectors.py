@@ -38,7 +38,7 @@ from numba.core.typing.templates import (
 )
 from numba.np import arrayobj
 
-from ...core import choose, round_down, set_lane_form, whole
+from ...core import choose, holds_anywhere, round_down, set_lane_form, whole
 from .lane_rows import LANES, Constants, LaneField, LaneTable, offset_rows
 
 GROUP = 8
@@ -261,7 +261,19 @@ def _truncate(_context: Any, number: Any) -> Any:
     return (INTEGERS(FLOATS), generate) if number == FLOATS else None
 
 
+@intrinsic
+def _reduce_or(_context: Any, conditions: Any) -> Any:
+    """Generates LLVM code that tells whether one of eight conditions holds."""
+
+    def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        bits = builder.bitcast(args[0], ir.IntType(GROUP))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+    return (types.boolean(conditions), generate) if conditions == CONDITIONS else None
+
+
 select_vector: Any = _select
+reduce_or: Any = _reduce_or
 truncate_vector: Any = _truncate
 
 
@@ -275,7 +287,13 @@ def _whole_vector(number: Any) -> Any:
     return truncate_vector(number)
 
 
+def _holds_in_vector(condition: Any) -> Any:
+    """Version of `holds_anywhere` for vectors."""
+    return reduce_or(condition)
+
+
 set_lane_form(choose, lambda _types: _choose_vector)
+set_lane_form(holds_anywhere, lambda _types: _holds_in_vector)
 
 
 def _round_vector_down(number: Any) -> Any:
@@ -331,6 +349,10 @@ class _GroupModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
 
 
+_EQUAL_IN_ALL_RUNS = ("prismatic",)
+"""Integer fields that are equal in all runs of a structure, so that code may branch on them."""
+
+
 def _vector_of(field: LaneField) -> LaneVector:
     """Returns the `LaneVector` for the numbers of a field."""
     return FLOATS if field.kind == "f8" else INTEGERS
@@ -348,6 +370,8 @@ class _RowAttributes(AttributeTemplate):
         field = row.find_field(name)
         if field is None:
             return None
+        if name in _EQUAL_IN_ALL_RUNS:
+            return types.int64
         vector = _vector_of(field)
         if not field.shape:
             return vector
@@ -391,6 +415,8 @@ def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name
     field = row_type.find_field(name)
     assert field is not None
     data = _find_numbers(builder, row, field)
+    if name in _EQUAL_IN_ALL_RUNS:
+        return builder.load(builder.bitcast(data, _WORD_TYPE.as_pointer()))
     if not field.shape:
         return builder.load(data, align=_WORD)
 

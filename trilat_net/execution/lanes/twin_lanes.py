@@ -10,6 +10,7 @@ Invariant:
       its limits.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ class LaneEndedError(Exception):
     """
 
 
-def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> bool:
+def suits_twins(run: FusedRun, runs: int, ticks: Sequence[int], least_site_ticks: int) -> bool:
     """Returns True if a run and its twins are computed faster together than one by one.
 
     The twins are copies of the run that start slightly displaced. Computing them together, with
@@ -49,7 +50,7 @@ def suits_twins(run: FusedRun, runs: int, ticks: int, least_site_ticks: int) -> 
     """
     if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
         return False
-    site_ticks = runs * ticks * len(run.scenario.names)
+    site_ticks = runs * sum(ticks)
     return site_ticks >= least_site_ticks or has_lane_code(run)
 
 
@@ -66,18 +67,24 @@ class TwinLanes(LaneRun):
     """
 
     def __init__(
-        self, run: FusedRun, count: int, ticks: int, feed: ReplayedInputs, kept: int
+        self,
+        run: FusedRun,
+        count: int,
+        ticks: Sequence[int],
+        feed: ReplayedInputs,
+        kept: int,
     ) -> None:
+        """Copies the initial state of the run into the lanes of the run and of all twins."""
         super().__init__([run], 1 << kept.bit_length())
         self._count = count
         self._feed = feed
         # The run and its twins have the same initial state, which all lanes contain already.
         self.runs = [run] * count
         self._states[:] = self._states[:, :, :1]
-        run.plan([ticks] * self._sites)
+        run.plan(ticks)
         self._widen_peaks(run.memory.peaks.shape[1])
-        self._planned_ticks = ticks
-        self._last_ticks = 0
+        self._planned_ticks = np.array(ticks)
+        self._last_ticks = self._ticks.copy()
         floats: list[tuple[Words, NDArray[np.bool_]]] = [
             (self._site, mark_floats(self._layout.site)),
             (self._links, mark_floats(self._layout.link)),
@@ -95,37 +102,25 @@ class TwinLanes(LaneRun):
         Raises:
             LaneEndedError: An arm left its limits, or a law failed.
         """
-        self._last_ticks = self._ticks
-        ticks = min(first_tick_at(last_ns + 1, self._rate_hz), self._planned_ticks)
+        self._last_ticks = self._ticks.copy()
+        ticks = [first_tick_at(last_ns + 1, rate_hz) for rate_hz in self._rates_hz.tolist()]
         try:
-            self._step_to(ticks)
+            self._step_to(np.minimum(ticks, self._planned_ticks))
         except Exception as error:  # a law may raise any exception
             raise LaneEndedError from error
         if (self._ended.ticks[: self._count] >= 0).any():
             raise LaneEndedError
 
-    def _use_samples(self, first: int, count: int) -> int:
-        """Determines which samples (states of other sites) the sites use in a block of ticks.
-
-        A run and its twins use the same samples in the same ticks (control periods). Therefore
-        the samples are determined for the run, either from the simulated network or from the
-        arrivals of a log, and copied for the twins.
-
-        Args:
-            first: First tick of the block.
-            count: Number of ticks.
-
-        Returns:
-            The largest age of a sample in use, in ticks.
-        """
+    def _use_samples(self, end: IntArray) -> int:
+        """Computes which samples the runs use in a block of ticks: all use the same."""
         if self._feed.first.shape[2] == 0:
-            age = super()._use_samples(first, count)
+            age = super()._use_samples(end)
         else:
             tables = self.runs[0].memory.tables
             age = use_recorded_samples(
-                first=first,
-                count=count,
-                rate_hz=self._rate_hz,
+                first=self._ticks,
+                end=end,
+                rates_hz=self._rates_hz,
                 feed=self._feed,
                 links=tables.links,
                 models=tables.models,
@@ -141,10 +136,12 @@ class TwinLanes(LaneRun):
         self._used[:, :, 1:lanes] = self._used[:, :, :1]
         return age
 
-    def read_times(self) -> IntArray:
-        """Returns the nominal times of the ticks of the last call of `step_to`, ns."""
+    def read_times(self, i: int) -> IntArray:
+        """Returns the times of the ticks of site i in the last call of `step_to`, ns."""
         # The equation of `tick_ns`.
-        return np.arange(self._last_ticks, self._ticks) * NS_PER_S // self._rate_hz
+        ticks = np.arange(self._last_ticks[i], self._ticks[i])
+        times_ns: IntArray = ticks * NS_PER_S // self._rates_hz[i]
+        return times_ns
 
     def read_records(self, i: int, columns: slice, runs: slice) -> Array:
         """Returns numbers of the ticks that the last call of `step_to` executed.
@@ -158,7 +155,7 @@ class TwinLanes(LaneRun):
         Returns:
             The numbers, shape (ticks, columns, runs).
         """
-        pages = np.arange(self._last_ticks, self._ticks) % self._records.shape[1]
+        pages = np.arange(self._last_ticks[i], self._ticks[i]) % self._records.shape[1]
         records: Array = self._records[i, :, columns, runs].view(np.float64)[pages]
         return records
 

@@ -69,6 +69,7 @@ class IndexedRecords:
         marks: NDArray[np.int32],
         counts: NDArray[np.int32],
     ) -> None:
+        """Stores the records, and where `index_records` has found their values."""
         self.messages = messages
         self._peers = peers
         self._layout = layout

@@ -143,6 +143,7 @@ class JointStatePacker:
     def __init__(
         self, names: Sequence[str], *, velocity: bool = True, effort: bool = True
     ) -> None:
+        """Computes the layout of the messages from the names of the joints."""
         # The names follow the stamp of 8 bytes and an empty frame.
         frame = ""
         self._names = _pack_fields(8, frame, len(names), *names)
@@ -196,6 +197,7 @@ class TransformPacker:
     """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
+        """Computes the layout of the messages from the names of the frames."""
         self._names: list[bytes] = []
         struct_format = "<4sI"
         # The number of transforms takes the first 4 bytes.

@@ -181,6 +181,7 @@ class _ArrayChannel:
     """
 
     def __init__(self, content: str, unit: str, *entry_names: Sequence[str]) -> None:
+        """Describes the channel, and prepares the encoding of its arrays."""
         joined_names = [" ".join(axis_entries) for axis_entries in entry_names]
         metadata = {
             "content": content,
@@ -225,6 +226,7 @@ class Ros2SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
+        """Describes all channels of the site from its arm and its peers."""
         arm = scenario.arms[site]
         self._arm = arm
         self._peers = scenario.peers(site)

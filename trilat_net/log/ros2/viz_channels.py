@@ -465,6 +465,7 @@ class VizChannels:
         views_hz: float,
         put: PutMessage,
     ) -> None:
+        """Prepares the channels of the session and of each site. No message is written yet."""
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
 
@@ -537,6 +538,8 @@ class VizChannels:
 
 def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
     """Returns the function with which a `LogWriter` creates its messages for viewers.
+
+    The writer itself does not depend on ROS: it calls this function for each file of a log.
 
     Args:
         scenario: Scenario of the session.

@@ -235,6 +235,7 @@ def _write(
         raise UsageError(
             f"fps must be a whole number of frames per second, at least 1, not {fps}"
         )
+
     if actions:
         _check_choice("actions", actions, ACTIONS)
     _check_choice("observations", observations, OBSERVATIONS)
@@ -345,6 +346,7 @@ def _write(
         text += f"; observations as the plugin makes them at {plugin_site}"
     if not has_program:
         return f"{text}; no program moved an arm, so there is no column intervention"
+
     found = "" if program else " (found in the log)"
     return f"{text}; the program is {program_text}{found}"
 
@@ -518,6 +520,7 @@ def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
             f"{log.source}: the log has no records of {sites_text}; records of a site that has "
             "diverged do not count"
         )
+
     stamps_ns = {}
     for site, site_rows in rows.items():
         records = log[site]
@@ -543,6 +546,7 @@ def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
 
     if not is_fresh.any():
         raise LogError(f"{log.source}: there is no time for which every site has a record")
+
     attempt = np.full(len(frame_ns), -1)
     for index, part in enumerate(attempts):
         is_inside = frame_ns >= part.begin_ns
@@ -556,6 +560,7 @@ def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
             f"{log.source}: no marked episode contains a time for which every site has a "
             "record; without episodes=marks the whole log is one episode"
         )
+
     chosen_attempt = attempt[chosen]
     frame_steps = np.diff(chosen, prepend=chosen[0])
     attempt_steps = np.diff(chosen_attempt, prepend=chosen_attempt[0])
@@ -736,7 +741,10 @@ def _read_commands(
     rows: dict[str, Ints],
     actions: str,
 ) -> tuple[list[Array], list[str]]:
-    """Returns the commands of every user.
+    """Returns the commands of every user, which a learning program takes as the actions.
+
+    A user commands the robot by moving a master arm. The commands are therefore the positions
+    of its end effector, the poses that the sites exchange, or its joint angles.
 
     Args:
         log: Log of the run that is exported.
@@ -760,6 +768,7 @@ def _read_commands(
             qd = records.qd[user_rows]
             end_effector = arm_rows.place_end_effector(q, qd)
             positions.append(end_effector.position)
+
         axis_count = positions[0].shape[1]
         axes = TASK_AXES[:axis_count]
         return positions, [f"{axis}.pos" for axis in axes]
@@ -771,6 +780,7 @@ def _read_commands(
             user_rows = rows[user]
             exchanged_poses = log[user].x[user_rows]
             poses.append(expand_poses(exchanged_poses))
+
         names = [f"{axis}.pos" for axis in TASK_AXES[:POSITION]]
         names += [f"{entry}.rot" for entry in MATRIX_ENTRIES]
         entry_count = poses[0].shape[1]
@@ -783,6 +793,7 @@ def _read_commands(
                 f"{log.source}: {user} and {first_user} have different joints, so the two "
                 "users have no common action: use --actions tip"
             )
+
     angles = []
     for user in users:
         user_rows = rows[user]

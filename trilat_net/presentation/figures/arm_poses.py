@@ -409,6 +409,8 @@ def _measure_picture(
 ) -> dict[str, Any]:
     """Returns the values that the SVG template of a pose needs: lines, joints and view box.
 
+    The page of the report contains such a picture for each arm, at a few times.
+
     Args:
         pose: The pose in units of the picture. None for a picture without an arm.
         index: Index of the site, on which its colour depends.

@@ -82,9 +82,11 @@ def draw_compared_runs(
             f"not {len(logs)}; "
             "overlay can be drawn for more"
         )
+
     sites = list_common_sites(logs)
     if not sites:
         raise UsageError(f"{name}: the logs have no site in common")
+
     signal = COMPARED_SIGNALS[name]
     first_log = next(iter(logs.values()))
     titles = style.name_shared(first_log) if signal.shares_poses else []

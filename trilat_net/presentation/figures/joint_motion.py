@@ -87,6 +87,9 @@ def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def _explain_absent_displacement(log: Log) -> str:
     """Returns the reason why a run cannot be repeated without its operators.
 
+    The displacement of an arm by its operators is the difference between a run and its
+    repetition without operators.
+
     Returns:
         The reason: there are no operators, or the code of a user's control law may not run
         here. Empty if the run can be repeated.
@@ -312,6 +315,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
     row_in = 0.95 if form.narrow else 1.25
     height_in = choose_height_in(log, 0.7 + row_in * len(log.sites))
+
     with style.time_figure(log, form, height_in) as plot:
         grid, lowest = add_joint_rows(
             figure=plot.figure, log=log, form=form, heads=heads, labels=labels, sharey="col"
@@ -380,6 +384,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             ylabel=f"largest error\nstill to come ({unit})",
         )
         plot.mark(settling_panel, log.sites)
+
         entries = style.site_legend_entries(log, log.sites)
         entries.append((f"settling limit: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE))
         plot.finish([*panels.lowest, settling_panel], entries)
@@ -567,6 +572,7 @@ def _draw_estimate(
     if all_are_equal:
         axes.axhline(true_values[sites[0]], **style.LIMIT_LINE)
         return
+
     for site, true_value in true_values.items():
         line = {**style.LIMIT_LINE, "color": style.site_colour(plot.log, site)}
         axes.axhline(true_value, **line)
@@ -667,6 +673,8 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
     """Draws the path of a point in a plane, with a ring at its start and a disc at its end.
+
+    A pair of coordinates, such as an error and its rate, becomes a curve without a time axis.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

@@ -281,6 +281,7 @@ def _find_figure(log: Log, name: str) -> FigureEntry:
         if not hint:
             hint = f"; the figures are {', '.join(FIGURES)}"
         raise UsageError(f"there is no figure {name!r}{hint}")
+
     entry = FIGURES[name]
 
     reason = entry.absent(log)

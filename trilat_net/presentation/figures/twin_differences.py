@@ -283,6 +283,7 @@ def _draw_rate(
     """
     if not np.isfinite(rated.rate_per_s) or rated.trend is EnvelopeTrend.UNDECIDED:
         return
+
     from_s = pushed.growth.from_s
     to_s = pushed.growth.to_s
     if rated.ended_s is not None:
@@ -357,6 +358,9 @@ def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
 
 def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
     """Draws the speed of the fastest joint of every site of the run, in rad/s.
+
+    The panel above shows how the differences between the run and its slightly pushed
+    repetitions change. Both panels have the same time axis.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

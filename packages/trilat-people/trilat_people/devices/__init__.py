@@ -29,6 +29,7 @@ def open_device(text: str) -> Device:
             f"--device must be one of {', '.join(device_names)}, "
             f"optionally followed by =ADDRESS, not {text!r}"
         )
+
     module = import_module(f"{__name__}.{name}")
 
     # The class of the file spacemouse.py is SpaceMouse: equal except for capitals and "_".

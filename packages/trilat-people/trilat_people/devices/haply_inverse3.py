@@ -151,6 +151,7 @@ class HaplyInverse3:
         """
         if self._socket is None or not self._id:
             return
+
         force = {self._force_key: dict(zip("xyz", force_n, strict=True))}
         command = {"device_id": self._id, "commands": {"set_cursor_force": force}}
         message = self._configuration | {"inverse3": [command]}

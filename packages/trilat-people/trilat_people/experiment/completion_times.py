@@ -266,9 +266,11 @@ def _compare(
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
     untied = longer + shorter
-    p = None
+
+    p_value = None
     if untied > 1:  # a single unit cannot show a difference
-        p = float(import_scipy_stats().binomtest(longer, untied).pvalue)
+        p_value = float(import_scipy_stats().binomtest(longer, untied).pvalue)
+
     return CompletionComparison(
         first=first,
         second=second,
@@ -276,7 +278,7 @@ def _compare(
         longer=longer,
         shorter=shorter,
         difference=_find_median_difference(pairs),
-        p=p,
+        p=p_value,
     )
 
 
@@ -294,6 +296,7 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
     """
     if not pairs:
         return None
+
     lower_bounds: list[float] = []
     upper_bounds: list[float] = []
     for first_s, second_s in pairs:

@@ -62,13 +62,16 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
     interval_style = {**_MEAN, "marker": "_", "zorder": 3}
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, measure)
+
         for columns, values in _list_unit_lines(means):
             axes.plot(columns, values, **_USER)
+
         summaries = summarise_conditions(rows, measure, unit=unit)
         for column, summary in enumerate(summaries):
             _plot_interval(axes, column, summary, interval_style)
             axes.plot([column], [summary.mean], zorder=3, **_MEAN)
         _label_conditions(axes, means)
+
         legend = [
             (f"a {unit}", _USER),
             ("mean, 95 % interval", _MEAN),
@@ -229,6 +232,7 @@ def draw_learning(
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
+
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, measure)
         styles_by_condition = _assign_looks(rows)
@@ -292,6 +296,7 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
         axes.axhline(limit_s, **_LIMIT)
+
         styles_by_condition = _assign_looks(rows)
         for condition, look in styles_by_condition.items():
             trials: list[Any] = []
@@ -302,6 +307,7 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
                 median_s = find_median(unit_medians_s)
                 trials.append(trial)
                 medians_s.append(median_s)
+
             _plot_times(axes, trials, medians_s, limit_s, look)
         _label_trials(axes)
         legend = [*styles_by_condition.items(), ("time limit; open: not reached", _LIMIT)]

@@ -402,6 +402,7 @@ class ExperimentAnalysis(Result):
         """
         if not self._is_reaching:
             return
+
         trials_by_group: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for row in self.rows:
             group = (row[self.unit], row["condition"])
@@ -493,6 +494,7 @@ class ExperimentAnalysis(Result):
         staircase = plan.protocol.staircase
         if staircase is None:
             return
+
         # Each block has a staircase, which its first trial stands for.
         first_trials = [trial for trial in plan.trials if trial.trial == 1]
         for planned in first_trials:

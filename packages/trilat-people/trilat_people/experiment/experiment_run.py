@@ -420,11 +420,13 @@ class Experiment(Result):
                 "text": note.text,
             }
             events.append(event)
+
         tables = {
             TRIALS_FILE: self.to_rows(),
             "questionnaires.csv": self.list_answers(),
             "events.csv": events,
         }
+
         for name, rows in tables.items():
             if rows or name == TRIALS_FILE:
                 text = encode_csv(rows)
@@ -637,6 +639,8 @@ def run_experiment(
 
 def list_log_problems(experiment: Experiment) -> Iterator[str]:
     """Yields a sentence for each finished trial whose log is missing or was changed.
+
+    A log proves what happened in its trial. The journal contains the checksum of each log.
 
     Args:
         experiment: The experiment in its folder.

@@ -141,6 +141,7 @@ def sparc(
     above_threshold = np.flatnonzero(spectrum >= threshold)
     if above_threshold.size == 0 or above_threshold[0] == above_threshold[-1]:
         return None
+
     first_index = above_threshold[0]
     last_index = above_threshold[-1]
     curve = spectrum[first_index : last_index + 1]
@@ -301,6 +302,7 @@ def measure_throughput(
     smallest_width = 1e-12 * float(lengths.max())
     if width <= smallest_width or distance <= 0.0:
         return None
+
     relative_distance = distance / width
     return Throughput(
         width_m=width,
@@ -443,6 +445,7 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
         raise UsageError(
             f"ratings are given for {rated}, but NASA-TLX needs a rating for each of {scales}"
         )
+
     for scale, rating in ratings.items():
         if not 0.0 <= rating <= 100.0:
             raise UsageError(
@@ -504,6 +507,7 @@ def sus_score(answers: Sequence[int]) -> float:
     if len(answers) != 10:
         count = count_nouns(len(answers), "answer was", "answers were")
         raise UsageError(f"{count} given, but SUS has 10 questions")
+
     for number, answer in enumerate(answers, 1):
         if answer not in (1, 2, 3, 4, 5):
             raise UsageError(

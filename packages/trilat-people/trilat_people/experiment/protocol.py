@@ -480,6 +480,7 @@ class ExperimentPlan(Result):
 
         if training is not None and starts_retention:
             return training.rest_s
+
         starts_later_block = planned.trial == 1 and planned.block > 1
         if starts_later_block:
             return self.protocol.rest_s
@@ -487,6 +488,9 @@ class ExperimentPlan(Result):
 
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order in which each group of participants gets the conditions.
+
+        Participants get better with practice. Therefore the groups meet the conditions in
+        different orders.
 
         Returns:
             Names of the conditions in order, by the name of the group, for example {"P01-P02":
@@ -773,6 +777,7 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
         raise ScenarioError(
             "the slave has no wall to press against", path=f"sites.{slave}.environment"
         )
+
     user_shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
     needs_shares = protocol.training is not None or protocol.task.needs_pair
     if needs_shares and min(user_shares) <= 0.0:

@@ -209,6 +209,7 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
             interval=None,
             bootstrap=None,
         )
+
     return ConditionMean(
         condition=condition,
         number=len(values),
@@ -640,6 +641,7 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
             f"the number of units is {number} and alpha is {alpha}: "
             "give at least two units, and an alpha between 0 and 1"
         )
+
     stats = import_scipy_stats()
     shift = abs(d_z) * math.sqrt(number)  # noncentrality of the t statistic
     freedom = number - 1
@@ -654,6 +656,8 @@ def find_least_number(
     d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
 ) -> int:
     """Returns the smallest number of participants (or pairs) that gives a test enough power.
+
+    The power is the probability that the test finds the effect if it exists.
 
     Args:
         d_z: Size of the effect: mean over standard deviation of the differences.

@@ -160,6 +160,7 @@ class SyntheticParticipant:
 
         if goal.is_moving:
             return self._follow(now, error_m, slave.age_s)
+
         if goal.force_n and now.t_s > goal.appears_s:
             press_step_m = self._find_press_step(slave, now.t_s)
             if press_step_m.any():
@@ -250,6 +251,7 @@ class SyntheticParticipant:
         touches_wall = bool(force_n)
         if not touches_wall:
             return 0.0 * full_step_m
+
         missing_share = 1.0 - force_n / goal.force_n
         return full_step_m * missing_share
 

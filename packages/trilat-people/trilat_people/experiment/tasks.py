@@ -267,8 +267,8 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     def needs_pair(self) -> bool:
         """True if the task needs two users.
 
-        This is so if the first user hands the control of the slave arm over to the second user
-        during the trial.
+        A second user is needed to receive the control of the slave arm from the first user
+        during the trial (handover).
         """
         return self.handover_s is not None
 
@@ -429,6 +429,7 @@ class _ReachGoal(_DwellGoal):
         errors_m = distances_m[is_handover]
         if not len(errors_m):
             return {}
+
         largest_error_m = float(errors_m.max())
         return {"error_handover_mm": 1e3 * largest_error_m}
 
@@ -632,8 +633,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     def needs_pair(self) -> bool:
         """True if the tracking task needs two users.
 
-        This is so if the users see different targets and must therefore agree on a position of
-        the slave arm.
+        The two users then see different targets, and must agree on a position of the slave arm.
         """
         return self.apart_m > 0.0
 

@@ -140,6 +140,9 @@ class _MotionSamples(NamedTuple):
 class ExperimentTrial:
     """One trial of an experiment with people: its scenario, its goal, and its result.
 
+    A trial is one execution of a task by the participants, for example to move the arm to a
+    target.
+
     Args:
         protocol: Protocol of the experiment, with the task and the users.
         scenario: Scenario of the condition: the arms, their control and the network.
@@ -212,6 +215,7 @@ class ExperimentTrial:
         goal = self.make_goal()
         if goal.lead is None:
             return scenario
+
         slave_factors = scenario.dominance[self.slave]
         first, second = self.protocol.users
         sum_of_shares = slave_factors[first] + slave_factors[second]
@@ -315,9 +319,11 @@ class ExperimentTrial:
         log = open_log(path)
         if not verify(log).passed:
             raise LogError(f"{path}: the records differ from those of a repeated run")
+
         outcome = self._judge_log(log)
         if outcome is None:
             raise LogError(f"{path}: the log ends before the trial does")
+
         return TrialEntry(
             cell=self.planned.number,
             seed=self.planned.seed,

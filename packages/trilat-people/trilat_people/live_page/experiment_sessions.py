@@ -102,6 +102,7 @@ class ExperimentSessions:
                     is_done = True
                 else:
                     is_done = self._run_trial(step)
+
                 if not is_done:
                     return False
             self.stage.show_end()
@@ -288,8 +289,8 @@ class ExperimentSessions:
         def begins() -> bool:
             """Returns True once all participants have said on their pages that they are ready.
 
-            The session waits for this before its first tick. When it is so, the pages change to
-            the picture of the trial.
+            The session waits for this before its first tick. Then the pages change to the
+            picture of the trial.
             """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):

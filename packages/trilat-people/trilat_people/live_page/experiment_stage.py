@@ -75,8 +75,8 @@ class TrialWatch:
     def over(self) -> bool:
         """True once the session of the trial can end.
 
-        This is so at once after an abort, and `END_DELAY_NS` after the outcome, so that the log
-        contains what follows.
+        After an abort, the session can end at once. After the outcome, it continues for
+        `END_DELAY_NS`, so that the log contains what follows.
         """
         if self.aborted:
             return True
@@ -285,6 +285,9 @@ class Stage:
     def show_feedback(self, entry: TrialEntry | None, why: str = "") -> None:
         """Shows the participants the result of a trial, or why the trial must be repeated.
 
+        Participants see only those measures of the trial that the protocol of the experiment
+        selects.
+
         Args:
             entry: Result of the trial. None if it must be repeated.
             why: Reason for the repetition.
@@ -335,6 +338,7 @@ class Stage:
 
         if self._watch is None:
             return []
+
         if view.running and self._phase == "starting":
             self._phase = "trial"
 
@@ -364,6 +368,7 @@ class Stage:
         request = self._request
         if request is None or self._clock.monotonic_ns() < request.from_ns:
             return False
+
         is_for_this_step = message.key == request.step.key
         if not is_holder or not is_for_this_step:
             return False
@@ -449,6 +454,8 @@ class Stage:
 
     def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
         """Describes the users for all pages: pseudonym, and whether they are present or done.
+
+        The experimenter sees there for whom the experiment waits.
 
         Args:
             step: The step that they have to complete.

@@ -86,6 +86,7 @@ class PageFiles:
         asset = self._assets.get(path)
         if asset is None:
             return None
+
         media_type, content = asset
         # The start page has a token in its address, and must not be stored.
         cache_control = "no-store" if path in ("/", "/index.html") else "no-cache"

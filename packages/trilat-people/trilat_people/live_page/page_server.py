@@ -233,15 +233,20 @@ class Page:
         self.hands = hands
         self.takes_part = takes_part
         self.asks: tuple[set[Page], int] | None = None
+
+        # Frames that were sent and drawn.
         self.wake = asyncio.Event()
         self.drawn = 0
         self.sent = 0
         self.notified = 0
         self.unseen: deque[int] = deque()
+
+        # What the page has received of growing lists.
         self.points = 0
         self.energies = 0
         self.events = 0
         self.greeted = False
+
         self.limits = MessageLimits()
         self.excess = 0
 
@@ -397,6 +402,7 @@ class PageServer:
             raise UsageError(
                 f"{self._host}:{self._port}: cannot listen: {self._problem.strerror}"
             )
+
         self._say(f"experimenter: {self.address}")
         if self._opens and sys.stdout.isatty() and _has_screen():
             self._opening = BrowserOpening(self.address)
@@ -567,6 +573,7 @@ class PageServer:
         are_users_known = scenario is not None or self._stage is not None
         if self._links_are_printed or not are_users_known:
             return
+
         self._links_are_printed = True
         if self._stage is not None:
             users = [*self._stage.users]
@@ -687,6 +694,7 @@ class PageServer:
         # The name of another web site may resolve to this machine (DNS rebinding).
         if self._is_local and name not in HERE:
             return "foreign host"
+
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{self._scheme}://{host}":
             return "foreign origin"
@@ -745,6 +753,7 @@ class PageServer:
         page = choose_page_to_close(self._pages, role)
         if page is None:
             return
+
         self._pages.discard(page)
         page.takes_part = False
         page.hands.release()
@@ -1086,6 +1095,7 @@ class PageServer:
         notices = [notice for notice in self._notices if notice["n"] > page.notified]
         if page.role.kind == "experimenter":
             return notices
+
         refused_stops: list[dict[str, Any]] = []
         for notice in notices:
             is_refused_stop = notice["of"] == topics.STOP and not notice["ok"]

@@ -145,6 +145,7 @@ class _ArmFrames:
         hand = self._hand
         if hand is None:
             return None
+
         device = hand.device
         axis_count = self._model.counts.axes
         centre, _, outer_m, *_ = self._model.reach
@@ -280,6 +281,7 @@ class _ArmFrames:
         """
         if not records.hand.size:
             return {}
+
         last_values = records.hand[-1].tolist()
         grip = HandInForce.read(last_values)
         hand = self._hand
@@ -330,6 +332,7 @@ class _ArmFrames:
         """
         if not self._spec.arm.known:
             return []
+
         motion = split.end_effector
         last_motion = EndEffectorRows(
             position=motion.position[-1:],
@@ -467,6 +470,7 @@ class SessionFrames:
         has_all_records = all(site.record is not None for site in view.sites.values())
         if not view.running or not has_all_records:
             return None
+
         if not self._arms:
             self.describe()
 
@@ -491,6 +495,7 @@ class SessionFrames:
         silence_s = 0.0
         if not view.ended:
             silence_s = round(view.session_silence_s, 1)
+
         return {
             "t": t_s,
             "sites": sites,
@@ -525,6 +530,7 @@ class SessionFrames:
         new_energies = self._view.advance_energy()
         if new_energies is None:
             return
+
         columns = [column.tolist() for column in new_energies]
         for t_s, V, supplied in zip(*columns, strict=True):
             next_point_s = self._energy_s + ENERGY_PERIOD_S
@@ -545,6 +551,7 @@ class SessionFrames:
         constants = self.describe()
         if not constants["running"]:
             return constants
+
         hidden: Json = {
             "about": "",
             "links": {},

@@ -90,6 +90,8 @@ class Tail(Generic[T]):
     def since(self, count: int, most: int) -> list[T]:
         """Lists the entries that a reader does not know yet.
 
+        A page receives in this way only the new events, and not all of them again.
+
         Args:
             count: Number of entries that had been added when the reader last asked.
             most: Largest number of entries to return. Older ones are left out.
@@ -182,6 +184,7 @@ class SiteView:
         record = self.record
         if record is None or not self.glides or self.ended:
             return None
+
         lost_peers: Sequence[str] = ()  # peers without which the site continues
         if self.layout is not None:
             lost_peers = self.layout.list_lost_peers(record.mem, self.peers)
@@ -468,6 +471,9 @@ class SessionView:
     def _create_sites(self, scenario: Scenario) -> None:
         """Creates the view of each site, the tables of the links and the energy of the session.
 
+        This is possible only when all sites run, because the energy is that of all arms
+        together.
+
         Args:
             scenario: Scenario of the session. All of its sites must have replied and run.
         """
@@ -658,9 +664,11 @@ class SessionView:
         """
         if self.scenario is None or self.energy is None:
             return
+
         identity = (site, text)
         if identity in self._applied_changes:
             return
+
         self._applied_changes.add(identity)
 
         try:

@@ -136,6 +136,7 @@ class SessionWatch:
                 f"people and walls gave {course.supplied[-1]:.4g} J"
             )
             return
+
         energy = view.energy
         if energy is not None and energy.reason:
             self._energy_text = f"no V: {energy.reason}"

@@ -1,0 +1,53 @@
+"""Whole cells of a sweep, which are simulated and judged: processor time of a cell, and of its parts."""
+
+import statistics
+import time
+
+from trilat_studies.sweep.sweep_cell import classify_cell, classify_cells
+from trilat_studies.sweep.sweep_plan import plan_sweep
+
+import trilat_net as tn
+from trilat_net.analysis import SETTLED_ERROR_RAD, RunTrace, judge_virtual_run
+from trilat_net.execution.fused import FusedRun
+from trilat_net.execution.lanes.run_groups import group_runs
+
+CELLS = 64
+DURATION_S = 20.0
+LONGEST_S = 160.0
+OVER = ("control.Kd=1:4:0.2", "control.Lambda=1.5:4.5:1")
+ROUNDS = 3
+
+
+def run() -> list[str]:
+    plan = plan_sweep("free", [f"duration_s={DURATION_S:g}"], over=OVER)
+    scenarios = [plan.scenario(*plan.cell(number).overrides) for number in range(plan.cells)]
+    texts = [scenario.text for scenario in scenarios]
+    assert len(texts) == CELLS
+    list(classify_cells(texts, DURATION_S))  # compiles
+    times_s: dict[str, list[float]] = {}
+    for _ in range(ROUNDS):
+        begun = time.process_time()
+        together = [cell.result for cell in classify_cells(texts, LONGEST_S)]
+        times_s.setdefault("together", []).append(time.process_time() - begun)
+        begun = time.process_time()
+        alone = [classify_cell(text, LONGEST_S) for text in texts]
+        times_s.setdefault("alone", []).append(time.process_time() - begun)
+        assert together == alone
+
+        begun = time.process_time()
+        runs = [FusedRun(scenario, SETTLED_ERROR_RAD) for scenario in scenarios]
+        for group in group_runs(runs):
+            group.advance_to(DURATION_S)
+        times_s.setdefault("simulation", []).append(time.process_time() - begun)
+        begun = time.process_time()
+        for scenario, finished in zip(scenarios, runs, strict=True):
+            end = RunTrace(finished.buckets, finished.tau_x, finished.diverged_s)
+            judge_virtual_run(scenario, finished, end.classify_end(scenario))
+        times_s.setdefault("judgement", []).append(time.process_time() - begun)
+    ms = {name: 1e3 * statistics.median(values) / CELLS for name, values in times_s.items()}
+    return [
+        f"{CELLS} cells of {DURATION_S:g} s of free, simulated and judged, processor time per cell:",
+        f"  side by side {ms['together']:.1f} ms, one by one {ms['alone']:.1f} ms",
+        f"  of it {ms['simulation']:.1f} ms simulation side by side, and {ms['judgement']:.1f} ms judgement",
+        f"  (median of {ROUNDS}, trilat-net {tn.__version__})",
+    ]

@@ -1,0 +1,57 @@
+"""Sums, maxima and tests over the few numbers in each row of a long array.
+
+The records of a run are arrays with ten thousands of rows and one column per joint. NumPy
+reduces each row of such an array in a loop of its own, which takes about ten times as long as
+to combine whole columns.
+
+Invariant:
+    - The results have the same bits as those of NumPy's reductions along the last axis.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Array
+
+_SEQUENTIAL_COLUMNS = 7
+"""Largest number of columns that NumPy adds one after the other. It adds more in pairs."""
+
+
+def sum_rows(values: Array) -> Array:
+    """Returns the sum of each row, shape (K,).
+
+    Args:
+        values: Numbers, shape (K, n).
+    """
+    columns = values.shape[1]
+    if not 1 <= columns <= _SEQUENTIAL_COLUMNS:
+        sums: Array = values.sum(axis=1)
+        return sums
+    total = values[:, 0].copy()
+    for column in range(1, columns):
+        total += values[:, column]
+    return total
+
+
+def max_rows(values: Array) -> Array:
+    """Returns the largest number of each row, shape (K,). A row with NaN gives NaN.
+
+    Args:
+        values: Numbers, shape (K, n), with at least one column.
+    """
+    largest = values[:, 0].copy()
+    for column in range(1, values.shape[1]):
+        np.maximum(largest, values[:, column], out=largest)
+    return largest
+
+
+def any_in_rows(values: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Returns for each row whether any of its values is true or not zero, shape (K,).
+
+    Args:
+        values: Numbers or truth values, shape (K, n).
+    """
+    is_any = np.zeros(len(values), dtype=np.bool_)
+    for column in range(values.shape[1]):
+        is_any |= values[:, column].astype(np.bool_)
+    return is_any
