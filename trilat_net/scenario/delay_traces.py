@@ -512,7 +512,7 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
     if not measurement.samples:
         raise ValueError("the file has no samples")
     samples = sorted(measurement.samples, key=lambda sample: sample[0])
-    first_s = samples[0][0]
+    first_s, _ = samples[0]
     points = []
     too_long = 0
     doubled = 0
@@ -522,15 +522,18 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
         if t_us <= previous_us:
             doubled += 1
             continue
+        previous_us = t_us
+
         # NaN is refused as well
         if not delay_ms >= 0.0:
             raise ValueError(
                 f"a delay of {delay_ms:g} ms is impossible: if the two clocks do not agree, "
                 "use half of the round trip"
             )
-        previous_us = t_us
-        too_long += LONGEST_MS < delay_ms < math.inf
-        points.append((t_us * 1e-6, delay_ms if delay_ms <= LONGEST_MS else math.inf))
+        # A message that took longer than a link may take counts as lost.
+        is_too_long = LONGEST_MS < delay_ms < math.inf
+        too_long += int(is_too_long)
+        points.append((t_us * 1e-6, math.inf if is_too_long else delay_ms))
 
     trace = MeasuredTrace(
         points=tuple(points[:MAX_TRACE_POINTS]),

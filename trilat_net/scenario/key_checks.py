@@ -61,6 +61,20 @@ class VectorCounts(NamedTuple):
         )
 
 
+def find_extra(hint: Any, name: str) -> str | None:
+    """Returns what the annotation of a type states in `Meta.extra` under a name.
+
+    For example, `Annotated[str, Meta(extra={"must_be": "a name"})]` states "a name" under
+    "must_be". None if the type states nothing under this name.
+    """
+    # Only a type of the form `Annotated[type, ...]` has this attribute.
+    for annotation in getattr(hint, "__metadata__", ()):
+        extra = annotation.extra if isinstance(annotation, Meta) else None
+        if extra is not None and name in extra:
+            return str(extra[name])
+    return None
+
+
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
     """Finds which keys of a table are vectors, and on which count the length of each depends.
@@ -83,11 +97,9 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
     for key, hint in get_type_hints(kind, include_extras=True).items():
         # A limit of a site is a union of a number and a vector.
         for member in (hint, *get_args(hint)):
-            # Only a type of the form `Annotated[type, ...]` has this attribute.
-            for annotation in getattr(member, "__metadata__", ()):
-                values = annotation.extra if isinstance(annotation, Meta) else None
-                if values is not None and extra in values:
-                    count_names[key] = str(values[extra])
+            count_name = find_extra(member, extra)
+            if count_name is not None:
+                count_names[key] = count_name
     return count_names
 
 

@@ -19,7 +19,6 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
-from msgspec import Meta
 
 from ..errors import ScenarioError
 from ..fields import WITHOUT_QUOTES, TomlTable, reword_problem
@@ -29,7 +28,13 @@ from .distributions import (
     StatedDistribution,
     dotted_key,
 )
-from .key_checks import describe_unknown_key, field_names, is_distribution, list_fields
+from .key_checks import (
+    describe_unknown_key,
+    field_names,
+    find_extra,
+    is_distribution,
+    list_fields,
+)
 
 _MESSAGE = re.compile(r"(?P<problem>.*) - at `\$(?P<location>.*)`", re.DOTALL)
 """Matches a message of msgspec about a value inside a table."""
@@ -388,12 +393,8 @@ def _strip_annotation(hint: Any) -> Any:
 
 def _find_extra(kind: Any, location: Location, name: str) -> str | None:
     """Returns what the annotation of a value states in `Meta.extra` under a name, or None."""
-    for hint in _list_hints(kind, location):
-        for annotation in getattr(hint, "__metadata__", ()):
-            extra = annotation.extra if isinstance(annotation, Meta) else None
-            if extra is not None and name in extra:
-                return str(extra[name])
-    return None
+    extras = (find_extra(hint, name) for hint in _list_hints(kind, location))
+    return next((extra for extra in extras if extra is not None), None)
 
 
 def _list_keys(hint: Any) -> tuple[str, ...]:

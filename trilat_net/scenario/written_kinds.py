@@ -15,7 +15,7 @@ from msgspec import UNSET, Meta
 
 from ..fields import Frozen, TomlTable
 from .distributions import StatedDistribution
-from .key_checks import StructType, list_fields
+from .key_checks import StructType, find_extra, list_fields
 
 
 @cache
@@ -45,29 +45,37 @@ def written_kind(
 def written_type(hint: Any, takes_distributions: bool) -> Any:
     """Returns the type that an author may write for the type of a complete value.
 
+    For example, a number may be a number or a distribution, and a vector with one entry per
+    joint may be a number, a distribution, or a list of both.
+
     Args:
         hint: Type of the complete value.
         takes_distributions: Whether a random distribution may stand for a number.
     """
-    base, annotations = _split_annotation(hint)
+    base, _ = _split_annotation(hint)
     origin = get_origin(base)
     if base is float and takes_distributions:
         return hint | StatedDistribution
+
     if origin in (Union, UnionType):
         # TOML has no None: a key is left out instead.
         members = [member for member in get_args(base) if member is not type(None)]
         written_members = [written_type(member, takes_distributions) for member in members]
         return Union[tuple(written_members)]  # noqa: UP007 - the members are computed
+
     if origin is dict:
         return dict[str, written_type(get_args(base)[1], takes_distributions)]  # type: ignore[misc]
+
     if origin is tuple:
-        is_vector = any(meta.extra and "per" in meta.extra for meta in annotations)
+        is_vector = find_extra(hint, "per") is not None
         written_list = _list_type(hint, takes_distributions)
         if not (is_vector and takes_distributions):
             return written_list
         return written_type(get_args(base)[0], takes_distributions) | written_list
+
     if isinstance(base, type) and issubclass(base, msgspec.Struct):
         return written_kind(base, takes_distributions=takes_distributions)
+    # texts, choices, whole numbers, and true or false
     return hint
 
 
@@ -86,9 +94,9 @@ def _list_type(hint: Any, takes_distributions: bool) -> Any:
         return list[TomlTable]
 
     entries: Any = list[written_type(entry, takes_distributions)]  # type: ignore[misc]
-    for annotation in annotations:
-        if annotation.extra and "per" in annotation.extra:
-            return Annotated[entries, Meta(extra=annotation.extra)]
+    count_name = find_extra(hint, "per")
+    if count_name is not None:
+        return Annotated[entries, Meta(extra={"per": count_name})]
     return Annotated[(entries, *annotations)] if annotations else entries
 
 

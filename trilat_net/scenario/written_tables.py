@@ -5,8 +5,9 @@ needs: most keys may be left out, tables such as `[arm]` hold for all sites, one
 stand for a vector, and a random distribution may stand for a number. `WrittenScenario` is the
 type of such a file, and `scenario_types.Scenario` the type of the complete description.
 
-Tables of which one key decides about the others, such as the law of `[control]`, are checked
-with `check_table` as soon as that key is known.
+The keys of some tables depend on one of their values, such as the law of `[control]`. These
+tables are checked separately, as soon as that value is known: by `check_control`, `check_link`
+and `operators.resolve_operators`.
 
 Invariant:
     - The keys, types and ranges of a group such as `arm` are stated once, in its complete type.
@@ -83,7 +84,9 @@ for _kind in _LINK_TABLES.values():
     # A link may change during a run: msgspec 0.22 crashes if two threads use a type at first.
     msgspec.convert({}, _kind)
 _USER_LAW = "own"
-"""Name that all laws of users have. Each has other keys, which explain no misplaced key."""
+"""Name that all laws of users have. Since their arguments differ, a message about a misplaced
+key does not name them as the owners of the key.
+"""
 
 
 class WrittenSite(Frozen, frozen=True, kw_only=True):
