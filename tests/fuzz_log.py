@@ -18,7 +18,7 @@ import atheris  # type: ignore[import-not-found]
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # what Numba compiles cannot be instrumented
-import trilat_net.core.site  # noqa: F401
+import trilat_net.core.step.site_step  # noqa: F401
 
 with atheris.instrument_imports(
     include=["trilat_net.log", "trilat_net.execution", "trilat_net.app.play", "mcap"]

@@ -74,7 +74,7 @@ import sys
 import numpy as np
 from numba.core import event
 from pathlib import Path
-from trilat_net.core import jit
+from trilat_net.core.step import jit
 jit._SHIPPED = Path(sys.argv[1], jit._SHIPPED.name)
 jit._ships = jit._SHIPPED.is_dir()
 
@@ -84,7 +84,8 @@ class Count(event.Listener):
     def on_end(self, _): pass
 
 event.register("numba:compile", count := Count())
-from trilat_net.core import elementary, philox
+from trilat_net.core.arms import elementary
+from trilat_net.core.links import philox
 for k in range(50):
     print(*(float(one).hex() for one in (
         philox.standard_gamma(np.uint64(5), k, 3, 1.5 + k),

@@ -59,6 +59,16 @@ def test_oscillators_have_several_stable_delay_windows() -> None:
             )
 
 
+def test_undamped_modes_leave_the_margin_finite() -> None:
+    """x'' + 9 x = 2 x(t - T): the response is infinite at 3 rad/s, and roots cross at sqrt(11)."""
+    span = find_delay_margin(
+        loop([[0.0, 1.0], [-9.0, 0.0]], (1.0, [[0.0, 0.0], [2.0, 0.0]]))
+    ).intervals[0]
+    assert span.high is not None
+    assert span.high_s == pytest.approx(math.pi / math.sqrt(11.0), rel=1e-9)
+    assert span.high.omega_rad_s == pytest.approx(math.sqrt(11.0), rel=1e-9)
+
+
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=15)
 def test_verdicts_over_delay_are_the_roots(seed: int) -> None:

@@ -11,7 +11,7 @@ from tests.analysis import logs
 from trilat_net.analysis.certificate.premises import find_unjudged_spans
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import RecordGap, StabilityFinding
-from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.errors import LogError
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.verdict_text import RECORD_GAPS
@@ -31,12 +31,16 @@ def test_every_released_version_is_certified(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("d", "motion", "passed"),
-    [(0.2, EndBehaviour.DIVERGED, False), (3.0, EndBehaviour.DECAYS, True)],
+    ("d", "motion", "stability"),
+    [
+        (0.2, EndBehaviour.DIVERGED, Stability.NOT_STABLE),
+        (3.0, EndBehaviour.DECAYS, Stability.OPEN),
+    ],
 )
 def test_growth_alone_judges_laws_without_functional(
-    d: float, motion: EndBehaviour, passed: bool
+    d: float, motion: EndBehaviour, stability: Stability
 ) -> None:
+    """Records alone prove no such run stable."""
     law = {
         "control.law": "p_d",
         "control.K": 10.0,
@@ -50,7 +54,7 @@ def test_growth_alone_judges_laws_without_functional(
         certificate.verdict.text == "V cannot be judged: m1, m2, s: law p_d has no functional V"
     )
     assert certificate.end.behaviour is motion
-    assert certificate.passed is passed
+    assert certificate.stability is stability
 
 
 def outside(log: Log, *, known: bool) -> Log:

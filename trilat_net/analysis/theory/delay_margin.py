@@ -45,6 +45,8 @@ _POINTS = 600
 """Number of frequencies of the grid, in addition to those near the loop's modes."""
 _LOWEST = 1e-4
 """Lowest frequency of the grid, relative to the highest one at which a crossing is possible."""
+_LEAST_WIDTH = 1e-6
+"""Least distance of grid points near a mode, relative to its frequency."""
 _BISECTIONS = 60
 """Largest number of bisections that locate a crossing."""
 _OUTSIDE = 1.0 + 1e-9
@@ -338,7 +340,8 @@ class _FrequencySweep:
 
         They are evenly spaced on a logarithmic scale. Near the frequency of each oscillating
         mode there are 13 more, within three times the decay rate of the mode, because sharp
-        resonances would fall between the others.
+        resonances would fall between the others. Without decay, the response is infinite at the
+        frequency of the mode, and the points lie on both sides of this frequency.
         """
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)
@@ -346,8 +349,12 @@ class _FrequencySweep:
         oscillates = np.abs(self._modes.imag) > 0.0
         modes = self._modes[oscillates]
         centres = np.abs(modes.imag)[:, np.newaxis]
-        widths = np.abs(modes.real)[:, np.newaxis]
-        offsets = np.linspace(-3, 3, 13)
+        decay_rates = np.abs(modes.real)[:, np.newaxis]
+        least_widths = _LEAST_WIDTH * centres
+        is_undamped = decay_rates < least_widths
+        widths = np.maximum(decay_rates, least_widths)
+        # half a step, so that no point is the frequency of an undamped mode
+        offsets = np.linspace(-3, 3, 13) + 0.25 * is_undamped
         near_modes = centres + widths * offsets
 
         candidates = np.concatenate([even, near_modes.ravel()])
