@@ -703,8 +703,8 @@ class LaneRun:
             old_pages = self._pages
             self._pages *= 2
             states = np.zeros((self._sites, self._pages + 1, *self._states.shape[2:]))
-            for i, ticks in enumerate(self._ticks.tolist()):
-                kept = np.arange(max(ticks - old_pages, 0), ticks)
+            for i, end in enumerate(self._ticks.tolist()):
+                kept = np.arange(max(end - old_pages, 0), end)
                 states[i, kept % self._pages] = self._states[i, kept % old_pages]
             states[:, -1] = self._states[:, -1]
             self._states = states
