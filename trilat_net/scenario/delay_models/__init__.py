@@ -325,8 +325,8 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 
         A sample is the state that a site publishes in one tick. This method is compiled. It may
         use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
-        numbers must come from `core.links.delay.draw_pair`: they are a function of the key of the
-        link and an index, so that a repeated run draws the same numbers (L4).
+        numbers must come from `core.links.delay.draw_pair`: they are a function of the key of
+        the link and an index, so that a repeated run draws the same numbers (L4).
 
         Args:
             now: The sample, and the place for the result.
