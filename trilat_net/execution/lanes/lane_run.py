@@ -392,6 +392,8 @@ class LaneRun:
         self._states = np.zeros((self._sites, self._pages + 1, LANES, width))
         self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
         self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
+        # The samples in use of the kept records, a ring buffer: shape (N, P, LANES, rows).
+        self._used_records = np.zeros((*self._used.shape[:3], 0), np.int64)
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
 
         def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
@@ -515,10 +517,13 @@ class LaneRun:
             self.runs[lane].plan([ticks] * self._sites)
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
         first = self._ticks
+        record_rows = self._records.shape[1]
+        if record_rows > 1 and not self._used_records.size:
+            self._used_records = np.zeros((*self._used.shape[:3], record_rows), np.int64)
         self._step_to(ticks)
         records = None
-        if self._records.shape[1] > 1:
-            count = min(self._ticks - first, self._records.shape[1])
+        if record_rows > 1:
+            count = min(self._ticks - first, record_rows)
             shape = (len(self.runs), self._sites, count, self._layout.floats)
             records = np.empty(shape)
             _copy_records(self._ticks - count, self._records.view(np.float64), records)
@@ -561,6 +566,7 @@ class LaneRun:
         while self._ticks < ticks and running:
             count = min(BLOCK_TICKS, ticks - self._ticks)
             self._keep_states(self._use_samples(self._ticks, count))
+            self._keep_samples_in_use(self._ticks, count)
             running = run_block(
                 first=self._ticks,
                 count=count,
@@ -581,6 +587,20 @@ class LaneRun:
                 ended=self._ended,
             )
             self._ticks += count
+
+    def _keep_samples_in_use(self, first: int, count: int) -> None:
+        """Copies the samples in use of a block of ticks to those of the kept records, if any.
+
+        Args:
+            first: First tick of the block.
+            count: Number of ticks.
+        """
+        rows = self._used_records.shape[3]
+        if not rows:
+            return
+        kept = np.arange(max(count - rows, 0), count)
+        lanes = slice(len(self.runs))
+        self._used_records[:, :, lanes, (first + kept) % rows] = self._used[:, :, lanes, kept]
 
     def _list_present(self) -> EndedRuns:
         """Returns the present state of all runs, as `keep_ended_runs` reads it."""
@@ -630,6 +650,7 @@ class LaneRun:
         ):
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
         self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
+        self._used_records[:, :, : len(lanes)] = self._used_records[:, :, lanes]
         self._ended.ticks[:] = -1
         self._deliveries = keep_link_states(self._deliveries, lanes)
         self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
@@ -661,6 +682,8 @@ class LaneRun:
         # The equation of `tick_ns`.
         sent.t_ns[:, pages] = ticks * NS_PER_S // self._rate_hz
         sent.rows[:, pages] = records[:, ticks - first]
+        rows = ticks % self._used_records.shape[3]
+        sent.used[:, pages] = self._used_records[:, :, lane, rows].transpose(0, 2, 1)
 
     def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
         """Writes the numbers of a lane into its run.

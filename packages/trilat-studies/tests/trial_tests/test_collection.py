@@ -65,8 +65,9 @@ def agree(metrics: RunMetrics, other: RunMetrics) -> None:
         {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333},
         {"limits.qd_limit_rad_s": 0.3},
         {"link.delay_ms": 9000.0},
+        {"sites.m1.hands": [{"kind": "own", "class": "tests.own_code:Circle", "rate_hz": 25}]},
     ],
-    ids=["plain", "random", "rates", "diverged", "never heard of"],
+    ids=["plain", "random", "rates", "diverged", "never heard of", "program"],
 )
 def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None:
     assert scenario().ticks("m1") > BATCH_RECORDS
@@ -369,7 +370,7 @@ def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> No
     )
     for name in varied.names:
         one, other = join_batches(ticked[name]), join_batches(looped[name])
-        for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
+        for field in RecordBatch._fields:
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
 
 
