@@ -401,6 +401,7 @@ class FusedRun:
         return RecentRecords(
             t_ns=np.zeros((site_count, pages), dtype=np.int64),
             rows=np.zeros((site_count, pages, floats)),
+            used=np.full((site_count, pages, site_count - 1), -1),
         )
 
     def _connect_hands(
@@ -1014,6 +1015,24 @@ class FusedRun:
             records.append((t_ns, rows))
             self._popped_ticks[i] = stop
         return records
+
+    def read_samples_in_use(self, i: int, count: int) -> IntArray:
+        """Returns which samples a site used in its latest ticks, shape (count, peers).
+
+        A sample is the state that a peer, another site, sent in one of its ticks.
+
+        Args:
+            i: Index of the site.
+            count: Number of ticks, at most the number of stored records.
+
+        Returns:
+            For each tick the tick in which each peer sent the sample. It is -1 before the first
+            sample.
+        """
+        stop = int(self._progress[i]["tick"])
+        positions = np.arange(stop - count, stop) % self._sent.t_ns.shape[1]
+        used: IntArray = self._sent.used[i, positions]
+        return used
 
     @property
     def records(self) -> Array:

@@ -212,7 +212,7 @@ class _Feed(Generic[T]):
         if self._retries:
             return [self._retries.popleft()]
 
-        size = 1  # until the duration of an item is known
+        size = self._least  # until the duration of an item is known
         if self._wall_s > 0.0:
             # The finished items, `_runs` in number, took `_wall_s` together.
             items_in_batch_s = int(self._batch_s * self._runs / self._wall_s)
@@ -220,8 +220,11 @@ class _Feed(Generic[T]):
         if self._remaining is not None:
             # Towards the end the batches become smaller, so that no worker is idle for long:
             # all batches in flight together contain at most half of the remaining items.
-            batches_in_flight = self._workers * _BATCHES_PER_WORKER
-            fair_size = self._remaining // (2 * batches_in_flight)
+            # Items that are computed together take longer in small batches.
+            shares = self._workers
+            if self._least == 1:
+                shares *= 2 * _BATCHES_PER_WORKER
+            fair_size = self._remaining // shares
             smallest_size = size // _SMALLEST_FRACTION  # limits the overhead of small batches
             size = min(size, max(fair_size, smallest_size))
         batch = list(islice(self._new, max(1, size)))

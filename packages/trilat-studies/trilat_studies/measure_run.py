@@ -39,6 +39,7 @@ from trilat_net.core import BUCKETS_PER_S, Array, Site, compute_fingerprint
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import (
     FusedRun,
+    check_fusable,
     execute_virtual,
     find_absent_samples,
     simulate_scenario,
@@ -80,8 +81,7 @@ class RecordBatch(NamedTuple):
         tau: Control torque, shape (K, n), in N m.
         tau_x: Exogenous torque with the sign of Eq. (8), shape (K, n), in N m.
         used: Tick in which each peer sent the sample that is in use, shape (K, P). It is -1
-            before the first sample. The shape is (K, 0) for a compiled run, which does not
-            report samples.
+            before the first sample.
     """
 
     t_ns: Ints
@@ -99,7 +99,7 @@ class RecordBatch(NamedTuple):
             t_ns: The time, in ns. A record at exactly this time is not returned.
         """
         first = int(np.searchsorted(self.t_ns, t_ns, side="right"))
-        return self._slice(first, None)
+        return self.slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
         """Returns the records from one time up to another.
@@ -110,7 +110,7 @@ class RecordBatch(NamedTuple):
         """
         first = int(np.searchsorted(self.t_ns, from_ns))
         stop = int(np.searchsorted(self.t_ns, to_ns))
-        return self._slice(first, stop)
+        return self.slice(first, stop)
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
         """Adds these records to a compact summary, from which the end of a run is judged.
@@ -134,7 +134,7 @@ class RecordBatch(NamedTuple):
             into=into,
         )
 
-    def _slice(self, first: int, stop: int | None) -> "RecordBatch":
+    def slice(self, first: int, stop: int | None) -> "RecordBatch":
         """Returns the records with the indices from `first` up to, but not including, `stop`.
 
         Args:
@@ -258,8 +258,8 @@ def run_compiled_in_batches(
 ) -> FusedRun:
     """Runs a scenario in the compiled loop, and passes the records on batch by batch.
 
-    The compiled loop executes all sites without returning to Python. It is faster than
-    `run_in_batches`, but it does not report the samples in use.
+    The compiled loop executes all sites without returning to Python, and is therefore much
+    faster than `run_in_batches`.
 
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
@@ -316,7 +316,8 @@ class _CompiledRun:
         """
         no_columns = slice(0, 0)  # for vectors that the site does not have
         records_of_sites = self.run.pop_records()
-        for name, site_records in zip(self._scenario.names, records_of_sites, strict=True):
+        pairs = zip(self._scenario.names, records_of_sites, strict=True)
+        for i, (name, site_records) in enumerate(pairs):
             t_ns, rows = site_records
             if not len(t_ns):
                 continue
@@ -325,8 +326,7 @@ class _CompiledRun:
             for key in _VECTORS:
                 vector_columns = columns.get(key, no_columns)
                 vectors.append(rows[:, vector_columns])
-            no_samples = (len(t_ns), 0)
-            used = np.zeros(no_samples, np.int64)
+            used = self.run.read_samples_in_use(i, len(t_ns))
             batch = _build_batch(self._axes[name], t_ns, used, *vectors)
             receive = self._receivers[name]
             receive(batch)
@@ -380,31 +380,39 @@ def run_whole_together(
         of which it was computed alone, or an empty text. The order is that of groups of runs,
         of which one is in memory at a time.
     """
-    # imported late: a single run must not load the code for several runs side by side (lanes)
-    from trilat_net.execution import group_runs
-
     batches: list[dict[str, list[RecordBatch]]] = []
     compiled = []
     for scenario in scenarios:
         batches.append({name: [] for name in scenario.names})
         receivers = {name: records.append for name, records in batches[-1].items()}
         compiled.append(_CompiledRun(scenario, receivers))
-    for group in group_runs([member_run.run for member_run in compiled], _RECORD_ROWS):
-        member_runs = [compiled[index] for index in group.members]
-        while running := [
-            member_run for member_run in member_runs if not member_run.is_finished
-        ]:
+    for index, obstacle in _finish_together(compiled):
+        yield index, _join_run(scenarios[index], compiled[index].run, batches[index]), obstacle
+        batches[index].clear()
+
+
+def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, str]]:
+    """Simulates several runs to their ends, as many as possible at once.
+
+    Args:
+        compiled: The runs.
+
+    Yields:
+        The index of a finished run; and the property because of which it was computed alone, or
+        an empty text.
+    """
+    # A single run must not load the code of lanes.
+    from trilat_net.execution import group_runs
+
+    for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
+        members = [compiled[index] for index in group.members]
+        while running := [member for member in members if not member.is_finished]:
             # Runs of a group have the same duration, and are at the same time.
             group.advance_to(running[0].find_next_end())
-            for member_run in running:
-                member_run.pass_records()
-        for index, member_run in zip(group.members, member_runs, strict=True):
-            yield (
-                index,
-                _join_run(scenarios[index], member_run.run, batches[index]),
-                group.obstacle,
-            )
-            batches[index].clear()
+            for member in running:
+                member.pass_records()
+        for index in group.members:
+            yield index, group.obstacle
 
 
 def _join_run(
@@ -999,6 +1007,10 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
     return float(spread.max(initial=0.0))
 
 
+NEEDS_LOG = "metrics that need a log"
+"""Reason why a run cannot be computed together with others: its metrics need its whole log."""
+
+
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """Runs a scenario in virtual time and returns the metrics of the run.
 
@@ -1011,22 +1023,151 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
+    measured = _MeasuredRun(scenario)
+    if measured.compiled is None:
+        return measured.measure_ticks()
+    compiled = measured.compiled
+    while not compiled.is_finished:
+        compiled.run.advance_to(compiled.find_next_end())
+        compiled.pass_records()
+    return measured.measure_compiled(compiled.run)
 
-    site_stats = {name: SiteStats(scenario, name) for name in scenario.names}
-    receivers = {name: stats.add for name, stats in site_stats.items()}
-    diverged_at_s, late_samples = run_in_batches(scenario, receivers)
-    missing = 0
-    if diverged_at_s is None:
-        expected = sum(scenario.ticks(name) for name in scenario.names)
-        recorded = sum(stats.records for stats in site_stats.values())
-        missing = expected - recorded
-    return _compute_run_metrics(
-        scenario,
-        site_stats,
-        diverged_at_s=diverged_at_s,
-        late_samples=late_samples,
-        missing=missing,
-    )
+
+def measure_virtual_runs(
+    scenarios: Sequence[Scenario],
+) -> Iterator[tuple[int, RunMetrics, str]]:
+    """Runs several scenarios in virtual time, as many as possible at once.
+
+    Scenarios that differ in numbers only share the vector instructions of the processor. The
+    metrics equal those of `measure_virtual_run` bit for bit.
+
+    Args:
+        scenarios: The scenarios.
+
+    Yields:
+        The index of a scenario; the metrics of its run; and the property because of which the
+        run was computed alone, or an empty text.
+    """
+    indices = []
+    measured_runs = []
+    compiled_runs = []
+    for index, scenario in enumerate(scenarios):
+        measured = None if scenario.expect.metrics else _MeasuredRun(scenario)
+        if measured is None:
+            yield index, measure_virtual_run(scenario), NEEDS_LOG
+        elif measured.compiled is None:
+            yield index, measured.measure_ticks(), measured.obstacle
+        else:
+            indices.append(index)
+            measured_runs.append(measured)
+            compiled_runs.append(measured.compiled)
+    for position, obstacle in _finish_together(compiled_runs):
+        run = compiled_runs[position].run
+        yield indices[position], measured_runs[position].measure_compiled(run), obstacle
+
+
+class _EvenBatches:
+    """Passes records on in batches of `BATCH_RECORDS`, however they arrive.
+
+    The last bits of a mean depend on the batches. Sites with different tick rates produce
+    batches of different lengths.
+
+    Args:
+        receive: Function that receives the batches.
+    """
+
+    def __init__(self, receive: Callable[[RecordBatch], None]) -> None:
+        self._receive = receive
+        self._waiting: list[RecordBatch] = []
+        self._count = 0
+
+    def add(self, batch: RecordBatch) -> None:
+        """Takes the next records of a site, and passes on all complete batches."""
+        if not self._waiting and len(batch.t_ns) == BATCH_RECORDS:
+            self._receive(batch)
+            return
+        self._waiting.append(batch)
+        self._count += len(batch.t_ns)
+        if self._count < BATCH_RECORDS:
+            return
+        joined = join_batches(self._waiting)
+        whole = self._count - self._count % BATCH_RECORDS
+        for first in range(0, whole, BATCH_RECORDS):
+            self._receive(joined.slice(first, first + BATCH_RECORDS))
+        rest = joined.slice(whole, None)
+        self._count = len(rest.t_ns)
+        self._waiting = [rest] if self._count else []
+
+    def flush(self) -> None:
+        """Passes on the last records, which are fewer than a batch."""
+        if self._waiting:
+            self._receive(join_batches(self._waiting))
+            self._waiting.clear()
+
+
+class _MeasuredRun:
+    """A run whose metrics are computed while it is simulated.
+
+    Args:
+        scenario: Scenario to run.
+
+    Attributes:
+        compiled: The run in the compiled loop. None if the loop cannot simulate it.
+        obstacle: Reason if there is none. Otherwise empty.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._stats = {name: SiteStats(scenario, name) for name in scenario.names}
+        self._batches = {name: _EvenBatches(stats.add) for name, stats in self._stats.items()}
+        receivers = {name: batches.add for name, batches in self._batches.items()}
+        self.obstacle = ""
+        self.compiled: _CompiledRun | None = None
+        refuse_external_arms(scenario)
+        try:
+            check_fusable(scenario)
+        except ScenarioError:
+            self.obstacle = "tick rates that differ too much"
+        else:
+            self.compiled = _CompiledRun(scenario, receivers)
+
+    def measure_ticks(self) -> RunMetrics:
+        """Simulates the run tick by tick, and returns its metrics."""
+        receivers = {name: stats.add for name, stats in self._stats.items()}
+        diverged_at_s, late_samples = run_in_batches(self._scenario, receivers)
+        return self._measure(diverged_at_s, late_samples)
+
+    def measure_compiled(self, run: FusedRun) -> RunMetrics:
+        """Returns the metrics of the run, which has ended.
+
+        Args:
+            run: The run.
+        """
+        for batches in self._batches.values():
+            batches.flush()
+        late_samples = int(run.memory.tables.links["late"].sum())
+        return self._measure(run.diverged_s, late_samples)
+
+    def _measure(self, diverged_at_s: float | None, late_samples: int) -> RunMetrics:
+        """Returns the metrics of the run.
+
+        Args:
+            diverged_at_s: Time at which the first site left the limits of its arm, in s.
+            late_samples: Number of samples that arrived too late.
+        """
+        scenario = self._scenario
+        missing = 0
+        if diverged_at_s is None:
+            expected = sum(scenario.ticks(name) for name in scenario.names)
+            recorded = sum(stats.records for stats in self._stats.values())
+            missing = expected - recorded
+        return _compute_run_metrics(
+            scenario,
+            self._stats,
+            diverged_at_s=diverged_at_s,
+            late_samples=late_samples,
+            missing=missing,
+        )
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:

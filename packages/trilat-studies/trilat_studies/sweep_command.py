@@ -175,6 +175,7 @@ def _run_sweep(
     """
     from trilat_net.work import count_workers
 
+    from .side_by_side import describe_runs_alone
     from .sweep import sweep_results, sweep_run
     from .sweep.cell_groups import find_cell_groups
 
@@ -207,7 +208,8 @@ def _run_sweep(
     if was_complete:
         terminal.out.print("nothing was left to run")
     remarks = [sweep_run.describe_sweep_speed(finished)] if finished.simulated_s else []
-    remarks += filter(None, [sweep_run.describe_runs_alone(finished)])
+    run_count = len(finished.results.rows)
+    remarks += filter(None, [describe_runs_alone(finished.alone, run_count)])
     remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
     _print_results(finished.results, remarks, folder.path)
     return finished

@@ -27,10 +27,10 @@ Invariant:
 
 import re
 import xml.etree.ElementTree as Xml
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,8 +54,10 @@ from .measure_run import (
     evaluate_expectations,
     measure_log,
     measure_virtual_run,
+    measure_virtual_runs,
 )
 from .run_commands import format_command, list_assignments, set_options
+from .side_by_side import RunKind, count_reasons, describe_runs_alone, prepare_kinds
 
 
 class TrialResult(NamedTuple):
@@ -70,6 +72,8 @@ class TrialResult(NamedTuple):
         wall_s: Duration in real time, in s.
         error: Reason why the run has no result. Empty if it has one.
         log: Log of a live trial, if it exists.
+        alone: Property because of which the run was computed alone, among trials that are
+            computed side by side. Empty if there is none.
     """
 
     trial: "Trial"
@@ -78,6 +82,7 @@ class TrialResult(NamedTuple):
     wall_s: float = 0.0
     error: str = ""
     log: Path | None = None
+    alone: str = ""
 
     @property
     def held(self) -> bool:
@@ -438,7 +443,8 @@ class TrialReport(Result):
         """Returns lines that help to interpret the results of the trials.
 
         The lines name the scenario keys that were changed for all trials, the scenarios that
-        ran only once because nothing in them is random, and the duration and speed of all runs.
+        ran only once because nothing in them is random, the duration and speed of all runs, and
+        the reasons why some of them were not computed side by side.
         """
         remarks = []
         overrides = self.results[0].trial.overrides if self.results else ()
@@ -460,6 +466,8 @@ class TrialReport(Result):
         speed = f": {simulated_s / self.wall_s:.3g}x" if self.wall_s > 0.0 else ""
         runs = count_nouns(len(self.results), "run")
         remarks.append(f"{runs}, {simulated_s:.6g} s {kind} in {self.wall_s:.1f} s{speed}")
+        reasons = count_reasons(result.alone for result in self.results)
+        remarks += filter(None, [describe_runs_alone(reasons, len(self.results))])
         return remarks
 
     def table(self) -> list[str]:
@@ -533,16 +541,84 @@ class TrialReport(Result):
         ]
 
 
-def _run_trial(trial: Trial) -> TrialResult:
+LANE_RUNS = 32
+"""Number of trials that a worker gets at once, to compute them side by side."""
+_RUN_ERRORS = (TrilatError, ArithmeticError, ValueError, MemoryError)
+"""Errors that concern a single trial."""
+
+
+class _TrialItem(NamedTuple):
+    """A trial for a worker.
+
+    Attributes:
+        trial: The trial.
+        is_side_by_side: True to compute it together with others, if possible.
+    """
+
+    trial: Trial
+    is_side_by_side: bool
+
+    def __str__(self) -> str:
+        return str(self.trial)
+
+
+def _run_trial_here(item: _TrialItem) -> TrialResult:
+    """Runs a trial in this process."""
+    return item.trial.run()
+
+
+def _run_trial(item: _TrialItem) -> TrialResult:
     """Runs a trial in a worker process.
 
     An error that concerns only this trial becomes its result, so that the other trials of the
     worker still run.
     """
     try:
-        return trial.run()
-    except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
-        return TrialResult(trial, error=f"{type(error).__name__}: {error}")
+        return item.trial.run()
+    except _RUN_ERRORS as error:
+        return TrialResult(item.trial, error=f"{type(error).__name__}: {error}")
+
+
+def _run_trials_here(items: Sequence[_TrialItem]) -> Iterator[TrialResult]:
+    """Runs several trials in this process, side by side where that is possible."""
+    return _run_side_by_side(items, _run_trial_here)
+
+
+def _run_trials(items: Sequence[_TrialItem]) -> Iterator[TrialResult]:
+    """Runs several trials in a worker process, side by side where that is possible."""
+    return _run_side_by_side(items, _run_trial)
+
+
+def _run_side_by_side(
+    items: Sequence[_TrialItem], run_alone: Callable[[_TrialItem], TrialResult]
+) -> Iterator[TrialResult]:
+    """Runs several trials, side by side where that is possible.
+
+    Args:
+        items: The trials.
+        run_alone: Function that runs one trial.
+
+    Yields:
+        The results in the order of the trials. They are those of `run_alone`.
+    """
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    chosen = [n for n, item in enumerate(items) if item.is_side_by_side]
+    scenarios = [items[n].trial.scenario for n in chosen]
+    measured: dict[int, tuple[RunMetrics, str]] = {}
+    try:
+        for index, metrics, obstacle in measure_virtual_runs(scenarios):
+            measured[chosen[index]] = metrics, obstacle
+    except _RUN_ERRORS:
+        # One by one, only the trial whose run fails has no result.
+        measured.clear()
+    wall_s = (clock.monotonic_ns() - start_ns) * 1e-9 / max(len(chosen), 1)
+    for n, item in enumerate(items):
+        if n in measured:
+            metrics, obstacle = measured[n]
+            yield item.trial.evaluate(metrics, wall_s)._replace(alone=obstacle)
+        else:
+            yield run_alone(item)
 
 
 def run_trials(
@@ -589,22 +665,41 @@ def _iterate_results(
         pool: Workers that run the trials.
         batch: The trials.
     """
-    if pool.is_local:
-        for index, trial in enumerate(batch):
-            yield index, trial.run()
-        return
-
-    if not is_core_cached():
+    if not pool.is_local and not is_core_cached():
         # The first step compiles the simulation kernel, once for all processes.
         next(execute_virtual(batch[0].scenario))
+    keys = [(trial.source, trial.overrides) for trial in batch]
+    counts = Counter(keys)
+    kinds = {
+        key: RunKind(trial.scenario, counts[key])
+        for key, trial in zip(keys, batch, strict=True)
+    }
+    side_by_side = prepare_kinds(kinds)
+    if pool.is_local and not side_by_side:
+        for n, trial in enumerate(batch):
+            yield n, trial.run()
+        return
+    items = [
+        _TrialItem(trial, key in side_by_side) for key, trial in zip(keys, batch, strict=True)
+    ]
+    if pool.is_local:
+        yield from pool.iterate_results(
+            _run_trial_here, items, together=_run_trials_here, together_count=LANE_RUNS
+        )
+        return
+
     # The longest trials run first, so that no worker is left with a long trial at the end.
-    longest_first = sorted(
-        range(len(batch)), key=lambda index: -batch[index].scenario.duration_s
-    )
-    queue = [batch[index] for index in longest_first]
-    lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
-    for queue_index, result in pool.iterate_results(_run_trial, queue, lost, len(queue)):
-        yield longest_first[queue_index], result
+    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
+    error = f"its worker process ended, {MAX_LOSSES} times"
+    for index, result in pool.iterate_results(
+        _run_trial,
+        [items[n] for n in longest_first],
+        lambda item: TrialResult(item.trial, error=error),
+        len(batch),
+        together=_run_trials if side_by_side else None,
+        together_count=LANE_RUNS if side_by_side else 1,
+    ):
+        yield longest_first[index], result
 
 
 def check(

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from trilat_studies.side_by_side import describe_runs_alone
 from trilat_studies.sweep import plan_sweep, sweep_run
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 
@@ -31,13 +32,13 @@ def test_table_does_not_depend_on_lanes(
 ) -> None:
     alone = run_in(tmp_path / "alone")
     assert not alone.alone
-    assert sweep_run.describe_runs_alone(alone) == ""
+    assert describe_runs_alone(alone.alone, alone.runs) == ""
     monkeypatch.setattr(sweep_run, "LANE_SITE_TICKS", 0)
     monkeypatch.setattr(run_groups, "find_obstacle", find_slow_site)
     together = run_in(tmp_path / "together")
     assert together.runs == alone.runs == len(together.results.rows)
     table = (tmp_path / "together" / RESULTS_FILE).read_bytes()
     assert table == (tmp_path / "alone" / RESULTS_FILE).read_bytes()
-    assert sweep_run.describe_runs_alone(together) == (
-        "8 of 16 runs were computed one by one: a slow site (8)"
+    assert describe_runs_alone(together.alone, together.runs) == (
+        "8 of 16 runs were computed one by one: tick rates that differ between sites (8)"
     )

@@ -66,8 +66,9 @@ def agree(metrics: RunMetrics, other: RunMetrics) -> None:
         {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333},
         {"limits.qd_limit_rad_s": 0.3},
         {"link.delay_ms": 9000.0},
+        {"sites.m1.hands": [{"kind": "own", "class": "tests.own_code:Circle", "rate_hz": 25}]},
     ],
-    ids=["plain", "random", "rates", "diverged", "never heard of"],
+    ids=["plain", "random", "rates", "diverged", "never heard of", "program"],
 )
 def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None:
     assert scenario().ticks("m1") > BATCH_RECORDS
@@ -389,9 +390,12 @@ def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> No
     )
     assert run.diverged_s == diverged_at_s
     for name in varied.names:
-        records, expected = join_batches(compiled[name]), join_batches(by_tick[name])
-        for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
-            np.testing.assert_array_equal(getattr(records, field), getattr(expected, field))
+        expected = join_batches(by_tick[name])
+        batch_of_loop = join_batches(compiled[name])
+        for field in RecordBatch._fields:
+            np.testing.assert_array_equal(
+                getattr(batch_of_loop, field), getattr(expected, field)
+            )
 
 
 def test_any_metric_may_be_expected() -> None:

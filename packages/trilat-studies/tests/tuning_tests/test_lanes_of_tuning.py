@@ -25,3 +25,12 @@ def test_lanes_do_not_change_scores(monkeypatch: pytest.MonkeyPatch) -> None:
         reports.append(result.to_dict())
         assert bool(calls) is has_code
     assert reports[0] == reports[1]
+
+
+def test_report_names_runs_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law in plain Python runs one by one beside a law that runs in lanes."""
+    monkeypatch.setattr(run_groups, "has_lane_code", lambda _: True)
+    found = tn.tune("free", ["p_d", "tests.own_laws:PD"], budget=6, duration_s=0.4, jobs=1)
+    note = "note: 6 of 14 runs were computed one by one: control laws in plain Python (6)"
+    assert note in list(map(str, found.blocks()))
+    assert "alone" not in str(found.to_dict())

@@ -52,6 +52,7 @@ from trilat_net.work import (
 from trilat_net.workers import count_cores
 
 from ..measure_run import describe_program
+from ..side_by_side import LANE_SITE_TICKS
 from . import sweep_cell
 from .cell_groups import find_cell_groups
 from .edge_refinement import NOT_KNOWN, EdgeRefinement, choose_side
@@ -431,12 +432,6 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
 
 LANE_RUNS = 32
 """Number of runs that a worker gets at once, to compute them side by side."""
-LANE_SITE_TICKS = 100_000_000
-"""Number of site ticks from which a sweep compiles the code for several runs side by side.
-
-The compilation takes some ten seconds per kind of site. The code then saves about 0.4 us per
-site tick.
-"""
 
 
 def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
@@ -468,23 +463,6 @@ def _compile_lanes(plan: SweepPlan) -> None:
     except ScenarioError:
         return  # the workers compile the code
     prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
-
-
-def describe_runs_alone(finished: FinishedSweep) -> str:
-    """Returns a sentence on runs that were not computed side by side, and why.
-
-    Args:
-        finished: The finished sweep.
-
-    Returns:
-        The numbers of these runs and of all runs, and the reasons. Empty if there are none.
-    """
-    if not finished.alone:
-        return ""
-    all_runs = count_nouns(len(finished.results.rows), "run")
-    reasons = ", ".join(f"{reason} ({count})" for reason, count in finished.alone.items())
-    count = sum(finished.alone.values())
-    return f"{count} of {all_runs} were computed one by one: {reasons}"
 
 
 def estimate_sweep(

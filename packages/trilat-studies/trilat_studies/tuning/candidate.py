@@ -847,10 +847,12 @@ class CandidateItem(NamedTuple):
             without walls and without operators who push the arms without a target pose. The
             second text is None if the scenario has no such parts.
         name: Name of the law and its gains in error messages.
+        is_side_by_side: True to compute the runs together with others, if possible.
     """
 
     runs: tuple[tuple[str, str | None], ...]
     name: str
+    is_side_by_side: bool = False
 
     def __str__(self) -> str:
         return self.name
@@ -868,50 +870,63 @@ def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
     return CandidateItem(runs, name)
 
 
-def measure_candidate_task(task: CandidateItem) -> CandidateScore:
+class MeasuredCandidate(NamedTuple):
+    """Score of a candidate, with the reasons why runs of it were computed one by one.
+
+    Attributes:
+        score: Average score over the seeds.
+        alone: For each run that could not be computed side by side with others, the reason.
+    """
+
+    score: CandidateScore
+    alone: tuple[str, ...] = ()
+
+
+def measure_candidate_task(task: CandidateItem) -> MeasuredCandidate:
     """Runs a candidate, a law with chosen gains, with all of its seeds.
 
     Any worker process can call it, because it needs nothing but its argument.
 
     Args:
         task: The runs of the candidate.
-
-    Returns:
-        The average score over the seeds.
     """
     scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
-    return average_scores(scores)
+    return MeasuredCandidate(average_scores(scores))
 
 
 LANE_RUNS = 16
 """Number of runs that a worker computes side by side. All their records are in memory."""
 
 
-def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[CandidateScore]:
+def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[MeasuredCandidate]:
     """Runs several candidates with all of their seeds, side by side where that is possible.
 
     Args:
         tasks: The runs of each candidate.
 
     Yields:
-        The average scores in the order of the candidates, equal to `measure_candidate_task`.
+        The scores in the order of the candidates, equal to those of `measure_candidate_task`.
     """
-    # Each different scenario is run once. Candidates may share a scenario without walls.
-    scenarios: dict[str, Scenario] = {}
-    for task in tasks:
-        for run_texts in task.runs:
-            for text in run_texts:
-                if text and text not in scenarios:
-                    scenarios[text] = parse_scenario(text)
-    all_texts = list(scenarios)
-
-    measures: dict[str, _RunMeasures] = {}
+    texts = [
+        text
+        for task in tasks
+        if task.is_side_by_side
+        for texts in task.runs
+        for text in texts
+        if text
+    ]
+    scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
+    measured = {}
+    obstacles = {}
+    chosen = list(scenarios)
     try:
-        for first in range(0, len(all_texts), LANE_RUNS):
-            batch = all_texts[first : first + LANE_RUNS]
-            batch_scenarios = [scenarios[text] for text in batch]
-            for index, run, _ in run_whole_together(batch_scenarios):
-                measures[batch[index]] = _measure_records(batch_scenarios[index], run)
+        for first in range(0, len(chosen), LANE_RUNS):
+            part = chosen[first : first + LANE_RUNS]
+            runs = run_whole_together([scenarios[text] for text in part])
+            for index, run, obstacle in runs:
+                text = part[index]
+                measured[text] = _measure_records(scenarios[text], run)
+                obstacles[text] = obstacle
     except CodeFailed:
         # One by one, the candidates before the one whose code fails are kept.
         for task in tasks:
@@ -919,10 +934,15 @@ def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[Candidat
         return
 
     for task in tasks:
-        scores = []
-        for text, twin_text in task.runs:
-            scores.append(_score_candidate(measures[text], measures[twin_text or text]))
-        yield average_scores(scores)
+        if not task.is_side_by_side:
+            yield measure_candidate_task(task)
+            continue
+        scores = [
+            _score_candidate(measured[text], measured[twin_text or text])
+            for text, twin_text in task.runs
+        ]
+        reasons = [obstacles[text] for texts in task.runs for text in texts if text]
+        yield MeasuredCandidate(average_scores(scores), tuple(filter(None, reasons)))
 
 
 def load_tuning_scenario(

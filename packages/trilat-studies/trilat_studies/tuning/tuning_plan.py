@@ -21,7 +21,7 @@ Invariant:
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,6 +39,7 @@ from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 from trilat_net.workers import count_cores
 
+from ..side_by_side import RunKind, prepare_kinds
 from .candidate import (
     CLASS_MEANINGS,
     LANE_RUNS,
@@ -501,6 +502,7 @@ class TuningPlan(NamedTuple):
         ]
         total = len(searches) * self.budget + len(paper_items)
         paper_scores: list[CandidateScore] = []
+        alone: Counter[str] = Counter()
         finished = 0
 
         def report_progress(in_round: int, _: int) -> None:
@@ -512,26 +514,33 @@ class TuningPlan(NamedTuple):
         with open_worker_pool(jobs, on, most=total) as pool:
             for round_number in range(len(searches[0].rounds)):
                 proposals = [search.propose_candidates(round_number) for search in searches]
-                items: list[CandidateItem] = []
-                firsts = []
-                for search, candidates in zip(searches, proposals, strict=True):
-                    items_of_law = self._build_items(bases, search.space, candidates)
-                    firsts += items_of_law[:1]
-                    items += items_of_law
+                items_of_laws = [
+                    self._build_items(bases, search.space, candidates)
+                    for search, candidates in zip(searches, proposals, strict=True)
+                ]
                 if round_number == 0:
-                    items += paper_items
-                    in_lanes = self._uses_lanes(firsts)
+                    side_by_side = self._choose_lanes([items[0] for items in items_of_laws])
+                items = [
+                    item._replace(is_side_by_side=search.space.law in side_by_side)
+                    for search, items_of_law in zip(searches, items_of_laws, strict=True)
+                    for item in items_of_law
+                ]
+                if round_number == 0:
+                    for item in paper_items:
+                        in_lanes = "adaptive" in side_by_side
+                        items.append(item._replace(is_side_by_side=in_lanes))
                 # The scores come in the order of the items: those of each law, and in the first
                 # round those of the printed gains, which remain in the end.
-                scores = iter(
-                    pool.map(
-                        measure_candidate_task,
-                        items,
-                        report_progress,
-                        together=measure_candidate_tasks if in_lanes else None,
-                        together_count=LANE_RUNS if in_lanes else 1,
-                    )
+                measured = pool.map(
+                    measure_candidate_task,
+                    items,
+                    report_progress,
+                    together=measure_candidate_tasks if side_by_side else None,
+                    together_count=LANE_RUNS if side_by_side else 1,
                 )
+                scores = iter([candidate.score for candidate in measured])
+                for candidate in measured:
+                    alone.update(candidate.alone)
                 finished += len(items)
                 for search, candidates in zip(searches, proposals, strict=True):
                     search.record_scores(candidates, [next(scores) for _ in candidates])
@@ -539,23 +548,19 @@ class TuningPlan(NamedTuple):
         printed = []
         for name, score in zip(paper_names, paper_scores, strict=True):
             printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
-        return TuningResult(self, searches, printed)
+        return TuningResult(self, searches, printed, alone)
 
-    def _uses_lanes(self, first_candidates: Sequence[CandidateItem]) -> bool:
-        """Returns True if the runs of every law can be simulated side by side (in SIMD lanes).
+    def _choose_lanes(self, first_candidates: Sequence[CandidateItem]) -> set[str]:
+        """Returns the names of the laws whose runs are to be computed side by side.
 
         Args:
             first_candidates: One candidate of each law.
         """
-        # imported here, because the code of lanes takes long to load
-        from trilat_net.execution import prepare_lanes
-
-        for candidate in first_candidates:
-            text, _ = candidate.runs[0]
-            run_count = self.budget * len(candidate.runs)
-            if not prepare_lanes(parse_scenario(text), run_count):
-                return False
-        return True
+        kinds = {}
+        for space, first in zip(self.spaces, first_candidates, strict=True):
+            scenario = parse_scenario(first.runs[0][0])
+            kinds[space.law] = RunKind(scenario, self.budget * len(first.runs))
+        return prepare_kinds(kinds)
 
     def _build_items(
         self,
@@ -590,11 +595,14 @@ class TuningResult(Result):
         found: For each law in the order of the plan, all tried gains and their scores.
         printed: Scores of the published gains of the adaptive law, for comparison. They are
             printed in the paper from which the law comes.
+        alone: Reasons why runs were not computed side by side with others, with the number of
+            these runs. Runs of a search that computes all runs one by one are not counted.
     """
 
     plan: TuningPlan
     found: list[CandidateSearch]
     printed: list[_PaperGainsResult]
+    alone: Mapping[str, int] = field(default_factory=dict)
 
     def blocks(self) -> Iterator[Any]:
         """Yields the parts of the text that `trilat compare --tune` prints.

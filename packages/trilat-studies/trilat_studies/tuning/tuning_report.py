@@ -39,6 +39,7 @@ from trilat_net.presentation import (
 from trilat_net.scenario import BUILT_IN
 from trilat_net.work import MeanInterval
 
+from ..side_by_side import describe_runs_alone
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
 
@@ -62,6 +63,9 @@ def compose_tuning(tuned: "TuningResult") -> Iterator[Block]:
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in _list_class_meanings())
     yield from (f"note: {line}" for line in list_energy_notes(tuned))
+    alone = describe_runs_alone(tuned.alone, tuned.plan.runs)
+    if alone:
+        yield f"note: {alone}"
 
     for search in tuned.found:
         if search.front:

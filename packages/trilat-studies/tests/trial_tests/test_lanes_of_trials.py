@@ -1,0 +1,84 @@
+"""Trials that are computed side by side have the results of trials one by one."""
+
+from typing import Any
+
+import msgspec
+import pytest
+from trilat_studies.measure_run import measure_virtual_run, measure_virtual_runs
+from trilat_studies.trials import Trial, run_trials, trials
+
+from trilat_net.execution.lanes import run_groups
+from trilat_net.execution.lanes.lane_run import LaneRun
+from trilat_net.scenario import Scenario, load_scenario, reseed_scenario
+
+RANDOM = {
+    "duration_s": 1.2,
+    "link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 15.0, "loss": 0.1},
+    "expect": {"mean_age_max_ms": 20.5, "synchronised_by_s": 1.1},
+}
+
+
+def list_runs() -> list[Scenario]:
+    """Returns five seeds of a run, one that diverges, one with two tick rates, and one with a
+    metric of its log.
+    """
+    runs = [reseed_scenario(load_scenario("free", RANDOM), seed) for seed in range(1, 6)]
+    changes: list[dict[str, Any]] = [
+        {"limits.qd_limit_rad_s": 0.9},
+        {"sites.s.rate_hz": 500},
+        {"expect.metrics.rms_error_rad": [0.0, 9.0]},
+    ]
+    return [*runs, *(load_scenario("free", {**RANDOM, **change}) for change in changes)]
+
+
+def test_metrics_do_not_depend_on_lanes() -> None:
+    runs = list_runs()
+    reasons = {}
+    together = {}
+    for index, metrics, obstacle in measure_virtual_runs(runs):
+        together[index] = msgspec.json.encode(metrics)
+        reasons[index] = obstacle
+    alone = {n: msgspec.json.encode(measure_virtual_run(run)) for n, run in enumerate(runs)}
+    assert together == alone
+    texts = ["", "", "", "", "", "", "tick rates that differ between sites"]
+    assert [reasons[n] for n in range(8)] == [*texts, "metrics that need a log"]
+
+
+def list_facts(batch: list[Trial]) -> list[Any]:
+    """Returns everything that a report says of each trial."""
+    rows = run_trials(batch, jobs=1).to_dict()["runs"]
+    assert len(rows) == len(batch)
+    return list(rows)
+
+
+def test_lanes_do_not_change_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    advance_to = LaneRun.advance_to
+
+    def count_calls(lanes: LaneRun, until_s: float) -> None:
+        calls.append(until_s)
+        advance_to(lanes, until_s)
+
+    monkeypatch.setattr(LaneRun, "advance_to", count_calls)
+    batch = [
+        *trials("free", range(1, 6), RANDOM),
+        *trials("free", [7], {**RANDOM, "duration_s": 1.3}),
+    ]
+    facts = []
+    for has_code in (True, False):
+        monkeypatch.setattr(run_groups, "has_lane_code", lambda _, has=has_code: has)
+        calls.clear()
+        facts.append(list_facts(batch))
+        assert bool(calls) is has_code
+    assert facts[0] == facts[1]
+    assert len({str(row) for row in facts[0]}) == len(batch)
+
+
+def test_report_names_trials_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trials with two tick rates run one by one beside trials that run in lanes."""
+    monkeypatch.setattr(run_groups, "has_lane_code", lambda _: True)
+    uneven = {**RANDOM, "sites.s.rate_hz": 500}
+    batch = [*trials("free", range(1, 6), RANDOM), *trials("free", [3, 4], uneven)]
+    assert run_trials(batch, jobs=1).remarks()[-1] == (
+        "2 of 7 runs were computed one by one: tick rates that differ between sites (2)"
+    )
