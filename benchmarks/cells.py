@@ -23,11 +23,11 @@ def run() -> list[str]:
     scenarios = [plan.scenario(*plan.cell(number).overrides) for number in range(plan.cells)]
     texts = [scenario.text for scenario in scenarios]
     assert len(texts) == CELLS
-    list(classify_cells(texts, DURATION_S))  # compiles
+    list(classify_cells(scenarios, DURATION_S))  # compiles
     times_s: dict[str, list[float]] = {}
     for _ in range(ROUNDS):
         begun = time.process_time()
-        together = [cell.result for cell in classify_cells(texts, LONGEST_S)]
+        together = [cell.result for cell in classify_cells(scenarios, LONGEST_S)]
         times_s.setdefault("together", []).append(time.process_time() - begun)
         begun = time.process_time()
         alone = [classify_cell(text, LONGEST_S) for text in texts]

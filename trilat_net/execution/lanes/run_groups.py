@@ -94,7 +94,7 @@ class RunGroup:
 
 
 def prepare_lanes(
-    scenario: Scenario, runs: int, least_site_ticks: int = LANE_SITE_TICKS
+    scenario: Scenario, runs: int, least_site_ticks: float = LANE_SITE_TICKS
 ) -> bool:
     """Decides whether a study computes its runs together, and compiles the code in this case.
 
@@ -105,7 +105,8 @@ def prepare_lanes(
         scenario: Scenario of one of the runs.
         runs: Number of runs with this structure.
         least_site_ticks: Number of simulated ticks (control periods), summed over all sites
-            (arm controllers) and runs, from which compiling the code pays off.
+            (arm controllers) and runs, from which compiling the code pays off. Infinity uses
+            existing code only.
     """
     rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
     site_ticks = runs * scenario.duration_s * sum(rates_hz)

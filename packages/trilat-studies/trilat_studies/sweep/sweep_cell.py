@@ -320,13 +320,13 @@ class _JudgedCell(NamedTuple):
     obstacle: str
 
 
-def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCell]:
+def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[_JudgedCell]:
     """Runs cells side by side, if possible, and classifies the end of each run.
 
     The result of a cell is that of `classify_cell`, which explains the method.
 
     Args:
-        texts: Canonical texts of the cells' scenarios.
+        scenarios: Scenarios of the cells. Each `duration_s` is the first duration.
         longest_s: Longest duration of each run, in s.
 
     Yields:
@@ -335,7 +335,7 @@ def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCe
     # A single run must not load the code of lanes.
     from trilat_net.execution import group_runs
 
-    cells = [_CellInProgress(parse_scenario(text), longest_s) for text in texts]
+    cells = [_CellInProgress(scenario, longest_s) for scenario in scenarios]
     runs = [cell.run for cell in cells]
     obstacles = [""] * len(cells)
     for group in group_runs(runs):

@@ -370,9 +370,9 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
             raise
         except ScenarioError as error:
             refused_runs[index] = _refuse_cell(task, error)
-    texts = [scenario.text for scenario in scenarios.values()]
+    longest_s = tasks[0].plan.longest_s
     try:
-        judged_cells = iter(list(sweep_cell.classify_cells(texts, tasks[0].plan.longest_s)))
+        judged_cells = iter(list(sweep_cell.classify_cells(scenarios.values(), longest_s)))
     except (CodeFailed, ScenarioError):
         # One by one, the runs before the one whose code fails are kept.
         yield from map(run_cell, tasks)
@@ -448,6 +448,27 @@ def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
     rates_hz = [spec.rate_hz for spec in plan.base.sites.values()]
     site_ticks = runs * plan.base.duration_s * sum(rates_hz)
     return site_ticks >= LANE_SITE_TICKS
+
+
+def _has_lanes(plan: SweepPlan, runs: int) -> bool:
+    """Returns True if the code for several runs side by side exists from an earlier study.
+
+    A small sweep then uses it as well, although it would not be worth its compilation.
+
+    Args:
+        plan: The sweep. The code is that of its first cell.
+        runs: Number of runs that remain.
+    """
+    if plan.judge == "linear" or runs < 2:
+        return False
+    # A sweep of single runs must not load the code of lanes.
+    from trilat_net.execution import prepare_lanes
+
+    try:
+        scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
+    except ScenarioError:
+        return False
+    return prepare_lanes(scenario, runs, least_site_ticks=math.inf)
 
 
 def _compile_lanes(plan: SweepPlan) -> None:
@@ -715,10 +736,11 @@ class _SweepWork:
         Args:
             cells: Number of cells that have to run.
         """
-        is_side_by_side = _uses_lanes(self._plan, cells - len(self._journal.done))
-        if is_side_by_side:
+        runs = cells - len(self._journal.done)
+        if _uses_lanes(self._plan, runs):
             _compile_lanes(self._plan)
-        return is_side_by_side
+            return True
+        return _has_lanes(self._plan, runs)
 
     def _list_runs(self, cell: int) -> list[CellRun]:
         """Returns the finished runs of a cell, in the order of the seeds."""
