@@ -25,6 +25,7 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -179,6 +180,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     }
 
 
+@cache
 def _list_group_paths() -> list[str]:
     """Returns the dotted paths of all keys of the tables for all sites or all links.
 
