@@ -311,6 +311,7 @@ def test_an_interrupted_confirmation_resumes(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_run, "run_bench_task", run)
+    monkeypatch.setattr(bench_run, "prepare_kinds", lambda _: {})
     folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
         run_bench(folder, on=executor, progress=stop)

@@ -545,8 +545,8 @@ class TuningPlan(NamedTuple):
             printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
         return TuningResult(self, searches, printed, alone)
 
-    def _choose_lanes(self, firsts: Sequence[CandidateItem]) -> set[str]:
-        """Returns the names of the laws whose runs are to be computed side by side.
+    def _choose_lanes(self, firsts: Sequence[CandidateItem]) -> dict[str, str]:
+        """Returns the laws whose runs are to be computed side by side, see `prepare_kinds`.
 
         Args:
             firsts: One candidate of each law.
