@@ -703,7 +703,23 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns all settings from which the compiled control loop of a site is built.
 
         A site is the process that runs one arm. The result contains its arm, control law,
-        network connections and limits.
+        network connections and limits. It is kept, because the check of a scenario needs it
+        before the run does.
+
+        Args:
+            site: Name of the site.
+        """
+        if site not in self._setups:
+            self._setups[site] = self._build_setup(site)
+        return self._setups[site]
+
+    @cached_property
+    def _setups(self) -> dict[str, SiteSetup]:
+        """The results of `setup` so far, by the name of the site."""
+        return {}
+
+    def _build_setup(self, site: str) -> SiteSetup:
+        """Builds the result of `setup`.
 
         Args:
             site: Name of the site.

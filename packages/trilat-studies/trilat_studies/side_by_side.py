@@ -41,7 +41,7 @@ class RunKind(NamedTuple):
         return self.runs * self.scenario.duration_s * sum(rates_hz)
 
 
-def prepare_kinds(kinds: Mapping[K, RunKind]) -> set[K]:
+def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     """Chooses the kinds of runs to compute side by side, and compiles the code for them.
 
     The runs must be long enough for the compilation, unless the code exists. Runs that cannot
@@ -52,27 +52,31 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> set[K]:
         kinds: Kinds of runs, by any keys.
 
     Returns:
-        The keys of the chosen kinds.
+        For each chosen kind the property because of which its runs are computed one by one
+        nevertheless, or an empty text.
     """
     several = {key: kind for key, kind in kinds.items() if kind.runs > 1}
     if not several:
-        return set()
+        return {}
     # A study of single runs must not load the code of lanes.
     from trilat_net.execution import FusedRun, describe_structure, prepare_lanes
 
-    chosen: set[K] = set()
-    unsuited: dict[K, RunKind] = {}
+    prepared: dict[K, str] = {}
+    obstacles: dict[K, str] = {}
     for key, kind in several.items():
         try:
             if prepare_lanes(kind.scenario, kind.runs, LANE_SITE_TICKS):
-                chosen.add(key)
-            elif isinstance(describe_structure(FusedRun(kind.scenario)), str):
-                unsuited[key] = kind
+                prepared[key] = ""
+                continue
+            structure = describe_structure(FusedRun(kind.scenario))
         except TrilatError:
             continue  # the run itself reports the error
-    return chosen | {
-        key for key, kind in unsuited.items() if chosen or kind.site_ticks >= LANE_SITE_TICKS
-    }
+        if isinstance(structure, str):
+            obstacles[key] = structure
+    for key, obstacle in obstacles.items():
+        if prepared or several[key].site_ticks >= LANE_SITE_TICKS:
+            prepared[key] = obstacle
+    return prepared
 
 
 def describe_runs_alone(reasons: Mapping[str, int], run_count: int) -> str:

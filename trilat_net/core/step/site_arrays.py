@@ -707,12 +707,32 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.singular_value = task.singular_value
         s.axes[: site_layout.shared] = task.axes
         s.posture[: site_layout.joints] = task.posture or setup.q0
-    lengths = site_layout.axes()
+    # Views of the fields of a row take longer than the numbers themselves.
+    floats = site.view(np.float64)
+    places = _find_places(layout, site_layout)
     for name, numbers in _list_vectors(setup).items():
-        field = FIELDS["site"][name]
-        (length,) = field_shape(field, lengths)
-        s[name][:length] = numbers
+        floats[places[name]] = numbers
     return site
+
+
+@cache
+def _find_places(layout: Layout, site_layout: Layout) -> dict[str, slice]:
+    """Returns the place of each vector among all numbers of a site's row, by its name.
+
+    Args:
+        layout: Layout of the row.
+        site_layout: Layout of the site, whose vectors may be shorter.
+    """
+    places = {}
+    fields: Any = site_dtype(layout).fields
+    lengths = site_layout.axes()
+    for name, field in FIELDS["site"].items():
+        dtype, offset, *_ = fields.get(name, (None, 0))
+        shape = field_shape(field, lengths) if dtype is not None else ()
+        if len(shape) == 1 and dtype.base == np.float64:
+            first = offset // 8
+            places[name] = slice(first, first + shape[0])
+    return places
 
 
 def _list_vectors(setup: SiteSetup) -> dict[str, Any]:

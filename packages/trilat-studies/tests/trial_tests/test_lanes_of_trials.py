@@ -16,16 +16,19 @@ RANDOM = {
     "link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 15.0, "loss": 0.1},
     "expect": {"mean_age_max_ms": 20.5, "synchronised_by_s": 1.1},
 }
+PLAIN = {"duration_s": 0.6, "sites.s.control.law": "tests.own_laws:PD"}
+PLAIN_REASON = "control laws in plain Python"
 
 
 def list_runs() -> list[Scenario]:
-    """Returns five seeds of a run, one that diverges, one with two tick rates, and one with a
-    metric of its log.
+    """Returns five seeds of a run, one that diverges, one with two tick rates, one with a law
+    in plain Python, and one with a metric of its log.
     """
     runs = [reseed_scenario(load_scenario("free", RANDOM), seed) for seed in range(1, 6)]
     changes: list[dict[str, Any]] = [
         {"limits.qd_limit_rad_s": 0.9},
         {"sites.s.rate_hz": 500},
+        PLAIN,
         {"expect.metrics.rms_error_rad": [0.0, 9.0]},
     ]
     return [*runs, *(load_scenario("free", {**RANDOM, **change}) for change in changes)]
@@ -40,8 +43,8 @@ def test_metrics_do_not_depend_on_lanes() -> None:
         reasons[index] = obstacle
     alone = {n: msgspec.json.encode(measure_virtual_run(run)) for n, run in enumerate(runs)}
     assert together == alone
-    texts = ["", "", "", "", "", "", "tick rates that differ between sites"]
-    assert [reasons[n] for n in range(8)] == [*texts, "metrics that need a log"]
+    assert [reasons[n] for n in range(6)] == [""] * 6
+    assert [reasons[7], reasons[8]] == [PLAIN_REASON, "metrics that need a log"]
 
 
 def list_facts(batch: list[Trial]) -> list[Any]:
@@ -75,10 +78,10 @@ def test_lanes_do_not_change_trials(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_report_names_trials_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials with two tick rates run one by one beside trials that run in lanes."""
+    """Trials with a law in plain Python run one by one beside trials that run in lanes."""
     monkeypatch.setattr(run_groups, "has_lane_code", lambda _: True)
-    uneven = {**RANDOM, "sites.s.rate_hz": 500}
-    batch = [*trials("free", range(1, 6), RANDOM), *trials("free", [3, 4], uneven)]
+    plain = {**RANDOM, **PLAIN, "expect": {"mean_age_max_ms": 20.5}}
+    batch = [*trials("free", range(1, 6), RANDOM), *trials("free", [3, 4], plain)]
     assert run_trials(batch, jobs=1).remarks()[-1] == (
-        "2 of 7 runs were computed one by one: tick rates that differ between sites (2)"
+        f"2 of 7 runs were computed one by one: {PLAIN_REASON} (2)"
     )

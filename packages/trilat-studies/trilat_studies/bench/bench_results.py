@@ -25,6 +25,7 @@ from trilat_net.presentation import Block, TextTable, format_number
 from trilat_net.results import Result
 from trilat_net.work import MeanInterval, encode_csv, wilson_interval
 
+from ..side_by_side import describe_runs_alone
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
@@ -304,10 +305,18 @@ class BenchResults(Result):
         plan: Plan of the suite.
         places: The results of all cells, in the order of the plan.
         runs: All runs, in the same order.
+        alone: Reasons why runs were not computed side by side with others, with the number of
+            these runs. Runs of a benchmark that computes all runs one by one are not counted.
     """
 
-    def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
+    def __init__(
+        self,
+        plan: BenchPlan,
+        runs: dict[tuple[str, int], BenchRun],
+        alone: Mapping[str, int] = {},
+    ) -> None:
         self.plan = plan
+        self.alone = alone
         self.places: list[BenchCellResult] = []
         for cell in plan.cells:
             cell_runs = [_confirm_run(runs, cell, seed) for seed in cell.seeds]
@@ -323,6 +332,7 @@ class BenchResults(Result):
         has the effects of delay and loss.
         """
         yield from _describe_bench(self)
+        yield from filter(None, [describe_runs_alone(self.alone, len(self.runs))])
         yield ""
         yield _tabulate_verdicts(self)
         for task in self.plan.tasks:

@@ -23,6 +23,8 @@ Invariant:
 
 import json
 import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +46,7 @@ from trilat_net.analysis import (
     wall_force,
 )
 from trilat_net.core import Array
-from trilat_net.errors import UsageError
+from trilat_net.errors import CodeFailed, UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, ViscousEnvironment
@@ -58,7 +60,14 @@ from trilat_net.work import (
     open_worker_pool,
 )
 
-from ..measure_run import RecordBatch, describe_program, run_whole
+from ..measure_run import (
+    RecordBatch,
+    WholeRun,
+    describe_program,
+    run_whole,
+    run_whole_together,
+)
+from ..side_by_side import RunKind, count_reasons, prepare_kinds
 from ..tuning.candidate import load_tuning_scenario
 from .bench_plan import (
     SHORTER_REACH,
@@ -119,11 +128,13 @@ class BenchRunItem(NamedTuple):
         seed: Seed of the run.
         to_s: Duration in s, if the run repeats a first run over twice its length to check that
             it is not stable. 0 for a first run.
+        is_side_by_side: True to compute the run together with others, if possible.
     """
 
     cell: BenchCell
     seed: int
     to_s: float = 0.0
+    is_side_by_side: bool = False
 
     def __str__(self) -> str:
         return f"{self.cell.name}, seed {self.seed}"
@@ -177,21 +188,73 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
         The finished run, ready for the journal. It has the judgement of its stability and
         measured numbers such as error and effort. A run that diverged has no such numbers.
     """
+    scenario = _build_scenario(item)
+    return _measure_item(item, scenario, run_whole(scenario))
+
+
+LANE_RUNS = 16
+"""Number of runs that a worker computes side by side. All their records are in memory."""
+
+
+def run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
+    """Executes several runs of the benchmark, side by side where that is possible.
+
+    Args:
+        items: The runs to execute.
+
+    Yields:
+        The finished runs in the order of the items, equal to those of `run_bench_task`.
+    """
+    for first in range(0, len(items), LANE_RUNS):
+        part = items[first : first + LANE_RUNS]
+        chosen = [n for n, item in enumerate(part) if item.is_side_by_side]
+        scenarios = {n: _build_scenario(part[n]) for n in chosen}
+        finished: dict[int, BenchRun] = {}
+        try:
+            for index, whole, _ in run_whole_together(list(scenarios.values())):
+                n = chosen[index]
+                finished[n] = _measure_item(part[n], scenarios[n], whole)
+        except CodeFailed:
+            # One by one, the runs before the one whose code fails are kept.
+            finished.clear()
+        for n, item in enumerate(part):
+            yield finished[n] if n in finished else run_bench_task(item)
+
+
+def _build_scenario(item: BenchRunItem) -> Scenario:
+    """Returns the scenario of a run of the benchmark, with the duration of the run.
+
+    Args:
+        item: The run to execute.
+    """
+    scenario = item.cell.build(item.seed).scenario
+    if item.to_s > 0.0:
+        scenario = msgspec.structs.replace(scenario, duration_s=item.to_s)
+    return scenario
+
+
+def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> BenchRun:
+    """Judges a run of the benchmark and measures its performance, see `run_bench_task`.
+
+    Args:
+        item: The run.
+        scenario: Its scenario, with the duration of the run.
+        whole: Its records.
+    """
     cell = item.cell
-    scenario = cell.build(item.seed).scenario
-    is_repeated = item.to_s > 0.0
-    if is_repeated:
-        judged = judge_bench_run(scenario, item.to_s)
-    else:
-        judged = judge_bench_run(scenario, scenario.duration_s)
+    judged = _judge_records(scenario, whole)
+    original = scenario
+    if item.to_s == 0.0:
         judged = lengthen_run(judged)
+    else:
+        original = cell.build(item.seed).scenario
 
     run = BenchRun(
         name=cell.name,
         inputs=cell.inputs,
         seed=item.seed,
         random=scenario.random,
-        sha256=scenario.sha256,
+        sha256=original.sha256,
         stability=judged.stability,
         behaviour=judged.end.behaviour,
         text=judged.text,
@@ -218,7 +281,17 @@ def judge_bench_run(scenario: Scenario, length_s: float) -> JudgedRun:
         length_s: Duration of the run, in s.
     """
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
-    records, end, run = run_whole(scenario)
+    return _judge_records(scenario, run_whole(scenario))
+
+
+def _judge_records(scenario: Scenario, whole: WholeRun) -> JudgedRun:
+    """Decides whether a simulated run is stable, see `judge_bench_run`.
+
+    Args:
+        scenario: Its scenario, with the duration of the run.
+        whole: The run with its records.
+    """
+    records, end, run = whole
     judged = judge_virtual_run(scenario, run, end)
     decision = judged.decision
     return JudgedRun(
@@ -843,15 +916,52 @@ def run_bench(
     plan = folder.plan
     items = [BenchRunItem(cell, seed) for cell in plan.cells for seed in cell.seeds]
     with folder.journal() as journal:
+        done = journal.done
+        pending = [item for item in items if (item.cell.key, item.seed) not in done]
+        side_by_side = _choose_lanes(pending)
+        alone = count_reasons(side_by_side.get(_find_kind(item), "") for item in pending)
+        items = [
+            item._replace(is_side_by_side=_find_kind(item) in side_by_side) for item in items
+        ]
         _run_pending(journal, items, jobs, on, progress)
 
         repeated = []
         for item in items:
             run = journal.done[item.cell.key, item.seed]
             if run.needs_confirmation:
-                repeated.append(item._replace(to_s=run.confirmation_s))
+                # The records of several long runs would need too much memory.
+                to_s = run.confirmation_s
+                repeated.append(item._replace(to_s=to_s, is_side_by_side=False))
         _run_pending(journal, repeated, jobs, on, progress)
-        return BenchResults(plan, dict(journal.done))
+        return BenchResults(plan, dict(journal.done), alone)
+
+
+def _find_kind(item: BenchRunItem) -> tuple[str, str, str]:
+    """Returns a key that is equal for runs that differ in numbers only, such as the delay."""
+    return item.cell.form, item.cell.law, item.cell.task
+
+
+RUNS_OF_A_JUDGEMENT = 8
+"""Approximate number of simulations with which a run is judged: the run and its twins."""
+
+
+def _choose_lanes(items: Sequence[BenchRunItem]) -> dict[tuple[str, str, str], str]:
+    """Chooses the runs that are computed side by side with others or with their twins.
+
+    Args:
+        items: The runs that are to be executed.
+
+    Returns:
+        The kinds of these runs, see `prepare_kinds`.
+    """
+    counts = Counter(map(_find_kind, items))
+    kinds = {}
+    for item in items:
+        kind = _find_kind(item)
+        if kind not in kinds:
+            scenario = _build_scenario(item)
+            kinds[kind] = RunKind(scenario, RUNS_OF_A_JUDGEMENT * counts[kind])
+    return prepare_kinds(kinds)
 
 
 def _run_pending(
@@ -880,6 +990,7 @@ def _run_pending(
             pending.append(item)
     if not pending:
         return
+    in_lanes = any(item.is_side_by_side for item in pending)
     hint = "; finished runs are kept: the same command continues"
     with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
         journal.run_pending(
@@ -889,4 +1000,6 @@ def _run_pending(
             done=len(items) - len(pending),
             total=len(items),
             show=progress,
+            together=run_bench_tasks if in_lanes else None,
+            together_count=LANE_RUNS if in_lanes else 1,
         )
