@@ -40,5 +40,5 @@ def test_table_does_not_depend_on_lanes(
     table = (tmp_path / "together" / RESULTS_FILE).read_bytes()
     assert table == (tmp_path / "alone" / RESULTS_FILE).read_bytes()
     assert describe_runs_alone(together.alone, together.runs) == (
-        "8 of 16 runs were computed one by one: tick rates that differ between sites (8)"
+        "8 of 16 runs were computed one by one: a slow site (8)"
     )

@@ -550,8 +550,8 @@ class TuningPlan(NamedTuple):
             printed.append(_PaperGainsResult(name, paper_scenarios[0][name], score))
         return TuningResult(self, searches, printed, alone)
 
-    def _choose_lanes(self, first_candidates: Sequence[CandidateItem]) -> set[str]:
-        """Returns the names of the laws whose runs are to be computed side by side.
+    def _choose_lanes(self, first_candidates: Sequence[CandidateItem]) -> dict[str, str]:
+        """Returns the laws whose runs are to be computed side by side, see `prepare_kinds`.
 
         Args:
             first_candidates: One candidate of each law.
