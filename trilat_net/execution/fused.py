@@ -475,7 +475,7 @@ class FusedRun:
 
     @property
     def memory(self) -> RunMemory:
-        """All arrays of the run, as views that change while the run advances."""
+        """All arrays of the simulated run, as views that change while the run advances."""
         return RunMemory(
             tables=self._tables,
             progress=self._progress,
@@ -772,7 +772,10 @@ class FusedRun:
 
     @property
     def programmed_sites(self) -> set[int]:
-        """Indices of the sites whose operator or arm is a user's program."""
+        """Indices of the sites (arm controllers) whose operator or arm is a user's own program.
+
+        Such a program is called in Python in each control period, which is slower.
+        """
         return {*self._hands, *self._plants}
 
     def copy_state(self, other: "FusedRun") -> None:
@@ -956,9 +959,9 @@ class FusedRun:
 
     @property
     def q(self) -> Array:
-        """Joint angles of all arms after the last tick, in rad, shape (N, n).
+        """Joint angles of all arms after the last control period, in rad, shape (N, n).
 
-        N is the number of sites, and n is the number of joints.
+        N is the number of sites (one per arm), and n is the number of joints of each arm.
         """
         return np.array(self._tables.site["q"][:, 0])
 
@@ -1017,9 +1020,9 @@ class FusedRun:
 
     @property
     def records(self) -> Array:
-        """Record of the last tick of each site.
+        """Results of the last control period (tick) of each site, one row per site.
 
-        The array has one row per site, and the columns of `Layout.columns`.
+        A site is the controller of one arm. For the columns see `Layout.columns`.
         """
         return np.array([self._last_row(i) for i in range(len(self._progress))])
 

@@ -65,13 +65,16 @@ class LogCheckReport(CheckReport):
 
     @property
     def identical(self) -> int:
-        """Number of records that the repeated execution confirmed in every computed field."""
+        """Number of records whose control periods were executed again with the same bits.
+
+        Every field that a control period computes must agree.
+        """
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the whole report as plain values, ready for JSON.
+        """Returns the whole report on a log as plain values, ready for JSON.
 
-        The keys are those of `trilat verify --json`.
+        The keys are those that `trilat verify --json` prints.
         """
         result = self.result
         first_difference = None

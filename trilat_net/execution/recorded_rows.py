@@ -136,7 +136,7 @@ class PlainRows:
         samples: SampleTable,
         resume_every: int = 0,
     ) -> None:
-        """Stores the records. Their arrivals are looked up when they are first needed."""
+        """Stores the records of a site. Received messages are looked up on first use."""
         self._site_log = site_log
         self._indexed = indexed
         self._samples = samples
@@ -306,5 +306,8 @@ def _read_plants(block: IndexedRecords) -> Array:
 
 
 def can_repeat(site: Site) -> bool:
-    """True if compiled code can execute recorded ticks of a site again."""
+    """True if compiled code can execute the recorded control periods of a site again.
+
+    This is much faster than Python. A site is the controller of one arm.
+    """
     return not site.parts.has_user_law

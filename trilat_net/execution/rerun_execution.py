@@ -475,7 +475,11 @@ class RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        """Creates the site in its initial state, and collects its inputs from the log."""
+        """Creates a site in its initial state, and collects its recorded inputs from the log.
+
+        A site is the controller of one arm. A rerun repeats a recorded run with something
+        changed.
+        """
         site_log = log[name]
         scenario = request.scenario
         setup = scenario.setup(name)
@@ -516,9 +520,9 @@ class RerunSite:
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the tick that is executed next, in ns after the epoch.
+        """Nominal time of the control period that is executed next, in ns after the epoch.
 
-        The epoch is the common start time of the sites.
+        The epoch is the common start time of the sites (arm controllers).
         """
         return self.k * NS_PER_S // self._site.rate_hz
 
@@ -686,7 +690,10 @@ class RerunExecution:
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
-        """Creates the executed sites, and connects them by the samples that they compute."""
+        """Creates the sites that are executed again, and connects them with each other.
+
+        A site (arm controller) then receives what the others compute, not what was recorded.
+        """
         self._log = log
         self._request = request
         self._recent: dict[str, dict[int, Arrival]] = {name: {} for name in request.replaced}

@@ -202,7 +202,10 @@ class RecordedInputs(Generic[Change]):
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
-        """Collects the samples and changes of one site, before its first tick is executed."""
+        """Collects what a site received in a recorded run, before its first control period.
+
+        These are the samples (states that other sites sent) and the changes of settings.
+        """
         self._site_log = site_log
         self._states = site_log.states if states is None else states
         self._links = links
@@ -214,7 +217,10 @@ class RecordedInputs(Generic[Change]):
 
     @property
     def next_change_tick(self) -> int | None:
-        """Tick at which the next change takes effect. None if there are no further changes."""
+        """Control period (tick) at which the next change of the settings takes effect.
+
+        None if there are no further changes in the recorded run.
+        """
         return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:

@@ -445,7 +445,10 @@ class _TwinRuns:
         inputs: RunInputs | None = None,
         log: Log | None = None,
     ) -> None:
-        """Creates the run and its twins before their first tick, and empty results."""
+        """Creates a run and slightly displaced copies of it (twins), and empty results.
+
+        No control period has been executed yet.
+        """
         self._log = log
         self._pushes = pushes
         self._joints = _list_joints(scenario)
@@ -497,7 +500,10 @@ class _TwinRuns:
         return runs
 
     def run(self) -> Twins:
-        """Simulates a run and its repetitions with a push, and returns the differences."""
+        """Simulates a run and slightly displaced copies of it, and returns their differences.
+
+        Differences that grow show that the system is unstable.
+        """
         for twin_index, push in enumerate(self._pushes):
             if push.at_s == 0.0:
                 self._push(twin_index, 0.0)
@@ -745,7 +751,7 @@ class _LaneTwinRuns(_TwinRuns):
         return [LaneTwin(self._lanes, lane) for lane in range(count)]
 
     def _execute_window(self, end_s: float) -> None:
-        """Executes the run and its twins to the end of a window, and measures the differences.
+        """Continues a run and its displaced copies (twins), and measures their differences.
 
         Args:
             end_s: End of the window, in s.

@@ -87,7 +87,7 @@ class RecordDifference(NamedTuple):
     computed: Any
 
     def __str__(self) -> str:
-        """Returns a text about the difference."""
+        """Returns a sentence about the difference, for the report to the user."""
         logged = _format_value(self.logged)
         computed = _format_value(self.computed)
         location = f"{self.site}, tick {self.tick}, {self.field}"
@@ -100,7 +100,7 @@ def _format_value(value: object) -> str:
 
 
 def equal_bits(a: float, b: float) -> bool:
-    """True if two numbers have the same bits.
+    """True if two floating-point numbers are identical bit by bit.
 
     Unlike `==`, this distinguishes -0.0 from 0.0, and counts two NaNs as equal.
     """
@@ -289,7 +289,7 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no record differs from the repeated execution.
+        """True if no record of the log differs from a repeated execution of its control period.
 
         It is also true if only few records, or none, could be compared.
         """
@@ -924,7 +924,7 @@ def _execute_sites(
 
 
 def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
-    """Returns the records of a site.
+    """Returns the records of a site (arm controller), decoded now or on first access.
 
     Args:
         site_log: Records of the site.

@@ -120,7 +120,7 @@ class SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
-        """Starts with no written message on any channel."""
+        """Prepares the numbering of a site's messages. No message has been written yet."""
         settings = scenario.sites[site]
         self.peers = scenario.peers(site)
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}

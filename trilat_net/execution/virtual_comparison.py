@@ -78,7 +78,7 @@ class _LateSample(NamedTuple):
     arrived_tick: int | None
 
     def __str__(self) -> str:
-        """Returns a sentence about the sample."""
+        """Returns a sentence about the late message, for the report to the user."""
         outcome = "never came"
         if self.arrived_tick is not None:
             outcome = f"came at tick {self.arrived_tick}"
@@ -341,7 +341,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the arrivals at a site, by tick.
+    """Returns the messages that arrived at a site, by the control period (tick) that used them.
 
     Arrivals in gaps of the log are assumed, unless too many records are missing.
     """

@@ -134,7 +134,10 @@ class RecordedNetwork:
         self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the sample of a tick under its sender and tick, until it is delivered."""
+        """Stores a sent state (sample) under its sender and tick, until it is delivered.
+
+        The delivery repeats the delays of the recorded run.
+        """
         self._sent[sender, output.tick] = output
 
     def is_ready(self, receiver: str, k: int) -> bool:

@@ -421,7 +421,7 @@ class Rerun(Result):
 
     @property
     def diverged(self) -> bool:
-        """True if the arm of a site left its limits in the rerun, but not in the log."""
+        """True if an arm left its limits in the repeated run, but not in the recorded run."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -429,7 +429,7 @@ class Rerun(Result):
 
     @property
     def identical(self) -> bool:
-        """True if the rerun reproduced every compared record with the same bits."""
+        """True if the repeated run gave the same bits in every record that was compared."""
         return all(effect.identical == effect.compared for effect in self.sites.values())
 
     @property
@@ -466,9 +466,9 @@ class Rerun(Result):
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the whole result as plain values, ready for JSON.
+        """Returns the result of a repeated run as plain values, ready for JSON.
 
-        The keys are those of `trilat rerun --json`.
+        The keys are those that `trilat rerun --json` prints.
         """
         return {
             "log": self.before.source,
@@ -602,9 +602,10 @@ def _make_executed_entries(
 
 
 def _to_plain_value(value: Any) -> Any:
-    """Converts a value for JSON.
+    """Converts a value to types that JSON can represent.
 
-    A named tuple becomes a dictionary. Infinite numbers and NaN become None.
+    A named tuple becomes a dictionary. Infinite numbers and NaN become None, because JSON has
+    no such numbers.
     """
     if hasattr(value, "_asdict"):
         return {key: _to_plain_value(item) for key, item in value._asdict().items()}
@@ -612,7 +613,7 @@ def _to_plain_value(value: Any) -> Any:
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences that tell the user what limits the meaning of a rerun.
+    """Yields sentences about what a repeated run cannot show, for the user.
 
     Args:
         result: The log and its rerun.

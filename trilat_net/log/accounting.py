@@ -170,7 +170,7 @@ class Account:
     """
 
     def __init__(self) -> None:
-        """Starts without any message."""
+        """Starts an account of received messages with no message counted yet."""
         self.received = 0
         self.duplicate = 0
         self.reordered = 0
@@ -316,7 +316,7 @@ class Account:
 
     @property
     def missing(self) -> int:
-        """Number of messages that were published, but not received, not even on request."""
+        """Number of lost messages: published, but never received, not even on request."""
         return self.expected - self.received
 
     @property
@@ -425,7 +425,10 @@ class StartGap:
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
-        """Starts with an unknown gap, because the site has not been started again yet."""
+        """Stores the account of a site's messages before the site was started again.
+
+        The number of messages that were lost between both starts is unknown at first.
+        """
         self._account = account
         self._under_way = under_way
         # Largest number of messages that the earlier start published, as other sites report.

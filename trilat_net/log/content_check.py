@@ -156,7 +156,7 @@ class ContentCheck:
     def __init__(
         self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool
     ) -> None:
-        """Starts without any accepted message."""
+        """Prepares the check of a channel's messages. No message has been accepted yet."""
         self._scenario = scenario
         self._about = about
         self._session = about.get("session", "")

@@ -103,7 +103,7 @@ class Column(NamedTuple):
 
     @property
     def is_text(self) -> bool:
-        """True if the values are texts."""
+        """True if the values of the column are strings, and False if they are numbers."""
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
@@ -155,7 +155,7 @@ class Table:
         return len(self.columns[0].values) if self.columns else 0
 
     def __getitem__(self, name: str) -> Column:
-        """Returns a column by its name.
+        """Returns a column of the table by its name, as in `table["q1_rad"]`.
 
         Raises:
             KeyError: The table has no column of that name.
@@ -167,7 +167,10 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table for file names, such as "m1_link", or "events" for all sites."""
+        """Name of the table for file names, such as "m1_link" for the links of the site "m1".
+
+        A table about all sites has a name without a site, such as "events".
+        """
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
     def to_data_frame(self) -> "polars.DataFrame":
@@ -845,9 +848,9 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:
-    """Converts a field of an event to a string.
+    """Converts a field of an event (a notable occurrence in a session) to a table cell.
 
-    A map becomes JSON, and an empty map an empty text.
+    A dictionary becomes JSON, but an empty dictionary becomes the empty string.
     """
     if isinstance(value, str):
         return value

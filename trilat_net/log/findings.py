@@ -141,7 +141,7 @@ class CheckReport(Result):
 
     @property
     def passed(self) -> bool:
-        """True if every check passed."""
+        """True if every check of the log passed."""
         return all(finding.passed for finding in self.findings)
 
     @property
@@ -158,5 +158,8 @@ class CheckReport(Result):
         return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per check, with the keys "label", "text", "passed" and "judged"."""
+        """Returns one dictionary per check of the log, for a table or for JSON.
+
+        The keys are "label", "text", "passed" and "judged".
+        """
         return [finding.to_row() for finding in self.findings]

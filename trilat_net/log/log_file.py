@@ -80,9 +80,10 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Frees the reserved disk space, so that the end of the log fits on a full disk.
+        """Frees the reserved disk space, so that the last part of the log fits on a full disk.
 
-        Later calls of `grow` reserve nothing.
+        The recorder calls this when an error stops the writing. Later calls of `grow` reserve
+        nothing.
         """
         self._is_possible = False
         self.size = 0
@@ -252,7 +253,7 @@ class LogFile:
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
-        """Creates the file under its working name."""
+        """Creates the log under a working name, which shows that it is not complete yet."""
         self.path = path
         self.working = working or active_path(path)
         self.size = 0

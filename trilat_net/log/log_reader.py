@@ -130,7 +130,7 @@ class Log(Result, Mapping[str, SiteLog]):
     """
 
     def __init__(self, contents: LogContents) -> None:
-        """Reads the scenario and the events. Records are decoded when they are accessed."""
+        """Reads the scenario and the events of a log. Records are decoded on first access."""
         self.source = contents.source
         self.sources = contents.sources
         self.session = contents.session
@@ -174,7 +174,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def why_empty(self) -> str:
-        """A clause that no site has a record in this log. Empty if a site has a record."""
+        """Clause for an error text which says that no site has a record in this log.
+
+        Empty if at least one site has a record.
+        """
         has_records = any(len(self[name]) for name in self.sites)
         return "" if has_records else "no site has a record in this log"
 
@@ -318,9 +321,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return sorted(event_topics & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
-        """Returns the messages of a topic.
+        """Returns all messages of one topic of the log, for example of one site's records.
 
-        They are empty if the log does not contain the topic.
+        The result is empty if the log does not contain the topic.
         """
         return self._contents.channels.get(topic) or ChannelMessages()
 
@@ -407,9 +410,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def failed_hands(self) -> list[str]:
-        """Sentences on the programs that failed while they moved an arm: which, when, and why.
+        """Sentences about programs that failed while they moved an arm, for reports on the log.
 
-        Empty if none failed.
+        Each sentence tells which program failed, when, and why. Empty if none failed.
         """
         return [
             event.text
@@ -661,7 +664,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return [*self.absences.get(site, ()), *self[site].skipped_ranges]
 
     def absent_ticks(self, site: str) -> int:
-        """Counts the ticks of `find_unexecuted_ticks`.
+        """Counts the control periods (ticks) that a site did not execute during the session.
+
+        The process may have started late or ended early, see `find_unexecuted_ticks`.
 
         Args:
             site: Name of the site.
@@ -685,9 +690,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return max(ticks, recorded) - self.absent_ticks(site)
 
     def _is_gone(self, site: str) -> bool:
-        """Returns True if the latest news about a site is that it was lost or left.
+        """Returns True if a site was lost or left, according to the latest event about it.
 
-        The other sites publish this news as events.
+        Other sites publish such events. The site may have come back after an earlier loss.
         """
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]

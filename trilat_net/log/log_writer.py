@@ -42,7 +42,11 @@ class _ViewChannels(Protocol):
     """Numbers of the channels for viewers in a file, by topic."""
 
     def __getitem__(self, topic: str) -> int:
-        """Returns the number of a topic's channel, and registers the channel if necessary."""
+        """Returns the number of a topic's channel in an MCAP file.
+
+        The channel is registered in the file at the first access, so that the file declares no
+        channel without messages.
+        """
 
 
 class _LogViews(Protocol):
@@ -66,7 +70,9 @@ class _LogViews(Protocol):
         """
 
     def open_channels(self, file: McapWriter) -> _ViewChannels:
-        """Returns the channels for viewers of a file, which are registered when needed.
+        """Returns the channels of a file that viewers such as Foxglove display.
+
+        A channel is registered in the file only when its first message is written.
 
         Args:
             file: The file.
@@ -213,12 +219,12 @@ class LogWriter:
 
     @property
     def messages(self) -> int:
-        """Number of messages that were added to the file, even if not yet on the disk."""
+        """Number of messages in the log, including those that are not yet on the disk."""
         return self._file.messages
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes written so far."""
+        """Number of bytes of the log file that have been written so far."""
         return self._file.position
 
     @property
@@ -444,7 +450,10 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
-        """Opens the first file of the log, after a check that its name is free."""
+        """Creates the first of the files into which a long log is divided.
+
+        An error is raised before that if a file of the same name exists.
+        """
         self._open_file = opened or (
             lambda path: LogFile(path, force=storage.force, durable=storage.durable)
         )
@@ -535,7 +544,7 @@ class LogParts:
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes that were written to all files of the log so far."""
+        """Number of bytes that have been written to all files of a divided log so far."""
         return self._previous_bytes + self._writer.written_bytes
 
     def add(

@@ -49,7 +49,7 @@ class FileCheck:
     def __init__(
         self, file: str, scanner: mcap_records.RecordScanner, findings: Findings
     ) -> None:
-        """Starts without any checked record."""
+        """Prepares the check of one MCAP file. No record has been checked yet."""
         self.counts = Counter(bytes=scanner.size)
         self._file = file
         self._scanner = scanner

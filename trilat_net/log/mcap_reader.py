@@ -155,12 +155,15 @@ class _MessageBlock(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """Number of messages in the block."""
+        """Number of messages in this block of consecutive messages of one topic."""
         return int(self.run.counts[self.slot])
 
     @property
     def most_bytes(self) -> int:
-        """Upper limit of the length of all payloads, in bytes."""
+        """Upper limit of the total length of the messages in this block, in bytes.
+
+        A reader reserves this much memory before it copies the messages.
+        """
         return int(self.run.lengths[self.slot])
 
     def copy_payloads(self, target: NDArray[np.uint8], offset: int) -> tuple[Ints, Ints]:
@@ -247,7 +250,7 @@ class McapReader:
         *,
         kept: bool = True,
     ) -> None:
-        """Prepares the reading. Only the beginning and the end of the file are read here."""
+        """Opens an MCAP file for reading. Only its beginning and its end are read here."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.channels: dict[str, ChannelInfo] = {}
@@ -340,10 +343,10 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def _check_begin(self) -> None:
-        """Checks that the file begins with the mark of MCAP files.
+        """Checks that the file begins with the eight bytes with which every MCAP file begins.
 
         Raises:
-            LogError: The file does not begin with the mark.
+            LogError: The file begins with other bytes, so that it is no MCAP file.
         """
         if not self.scanner.begins:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
@@ -398,7 +401,7 @@ class McapReader:
             self._note_damage(record.frame, error)
 
     def _note_damage(self, frame: mcap_records.RecordFrame, error: Exception) -> None:
-        """Adds a record that cannot be read to the damaged parts.
+        """Adds a record that cannot be decoded to the list of damaged parts of the file.
 
         Args:
             frame: Place of the record.
@@ -872,14 +875,17 @@ class ChannelMessages:
 
     @property
     def payloads(self) -> PackedMessages:
-        """The K messages, as published. Messages that are added later are not included."""
+        """The contents of all K messages of the topic, as they were published.
+
+        Messages that are added to the topic later are not included.
+        """
         data = self._reserve(PADDING)
         ends = np.array(self._ends, np.int64)
         starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(ends)]
         return PackedMessages(data[: self._size + PADDING], starts, ends)
 
     def payload(self, number: int) -> bytes:
-        """Returns one message.
+        """Returns the content of one message of the topic, as it was published.
 
         Args:
             number: Number of the message, from 0.
@@ -919,7 +925,7 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def add_block(self, block: _MessageBlock) -> None:
-        """Adds the next messages of the topic, in the order of the file."""
+        """Appends a block of messages to those of the topic, in the order of the file."""
         data = self._reserve(block.most_bytes)
         ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
         self._size = int(ends[-1])
@@ -973,7 +979,7 @@ class LogContents:
 
     @property
     def source(self) -> str:
-        """Name of the log for error messages."""
+        """Name of the log for error messages, so that users know which file is meant."""
         more = len(self.sources) - 1
         if not more:
             return self.sources[0]

@@ -250,12 +250,12 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of the whole record in the file, in bytes: its kind, length and content."""
+        """Size of a whole MCAP record in bytes: opcode, length field and content."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
     def end(self) -> int:
-        """Offset of the first byte after the record, at which the next record begins."""
+        """Offset in the file of the first byte after this record, where the next one begins."""
         return self.offset + self.size
 
 
@@ -381,9 +381,9 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every record that `scan` finds.
+        """Yields the kind and the position of every readable record of an MCAP file.
 
-        Unreadable parts of the file are left out.
+        Parts of the file that cannot be read are left out.
         """
         for item in self.scan():
             if isinstance(item, ScannedRecord):

@@ -69,7 +69,7 @@ class Sink(Protocol):
         """
 
     def flush(self) -> None:
-        """Passes all bytes that are stored in the buffer on to the file."""
+        """Passes buffered bytes on to the file, so that other programs can read them."""
 
 
 def _pack_text(text: str) -> bytes:

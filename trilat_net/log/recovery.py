@@ -441,9 +441,10 @@ class _FileCopy:
             )
 
     def _report_damage(self, damage: Damage) -> None:
-        """Adds a damaged part to the losses.
+        """Adds a damaged part of the file to the losses that the report on the recovery states.
 
-        Parts after the end of the data contain only the index, and are no loss.
+        A part after the end of the data contains only the index, which is rebuilt, and is no
+        loss.
         """
         if damage.offset <= self._data_end:
             self._result.add_loss(str(damage), damage.length)
@@ -756,9 +757,10 @@ class _FileCopy:
             self._contradicted.add(entry.id)
 
     def _is_plausible(self, topic: str) -> bool:
-        """Returns True if a topic can occur in the source.
+        """Returns True if a topic can occur in the log that is recovered.
 
-        The log of a session contains no topics of members of other sessions.
+        Damaged bytes can look like a valid topic. The log of a session, for example, contains
+        no topics of other sessions.
         """
         if self._content is None or not topic.startswith(f"/{topics.ROOT}/"):
             return True

@@ -71,7 +71,7 @@ class RecoverySurvey:
     """
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
-        """Reads the whole file once, and selects the parts that belong together."""
+        """Reads a damaged file once, and selects those parts of it that belong to one log."""
         self.profile = ""
         self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -109,7 +109,7 @@ class RecoverySurvey:
             self.why_empty = self._explain_empty()
 
     def _read_records(self) -> bool:
-        """Reads all records of the file except the messages.
+        """Reads all records of the damaged file except messages, such as schemas and channels.
 
         Returns:
             True if the file contains messages or chunks.

@@ -58,7 +58,7 @@ class SessionAccounts:
         continued: bool = False,
         events: bool = True,
     ) -> None:
-        """Starts with no counted message and no opened channel."""
+        """Starts the accounts of a session's messages. No message has been counted yet."""
         self._session = session
         self._continued = continued
         self._rates_hz: dict[str, int] = {}

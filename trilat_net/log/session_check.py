@@ -178,7 +178,7 @@ class _ChannelCheck:
         findings: Findings,
         accounts: SessionAccounts,
     ) -> None:
-        """Starts without any checked message."""
+        """Prepares the check of one channel of a log. No message has been checked yet."""
         self.member = key.member
         self.kind = key.channel
         self._topic = "/" + topics.key(key.session, key.member, key.channel)
@@ -206,7 +206,10 @@ class _ChannelCheck:
 
     @property
     def name(self) -> str:
-        """Short name of the channel for texts, such as "m1/state": the member and the kind."""
+        """Short name of the channel for texts, such as "m1/state".
+
+        It consists of the publishing member ("m1") and the kind of message ("state").
+        """
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
@@ -409,7 +412,7 @@ class _SessionCheck:
     """
 
     def __init__(self) -> None:
-        """Starts without any checked file."""
+        """Prepares the check of all files of a session. No file has been checked yet."""
         self.ours = False
         self.channels: dict[str, _ChannelCheck] = {}
         self._findings = Findings()

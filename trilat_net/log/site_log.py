@@ -151,7 +151,7 @@ class LazyRecords(Sequence[State]):
     def __init__(
         self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
     ) -> None:
-        """Prepares the cache of decoded blocks. No record is decoded yet."""
+        """Stores encoded records, which are decoded in blocks when they are accessed."""
         block_size = _HEAVY_BLOCK if heavy else BLOCK_RECORDS
         block_count = _HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // block_size
         self._payloads = payloads
@@ -159,7 +159,7 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=block_count)
         def get_block(number: int) -> list[State]:
-            """Returns a block of consecutive records, decoded unless it is in memory.
+            """Returns a block of consecutive records. It is decoded if it is not in memory.
 
             Args:
                 number: Number of the block, counted from 0.
@@ -370,7 +370,7 @@ class SiteLog:
         channel: LawChannel = LawChannel(),  # noqa: B008
         axes: tuple[float, ...] = (),
     ) -> None:
-        """Finds the tick of each record, and sorts the records by tick."""
+        """Finds the control period (tick) of each encoded record, and sorts the records."""
         self.channel = channel
         self.name = name
         self.peers = peers
@@ -543,9 +543,10 @@ class SiteLog:
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """The records by tick, to compare two logs whose records may have gaps.
+        """All records by the number of their control period (tick).
 
-        If several records have the same tick, the last one counts.
+        Two logs are compared this way, because either may lack records. If several records have
+        the same tick, the last one counts.
         """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
@@ -553,7 +554,10 @@ class SiteLog:
 
     @property
     def last_tick(self) -> int:
-        """Tick of the last record, counted from the start of the run. -1 without records."""
+        """Number of the control period (tick) of the last record; -1 if there are no records.
+
+        Ticks are counted from 0 at the start of the run.
+        """
         return int(self.tick[-1]) if len(self) else -1
 
     @property

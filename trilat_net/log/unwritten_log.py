@@ -58,7 +58,7 @@ class _UnwrittenSiteLog(SiteLog):
 
     @property
     def diverged_s(self) -> float | None:
-        """None, because every tick of the scenario was executed."""
+        """None, because no arm left its limits: every planned control period was executed."""
         return None
 
     def _read_from(self, *_: Any) -> Any:

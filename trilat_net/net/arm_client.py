@@ -98,7 +98,7 @@ class SiteSender:
         channel: str,
         boot: int,
     ) -> None:
-        """Opens the channel to the site. No message is sent yet."""
+        """Opens a channel for messages to a site (arm controller). No message is sent yet."""
         self.boot = boot
         self.number = -1
         self._clock = clock
@@ -187,7 +187,7 @@ class SiteClient:
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the records, the events and the presence of the site."""
+        """Subscribes to the records, the events and the presence of a site (arm controller)."""
         self._bus = bus
         self._clock = clock
         self._site = site
@@ -324,7 +324,7 @@ class _OutsideClient(SiteClient):
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the messages of the site, and opens the channel to the site."""
+        """Subscribes to the messages of a site (arm controller), and opens a channel to it."""
         super().__init__(bus, clock, session, site)
         self._sender = SiteSender(
             bus=bus,
@@ -510,7 +510,7 @@ class Hand(SiteClient):
         *,
         repeats: bool = True,
     ) -> None:
-        """Connects to the site. The arm is moved only after the first call of a method."""
+        """Connects to a site (arm controller). The arm moves only after a further call."""
         super().__init__(bus, clock, session, site)
         self._operator = operator
         self._compute_pose = compute_pose
@@ -633,7 +633,7 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """Pose of the arm in the newest record.
+        """Pose of the arm in the newest received record.
 
         It is the position of the end effector in m, or for `turn` the joint angles in rad.
         """

@@ -36,10 +36,10 @@ class PolledRing(Protocol[Polled]):
     """
 
     def poll(self) -> Polled | None:
-        """Removes the oldest entry from the queue and returns it, without waiting.
+        """Removes the oldest received message from the queue and returns it, without waiting.
 
         Returns:
-            The entry. None if the queue is empty.
+            The message. None if the queue is empty.
         """
 
 
@@ -63,7 +63,7 @@ class Query(Protocol):
         """Content of the query, as the sender encoded it. Empty if the query has no content."""
 
     def reply(self, payload: bytes) -> None:
-        """Sends the answer to the member that sent the query. A query can be answered once.
+        """Sends the answer to the member that asked. A query can be answered once.
 
         Args:
             payload: The encoded reply.
@@ -237,7 +237,7 @@ class BoundedRing(Generic[T]):
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds an entry to the queue. If the queue is full, its oldest entry is dropped."""
+        """Adds an entry to the queue without waiting; a full queue drops its oldest entry."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:

@@ -55,7 +55,10 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The clocks of the operating system of this machine."""
+    """The monotonic clock and the time of day of the operating system.
+
+    Live processes use this class. Tests put other clocks in its place.
+    """
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
     """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""
@@ -113,7 +116,7 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the monotonic time as this wrong clock shows it, in ns.
+        """Returns the time of a clock that is wrong on purpose, in ns, to test synchronisation.
 
         true time + offset + drift * (time since the clock was created)
         """
@@ -122,9 +125,9 @@ class SkewedClock:
         return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
-        """Returns the time of day of the base clock, unchanged, in ns since 1970.
+        """Returns the correct time of day in ns since 1970, without offset and drift.
 
-        Only the monotonic time has an offset and a drift.
+        Only the monotonic time of this class is wrong on purpose.
         """
         return self._clock.unix_ns()
 

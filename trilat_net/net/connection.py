@@ -117,7 +117,9 @@ def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[li
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns endpoints on this machine whose ports no program uses at this moment.
+    """Returns network addresses on this machine whose ports no program uses at this moment.
+
+    Another program may take a port before the caller does.
 
     Args:
         count: Number of endpoints to find.

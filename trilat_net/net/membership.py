@@ -164,7 +164,7 @@ class EventPublisher:
         info: Info,
         keep: Callable[[bytes], None] = lambda _: None,
     ) -> None:
-        """Opens the channel of the events, and begins to receive queries for the identity."""
+        """Opens the channel for this process's events, and answers queries for its identity."""
         self.info = info
         self.published = 0
         self._keep = keep
@@ -310,7 +310,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
-        """Subscribes to the presence of the members. No other member is known yet."""
+        """Subscribes to the presence of the processes of a session. None is known yet."""
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
@@ -328,7 +328,7 @@ class Membership:
 
     @property
     def local_info(self) -> Info:
-        """Identity of this member, as it replies to queries of other members."""
+        """Identity of this process, which other processes of the session can query."""
         return self._publisher.info
 
     @property

@@ -262,7 +262,11 @@ class _AdmissibleLines:
     def __init__(
         self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int
     ) -> None:
-        """Computes the steepest and the flattest line that the limits permit."""
+        """Computes the steepest and the flattest line that the limits of a clock offset permit.
+
+        A line is a possible course of the offset over time; its slope is the drift of the
+        clock.
+        """
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
         self._ceiling_times_s, self._ceilings = self._read_columns(ceilings)
@@ -469,9 +473,10 @@ class SlewedOffset:
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """Latest estimate of the offset.
+        """Latest estimate of the offset between two clocks.
 
-        The smoothed offset moves towards it, or has reached it.
+        The offset in use approaches the estimate gradually, because a jump would disturb the
+        control loop.
         """
         return self._segment.estimate
 

@@ -202,7 +202,10 @@ class RoundTrips:
 
     @property
     def is_known(self) -> bool:
-        """True once the clock offset is known, as enough round trips agree with each other."""
+        """True once the offset between two clocks is known.
+
+        It is known when enough measured round trips of messages agree with each other.
+        """
         return self._agreeing >= self._required
 
     def receive(self, pinged_ns: int, pong: Pong, now_ns: int) -> None:
@@ -241,7 +244,10 @@ class RoundTrips:
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
-            """Returns a limit of the clock offset, moved along the drift to the present, ns."""
+            """Returns a limit of the clock offset at the present time, in ns.
+
+            The limit was measured earlier, and moves with the drift of the clocks.
+            """
             return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
@@ -281,7 +287,7 @@ class Pinger:
         session: str,
         required: int = PINGS,
     ) -> None:
-        """Starts without any measured round trip."""
+        """Prepares the measurement of round trips to other processes. None is measured yet."""
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required

@@ -222,9 +222,10 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the liveliness token of the node.
+        """Returns the text by which ROS 2 programs see that a node exists.
 
-        While this program declares the token, other ROS 2 programs see that the node exists.
+        The node exists for them as long as this program declares the text to Zenoh as a
+        liveliness token.
         """
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
@@ -397,7 +398,7 @@ class TopicPublisher:
         *,
         latched: bool,
     ) -> None:
-        """Stores the publisher. The first message will have the number 1."""
+        """Stores a publisher of a ROS 2 topic, whose messages are numbered from 1."""
         self._declared = declared
         self._gid = gid
         self._clock = clock
@@ -406,9 +407,9 @@ class TopicPublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True while there is a subscriber, or if the topic is latched.
+        """True if somebody would receive a message, so that composing one is worth the time.
 
-        If it is False, the caller need not compose a message.
+        It is always true for a latched topic, whose last message later subscribers receive.
         """
         return self._latched or bool(self._declared.matching_status.matching)
 
@@ -460,7 +461,7 @@ class Ros2Graph:
         domain: int = 0,
         distro: str = "jazzy",
     ) -> None:
-        """Connects to the router of ROS, and announces the node to ROS programs."""
+        """Connects to a Zenoh router of ROS 2, and announces a node to ROS 2 programs."""
         check_hosts(find_endpoint_addresses(routers))
         self._session = open_zenoh(
             listen=[],

@@ -88,7 +88,7 @@ class SessionJoin:
         sites: Sequence[str],
         late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
-        """Announces this process to the other members, and begins to look for them."""
+        """Announces this process to the other processes of a session, and looks for them."""
         self._clock = clock
         self._session = session
         self._publisher = publisher
@@ -606,7 +606,7 @@ class SessionJoin:
         return self._make_epoch(start)
 
     def _announce(self, now_ns: int) -> None:
-        """Proposes an epoch to the members that are present, as the leader.
+        """Proposes a common start time (epoch) to all processes, as the leader of the session.
 
         Args:
             now_ns: Present time on the local clock, in ns.

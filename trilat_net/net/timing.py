@@ -84,7 +84,7 @@ class TickSchedule:
         self._slew_per_ns = 0.0
 
     def due_ns(self, k: int) -> int:
-        """Returns the time at which a tick is due, on the site's clock, in ns.
+        """Returns the time at which a control period (tick) is due, on the site's clock, in ns.
 
         Args:
             k: Number of the tick (period of the control loop).
@@ -180,7 +180,7 @@ class PeerClock(NamedTuple):
 
     @property
     def is_own(self) -> bool:
-        """True if the peer runs on this machine, and therefore on the same clock."""
+        """True if the other site runs on this machine, so that both have the same clock."""
         return self.estimator is None
 
 
@@ -475,7 +475,7 @@ class SiteTiming:
         leader: str,
         turn_ns: int = 0,
     ) -> None:
-        """Starts the schedule at the epoch, with the first estimates of the peers' clocks."""
+        """Starts the schedule of control periods with first estimates of the other clocks."""
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
         self._epoch_ns = epoch_ns
@@ -816,7 +816,7 @@ class LoopStats:
 
     @property
     def late_ticks(self) -> int:
-        """Number of ticks that were executed, but began after the next tick was due."""
+        """Number of control periods (ticks) that began after the next one was already due."""
         return self.overruns - self.skipped
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:

@@ -447,7 +447,7 @@ def make_reader(
     decoder = make_decoder(kind, layout=layout)
 
     def read(payload: bytes) -> Any | WireError:
-        """Returns the decoded message. If the payload is not valid, returns the `WireError`."""
+        """Returns the decoded network message, or a `WireError` if its bytes are not valid."""
         try:
             return decoder(payload)
         except WireError as error:

@@ -144,9 +144,9 @@ def _read_sample(sample: Any) -> tuple[str, bytes]:
 
 
 class _ZenohQuery(NamedTuple):
-    """A query of another member that waits for a reply, with the key of the reply.
+    """A request of another process that waits for a reply, received through Zenoh.
 
-    It implements `Query` of the interface `bus`.
+    It implements `Query` of the interface `bus`. The key is the address of the reply.
     """
 
     query: zenoh.Query
@@ -154,11 +154,11 @@ class _ZenohQuery(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """Content of the query, for example a request. Empty if the query has no content."""
+        """Content of the request, as its sender encoded it. Empty if it has no content."""
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def reply(self, payload: bytes) -> None:
-        """Replies to the query, which then ends for its sender. A query can be answered once.
+        """Replies to the request, which then ends for its sender. Only one reply is possible.
 
         Args:
             payload: The encoded reply.
@@ -238,7 +238,7 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        """Opens the Zenoh session of this connection."""
+        """Connects this process to the other processes of its network through Zenoh."""
         other_reason = ", or no router accepts this member" if settings else ""
         self._session = open_zenoh(
             listen=listen,
@@ -357,9 +357,9 @@ class ZenohBus:
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
-            """Replies to a query in the thread of Zenoh.
+            """Replies to a query in the thread of Zenoh in which the query arrived.
 
-            If `answer` returns None, there is no reply.
+            There is no reply if `answer` returns None.
             """
             # A query ends for its sender only when the query object is dropped.
             with query:
@@ -436,7 +436,7 @@ class ZenohBus:
         return _ZenohRing(tokens, read)
 
     def close(self) -> None:
-        """Closes the Zenoh session of this connection. Calling it again has no effect."""
+        """Closes the network connection of Zenoh. Calling it again has no effect."""
         if not self._session.is_closed():
             self._session.close()
         self._declarations.clear()

@@ -195,7 +195,7 @@ def _require_value(required: object, text: str) -> _Requirement:
     """
 
     def is_required_value(value: Any) -> bool:
-        """Returns True if a setting has the required value and the type of this value.
+        """Returns True if a setting of Zenoh has the required value, and the same type.
 
         The type matters, because 0 == False in Python.
         """
@@ -238,7 +238,7 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
         return is_equal and type(value) is type(session_value)
 
     def are_session_values(values: Any) -> bool:
-        """Returns True if a dictionary of values by mode agrees with the values of the session.
+        """Returns True if a setting that depends on Zenoh's mode agrees with the session.
 
         A mode is "peer", "client" or "router".
         """

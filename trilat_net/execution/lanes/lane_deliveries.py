@@ -147,7 +147,10 @@ def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
 
 
 def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
-    """Returns the states of the network links of those runs that continue.
+    """Returns the states of the simulated network links of those runs that continue.
+
+    Several runs are simulated side by side, each at one index (lane). A search drops runs that
+    it needs no longer, so that no time is spent on them.
 
     Args:
         states: State of all runs that have been simulated together.
@@ -165,9 +168,10 @@ def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
 
 @leaf
 def _constant_delay_ns(model: Row) -> int:
-    """Returns the time from the stamp of a sample to its use, on a link that only delays.
+    """Returns the delay of a simulated link on which all messages take equally long, in ns.
 
-    A sample is never used at the time when it was sent.
+    The delay is the time from the stamp of a sample (sent state) to its use. It is at least 1
+    ns, because a sample is never used at the time at which it was sent.
     """
     return int(max(max(clamp_delay_us(model.location), model.playout_us) * 1000, 1))
 
@@ -257,9 +261,10 @@ class DrawAddresses(NamedTuple):
 
 
 def find_draw_addresses() -> DrawAddresses:
-    """Returns the addresses of the functions that draw delays and losses of many samples.
+    """Returns the addresses of compiled functions that draw random network delays and losses.
 
-    The functions are compiled if their code is not stored on the disk.
+    Each call draws the numbers of many messages, which is faster than one call per message. The
+    functions are compiled if their machine code is not stored on the disk.
     """
     integer = types.int64
     number = types.float64

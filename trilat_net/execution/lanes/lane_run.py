@@ -226,7 +226,11 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
 
 
 def choose_code(layout: LaneLayout) -> Callable[..., None]:
-    """Returns the function that computes a tick in lanes, for planar arms or for chains."""
+    """Returns the compiled function that advances several simulated runs by one control period.
+
+    There is one function for planar arms with two joints, and one for chains of joints from a
+    URDF file. The layout of the arrays decides which one is returned.
+    """
     return advance_site if layout.chain is None else advance_chain_site
 
 
@@ -584,7 +588,10 @@ class LaneRun:
             self._write_back(lane, self.runs[lane], until_s)
 
     def _use_samples(self, end: IntArray) -> int:
-        """Finds the samples that are used in a block of ticks, see `use_samples`.
+        """Finds which received state of its peers each site uses, in some control periods.
+
+        The delays of the network decide this. A site is the controller of one arm, a peer is
+        another site, and a tick is a control period; see `use_samples`.
 
         Args:
             end: Tick of each site after the block, shape (N,).
@@ -615,7 +622,10 @@ class LaneRun:
         )
 
     def _find_block_end(self, ticks: IntArray) -> IntArray:
-        """Returns the tick of each site after the next block, an interval of time.
+        """Returns the control period (tick) at which each site is at the end of the next block.
+
+        The sites (controllers of one arm each) may have different rates. A block is an interval
+        of time that all sites simulate before samples are exchanged.
 
         Args:
             ticks: Number of ticks of each site after all blocks.
@@ -671,9 +681,10 @@ class LaneRun:
             )
 
     def _list_present(self) -> EndedRuns:
-        """Returns the present state of all runs, as views.
+        """Returns the present state of all simulated runs, as views that share their memory.
 
-        `keep_ended_runs` copies the state of a run at the moment at which it ends.
+        When a run ends early, `keep_ended_runs` copies its state from these views, because the
+        arrays are overwritten while the other runs continue.
         """
         return EndedRuns(
             ticks=self._ended.ticks,
@@ -733,9 +744,10 @@ class LaneRun:
         self.runs = [self.runs[lane] for lane in lanes]
 
     def _widen_peaks(self, buckets: int) -> None:
-        """Enlarges the memory for the largest values in intervals of 50 ms (buckets).
+        """Enlarges the arrays that hold the largest values of each interval of 50 ms.
 
-        -1 marks an interval in which no tick has been executed.
+        The arrays must have room for all intervals up to the end of the simulation. New entries
+        are -1, which marks an interval in which no control period has been executed.
         """
         wider = allocate_words(self._sites * buckets, self._layout.columns)
         peaks = wider.reshape(self._sites, buckets, self._layout.columns, LANES)
@@ -827,10 +839,11 @@ class LaneRun:
             )
 
     def _write_sent(self, lane: int, run: FusedRun) -> None:
-        """Writes the latest samples of a lane into the records of its run.
+        """Copies the latest sent states of one run from common arrays into its own records.
 
-        A slow site accepts several samples of a faster peer at once. A run that continues alone
-        reads from the records the samples that no site has accepted yet.
+        Several runs are simulated side by side, each in one lane. A slow site (arm controller)
+        accepts several samples (sent states) of a faster peer at once. A run that continues
+        alone reads from its records the samples that no site has accepted yet.
 
         Args:
             lane: The lane.
@@ -860,7 +873,9 @@ class LaneRun:
 def _find_recorded_hands(
     feed: ReplayedInputs, actor: np.dtype[Any], most_sources: int
 ) -> RecordedHands:
-    """Returns what live operators did in a recorded run.
+    """Returns the torques or targets with which live operators moved arms in a recorded run.
+
+    A repetition of the run applies them again at the same control periods.
 
     Args:
         feed: Inputs of the recorded run.
@@ -880,14 +895,19 @@ def _find_recorded_hands(
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
-    """Returns an array of shape (N, rows, columns) as N structured rows, without copying it."""
+    """Returns an array of floats as structured records whose fields have names.
+
+    The array has the shape (N, rows, columns) for N sites. The records share its memory, so
+    that assigning to a field changes the array.
+    """
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the part of an array that belongs to one site.
+    """Returns the part of an array that belongs to one site (controller of one arm).
 
-    The array contains the rows of all sites one after another, equally many for each site.
+    The array contains the rows of all sites one after another, equally many for each site. For
+    example, site 1 of 3 has the rows 2 and 3 of 6.
     """
     rows = len(table) // sites
     return table[i * rows : (i + 1) * rows]
@@ -913,7 +933,9 @@ def put_rows(rows: NDArray[Any], numbers: Words) -> None:
 
 
 def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
-    """Writes how far the sites of a run are, after a number of ticks.
+    """Sets the number and time of the next control period (tick) of each site of a run.
+
+    The time is "never" for a site that has executed all its control periods, see `ProgressRow`.
 
     Args:
         progress: Rows of all sites, see `ProgressRow`; written.

@@ -63,7 +63,7 @@ class RunGroup:
         self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the runs until they are as long as a run of `until_s` seconds.
+        """Continues the simulated runs of the group up to a time. Calls may follow one another.
 
         Args:
             until_s: The time, s, later than that of the previous call.
@@ -81,7 +81,9 @@ class RunGroup:
             run.advance_to(until_s)
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Continues with some of the runs only, so that no time is spent on the others.
+        """Continues with some of the runs only, so that no time is spent on other runs.
+
+        A search for the best gains, for example, drops runs that are already worse than others.
 
         Args:
             chosen: Indices in `members` of the runs that continue, in ascending order. No arm

@@ -69,7 +69,7 @@ class IndexedRecords:
         marks: NDArray[np.int32],
         counts: NDArray[np.int32],
     ) -> None:
-        """Stores the records, and where `index_records` has found their values."""
+        """Stores encoded records, with the positions of their values from `index_records`."""
         self.messages = messages
         self._peers = peers
         self._layout = layout
@@ -82,7 +82,7 @@ class IndexedRecords:
         return len(self.messages)
 
     def select(self, rows: Ints | slice) -> "IndexedRecords":
-        """Returns some of the records, or all of them in another order.
+        """Returns some of the records, or all of them in another order, without decoding them.
 
         Args:
             rows: Indices of the records, or a slice.
@@ -99,7 +99,7 @@ class IndexedRecords:
 
     @property
     def ticks(self) -> Ints:
-        """Tick of each record, shape (K,)."""
+        """Number of the control period (tick) of each of the K records, shape (K,)."""
         return np.ascontiguousarray(self._heads[:, _TICK])
 
     @property
@@ -112,19 +112,19 @@ class IndexedRecords:
 
     @property
     def mode_codes(self) -> Ints:
-        """Number of the operating mode in each record, shape (K,), see `Mode`."""
+        """Code of the controller's operating mode in each record, shape (K,), see `Mode`."""
         return self._heads[:, _MODE]
 
     @property
     def modes(self) -> NDArray[np.object_]:
-        """Name of the operating mode in each record, such as "run", shape (K,)."""
+        """Name of the controller's operating mode in each record, such as "run", shape (K,)."""
         bits = np.empty(max(map(int, MODE_WORDS)) + 1, np.object_)
         for mode, word in MODE_WORDS.items():
             bits[int(mode)] = word
         return bits[self.mode_codes]
 
     def ints(self, field: str) -> Ints:
-        """Returns an integer field of each record, shape (K,).
+        """Returns one integer field of all K records as an array of the shape (K,).
 
         Args:
             field: Name of the field, one of `_INTS`.
@@ -134,7 +134,7 @@ class IndexedRecords:
         return np.ascontiguousarray(self._gather_ints(mark, gaps)[:, -1])
 
     def has_ints(self, field: str) -> bool:
-        """True if a field of the records is an integer that `ints` can read."""
+        """True if the records have an integer field of this name, which `ints` can read."""
         return field in _INTS
 
     def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
@@ -276,7 +276,10 @@ class IndexedRecords:
 
     @property
     def change_counts(self) -> NDArray[np.int32]:
-        """Number of texts in the field `cmd` of each record, shape (K,)."""
+        """Number of changes of settings that each record contains, shape (K,).
+
+        They are the strings of the field `cmd`. Most records contain none.
+        """
         return self._counts[:, record_scan.CHANGE_COUNT]
 
     @property
@@ -299,7 +302,10 @@ class IndexedRecords:
 
     @property
     def memories(self) -> NDArray[np.object_]:
-        """Field `mem` of each record as a list of numbers, shape (K,)."""
+        """Internal state of the control law in each record, as lists of numbers, shape (K,).
+
+        It is the field `mem` of a record, which a simulation needs to continue from the record.
+        """
         counts, bits = self.memory_words
         numbers = bits.view(np.float64).tolist()
         lists = np.empty(len(self), np.object_)

@@ -143,7 +143,10 @@ class JointStatePacker:
     def __init__(
         self, names: Sequence[str], *, velocity: bool = True, effort: bool = True
     ) -> None:
-        """Computes the layout of the messages from the names of the joints."""
+        """Computes the positions of all fields in a `JointState` message from the joint names.
+
+        This is done once, so that encoding a message only fills in numbers.
+        """
         # The names follow the stamp of 8 bytes and an empty frame.
         frame = ""
         self._names = _pack_fields(8, frame, len(names), *names)
@@ -197,7 +200,10 @@ class TransformPacker:
     """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        """Computes the layout of the messages from the names of the frames."""
+        """Computes the positions of all fields in a transform message from the frames' names.
+
+        This is done once, so that encoding a message only fills in numbers.
+        """
         self._names: list[bytes] = []
         struct_format = "<4sI"
         # The number of transforms takes the first 4 bytes.
@@ -259,7 +265,7 @@ def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes
 
 
 def pack_string(text: str) -> bytes:
-    """Encodes a `std_msgs/msg/String`."""
+    """Encodes a ROS 2 message of the type `std_msgs/msg/String`, in the CDR format of ROS 2."""
     return _HEAD + _pack_fields(0, text)
 
 
@@ -416,7 +422,7 @@ class _CdrReader:
         return int(count)
 
     def text(self) -> str:
-        """Decodes the next string."""
+        """Decodes the next string of a ROS 2 message, and moves on to the next field."""
         length = self.count()
         if not length:
             return ""
@@ -424,7 +430,7 @@ class _CdrReader:
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
-        """Decodes the next list of floats."""
+        """Decodes the next list of floats of a ROS 2 message, and moves to the next field."""
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:

@@ -113,7 +113,7 @@ class SiteMessages:
     """
 
     def __init__(self, scenario: Scenario, site: str, epoch_unix_ns: int) -> None:
-        """Prepares the encoding of all messages of the site: names, frames and layouts."""
+        """Prepares the encoding of all ROS 2 messages about one arm, such as joint names."""
         self._arm = scenario.arms[site]
         self._epoch_unix_ns = epoch_unix_ns
         settings = scenario.sites[site]

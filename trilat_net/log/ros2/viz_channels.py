@@ -374,7 +374,7 @@ class _SiteBuckets:
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
-        """Returns the values of the curves that are written less often than the joints.
+        """Returns the values of curves that need fewer points per second than the joint angles.
 
         Args:
             rows: Values of all curves at some times.
@@ -465,7 +465,7 @@ class VizChannels:
         views_hz: float,
         put: PutMessage,
     ) -> None:
-        """Prepares the channels of the session and of each site. No message is written yet."""
+        """Prepares channels for viewers such as Foxglove. No message is written yet."""
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
 
@@ -520,7 +520,9 @@ class VizChannels:
             buckets.finish(log_ns)
 
     def open_channels(self, file: McapWriter) -> ros2_messages.StandardChannels:
-        """Returns the channels for viewers of a file, which are registered when needed.
+        """Returns the channels of a file that viewers such as Foxglove display.
+
+        A channel is registered in the file only when its first message is written.
 
         Args:
             file: The file.
