@@ -133,7 +133,7 @@ class TrilatRobot(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """True, because the scenario describes the arms and there is nothing to calibrate."""
+        """True: calibration is never needed, because the scenario file describes the arms."""
         return True
 
     def calibrate(self) -> None:
@@ -233,7 +233,10 @@ class TrilatRobot(Robot):
         return goal
 
     def disconnect(self) -> None:
-        """Releases the master and leaves the session, which continues with its other users."""
+        """Releases the master arm, and leaves the teleoperation session.
+
+        The session continues for its other users.
+        """
         self._require_hand()
         self._hand = None
         self._stack.close()
@@ -383,7 +386,10 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
 
 
 def main() -> None:
-    """Runs a trained policy in a session: the command `python -m lerobot_robot_trilat`."""
+    """Runs a trained policy, which moves an arm of a running teleoperation session.
+
+    This is the command `python -m lerobot_robot_trilat`.
+    """
     parser = argparse.ArgumentParser(prog="python -m lerobot_robot_trilat")
     parser.add_argument("folder", help="folder of the policy, which ends in pretrained_model")
     parser.add_argument("--site", default="m2", help="master that the policy drives")

@@ -122,7 +122,7 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """True, because the scenario describes the arm and there is nothing to calibrate."""
+        """True: calibration is never needed, because the scenario file describes the arm."""
         return True
 
     def calibrate(self) -> None:
@@ -202,13 +202,16 @@ class TrilatTeleoperator(Teleoperator):
             command(*goal)
 
     def enable_torque(self) -> None:
-        """Allows `send_feedback` to move the arm, for example before the person intervenes."""
+        """Allows `send_feedback` to move the arm, until `disable_torque` is called.
+
+        The arm can then follow a policy before the person intervenes.
+        """
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm, so that only the person moves it and feedback has no effect.
+        """Releases the arm, so that only the person moves it, and feedback has no effect.
 
-        `enable_torque` ends this.
+        Calling `enable_torque` allows feedback again.
         """
         self._torque_enabled = False
         self._require_hand().release()
@@ -231,7 +234,10 @@ class TrilatTeleoperator(Teleoperator):
         }
 
     def disconnect(self) -> None:
-        """Releases the arm and leaves the session, which continues with its other users."""
+        """Releases the arm, and leaves the teleoperation session.
+
+        The session continues for its other users.
+        """
         self._require_hand()
         self._hand = None
         self._stack.close()

@@ -763,10 +763,10 @@ class FusedRun:
 
     @property
     def has_programs(self) -> bool:
-        """True if users' programs act as operators, or compute the motion of an arm.
+        """True if users' own programs act as operators, or compute the motion of an arm.
 
-        The state of such programs is not part of the state of the run. Therefore the run cannot
-        be copied.
+        The run cannot be copied then, because the state of such programs is not part of its
+        state.
         """
         return bool(self._hands or self._plants)
 
@@ -779,10 +779,10 @@ class FusedRun:
         return {*self._hands, *self._plants}
 
     def copy_state(self, other: "FusedRun") -> None:
-        """Makes this run continue from exactly the same state as another run.
+        """Makes this simulated run continue from exactly the same state as another run.
 
-        Both runs must have the same scenario and the same planned ticks. The other run does not
-        change.
+        Both runs must have the same scenario and the same planned control periods. The other
+        run does not change.
         """
         self.scale_difference(other, 0.0)
 
@@ -875,11 +875,7 @@ class FusedRun:
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the first site diverged, in s.
-
-        A site has diverged if its arm has left its limits. None if all sites stayed within
-        them.
-        """
+        """Time at which the first arm left its safety limits, in s. None if no arm did."""
         ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
         return min(ends_ns) / NS_PER_S if ends_ns else None
 
@@ -927,10 +923,10 @@ class FusedRun:
 
     @property
     def totals(self) -> RunTotals:
-        """Numbers that summarise the simulated run so far.
+        """Numbers that summarise the simulated run so far, such as the largest mean error.
 
-        They are the largest mean error, the control effort, and the forces and work of walls
-        and other environments. See `RunTotals` for their definitions.
+        They also contain the control effort, and the forces and work of walls and dampers. See
+        `RunTotals` for the definitions.
         """
         sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
@@ -988,9 +984,10 @@ class FusedRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """External torque of each site's last tick, in N m, one array of shape (n,) per site.
+        """External torque on each arm in the last control period, in N m, not of the motors.
 
-        It is the torque of operators and environments, not of the motors.
+        The list has one array of the shape (n,) per site, for n joints. Operators and
+        environments exert the torque.
         """
         pairs = zip(self.records, self._layouts, strict=True)
         return [row[layout.columns()["tau_x"]] for row, layout in pairs]

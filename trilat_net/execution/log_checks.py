@@ -57,9 +57,9 @@ class LogCheckReport(CheckReport):
 
     @property
     def records(self) -> int:
-        """Number of records whose ticks were executed again to check them.
+        """Number of records that were checked by executing their control periods again.
 
-        A record is the stored result of one tick, that is, of one period of the control loop.
+        A record is the stored result of one control period.
         """
         return self.result.records
 

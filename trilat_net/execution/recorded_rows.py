@@ -148,7 +148,7 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the number in a record that identifies a start of the site."""
+        """Returns the random number in a record that tells two starts of a process apart."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
@@ -188,7 +188,8 @@ class PlainRows:
     def _stops(self) -> IntArray:
         """Indices of all records before which compiled code must stop, in ascending order.
 
-        They lack an input of their tick, or do not follow the record before them.
+        Such a record lacks an input of its control period, or does not follow the record before
+        it. Slower code then continues.
         """
         follows = np.zeros(len(self._site_log), np.bool_)
         ticks = self._site_log.tick
@@ -308,6 +309,7 @@ def _read_plants(block: IndexedRecords) -> Array:
 def can_repeat(site: Site) -> bool:
     """True if compiled code can execute the recorded control periods of a site again.
 
-    This is much faster than Python. A site is the controller of one arm.
+    Compiled code is much faster than Python, but cannot call a user's own control law. A site
+    is the controller of one arm.
     """
     return not site.parts.has_user_law

@@ -110,9 +110,10 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """Kind of the rerun: "closed loop" if every site is executed, otherwise "open loop".
+        """Kind of the repeated run: "closed loop" if every site is executed, else "open loop".
 
-        In an open loop, the sites that are not executed keep their records and do not react.
+        In an open loop, sites (arm controllers) that are not executed keep their records, so
+        that they do not react to changes.
         """
         return "open loop" if self.recorded else "closed loop"
 
@@ -173,9 +174,12 @@ def resolve_rerun_request(
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Refuses to execute a site whose arm is a real robot or a user's program.
+    """Refuses to repeat the run of a site whose arm is a real robot or a user's program.
 
     How this arm would have reacted to other torques is not known.
+
+    Raises:
+        UsageError: A replaced site has such an arm.
     """
     for name in original.external:
         if name not in replaced:
@@ -515,7 +519,7 @@ class RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site has executed its last tick and nothing is left to do."""
+        """True if the site has executed its last control period, so that nothing is left."""
         return self.diverged or self.k > self._last_tick
 
     @property
@@ -794,9 +798,9 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: RerunSite) -> None:
-        """Stores the newest sample (state) of an executed site, which its peers will receive.
+        """Stores the newest state of an executed site, which its peers will receive.
 
-        A sample that is so old that it cannot arrive any more is removed.
+        A state that is so old that it cannot arrive any more is removed.
         """
         output = site.output
         recent = self._recent[site.name]

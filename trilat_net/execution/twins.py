@@ -558,7 +558,9 @@ class _TwinRuns:
                 self._push(twin_index, end_s)
 
     def _push(self, twin_index: int, at_s: float) -> None:
-        """Displaces the state of a twin by its push, and notes the time.
+        """Displaces the state of a copy of the run (twin) a little, and notes the time.
+
+        The further course of the difference shows whether the system is stable.
 
         Args:
             twin_index: Index of the twin.
@@ -780,7 +782,7 @@ class _LaneTwinRuns(_TwinRuns):
                 self._push(n, end_s)
 
     def _measure_window(self, measured: Sequence[int]) -> None:
-        """Adds the course of the run and of the differences in one window to the paths.
+        """Stores the course of the run and of the differences in one interval of time.
 
         Args:
             measured: Indices of the twins that are measured.

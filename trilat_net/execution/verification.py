@@ -208,7 +208,9 @@ def _compare_fields(
     equal: NumberEquality,
     channel: LawChannel,
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Compares every field of a record with the execution, see `find_first_difference`.
+    """Compares a recorded control period with its repeated execution, field by field.
+
+    See `find_first_difference`.
 
     Yields:
         Name of the field, logged value, computed value, and whether they are equal.
@@ -297,10 +299,10 @@ class VerifyResult:
 
     @property
     def passed(self) -> bool:
-        """True if the log can be trusted.
+        """True if the log can be trusted to contain what the controllers computed.
 
         No record differs from the repeated execution, the log is unchanged since it was
-        written, and enough of the ticks of every site were compared.
+        written, and enough of the control periods of every site were compared.
         """
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
@@ -706,7 +708,7 @@ class _SiteVerifier:
         return None
 
     def _verify_record(self, row: int, state: State) -> None:
-        """Executes the tick of a record, and compares the record with the execution.
+        """Executes the control period of a record again, and compares the results.
 
         Args:
             row: Row of the record.

@@ -569,7 +569,7 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes the reports of an operator's connection to the log, and empties their list.
+        """Writes to the log what an operator's connection has reported, and empties the list.
 
         Args:
             news: The reports, as pairs of a tick (number of a period of the control loop) and a

@@ -251,9 +251,9 @@ class _VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[_LateSample]:
-        """List of the samples that arrived later than the scenario describes.
+        """Messages that arrived later than the delay model of the scenario describes.
 
-        A sample is the state that a site (process that runs one arm) sends.
+        A message (sample) contains the state that a site (process that runs one arm) sends.
         """
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 

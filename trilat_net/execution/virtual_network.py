@@ -60,7 +60,7 @@ class Network(Protocol):
         """
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples that arrive at a site in one tick, in the order of their arrival.
+        """Returns the messages that arrive at a site in one control period, in their order.
 
         Args:
             receiver: Name of the site.
@@ -86,20 +86,20 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the sample of a tick until each other site has received it."""
+        """Stores the state that a site sends in a control period until all others have it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
 
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """Returns True, because the samples for the next tick are always complete.
+        """Returns True: a site can always execute its next control period without waiting.
 
-        The sites run in the order of time, so all earlier samples have been sent.
+        The sites are simulated in the order of time, so that all earlier states have been sent.
         """
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples sent before tick `k` that the site has not received yet."""
+        """Returns the states sent before control period `k` that a site has not received."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
         for index, queue in enumerate(self._in_transit[receiver].values()):

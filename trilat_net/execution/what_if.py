@@ -269,7 +269,7 @@ def _pair_records(
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the largest root mean square of all columns of an array.
+    """Returns the root mean square of each column of an array, and of these the largest.
 
     Args:
         values: Values, shape (K, n), with a column for each joint.
@@ -348,10 +348,10 @@ class Rerun(Result):
 
     @cached_property
     def after(self) -> Log:
-        """The rerun in the form of a log, so that it can be analysed like any other log.
+        """The repeated run in the form of a log, so that it can be analysed like any log.
 
-        Executed sites appear as they were computed now, and the other sites as they were
-        recorded.
+        Sites (arm controllers) that were executed appear as they were computed now, and other
+        sites as they were recorded.
         """
         stream = io.BytesIO()
         self.write(stream)
@@ -451,17 +451,17 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences that tell the user what limits the meaning of the result.
+        """Sentences that tell the user what the result of a repeated run cannot show.
 
         For example, records may have been copied because the log was incomplete. Empty if there
-        are no limits to mention.
+        is nothing to mention.
         """
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table with a row for each site that was executed again, for JSON.
+        """Returns a table of how the repeated run differs from the recorded run, for JSON.
 
-        A site is a process that runs one arm. A row tells how its records differ from the log.
+        It has one row for each site (process that runs one arm) that was executed again.
         """
         return list(self.to_dict()["sites"].values())
 

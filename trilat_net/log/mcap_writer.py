@@ -132,7 +132,7 @@ class McapWriter:
     def __init__(
         self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = _CHUNK_BYTES
     ) -> None:
-        """Begins the file: writes the mark of MCAP files and the header."""
+        """Begins an MCAP file with the eight bytes that identify the format, and a header."""
         self.position = 0
         self.messages = 0
         self._stream = stream

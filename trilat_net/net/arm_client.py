@@ -210,10 +210,10 @@ class SiteClient:
 
     @property
     def record(self) -> State | None:
-        """Newest record of the site that has arrived. None before the first tick of the site.
+        """Newest record of the arm controller (site) that has arrived, with angles and torque.
 
-        A record is the result of one tick, a period of the control loop. It contains the joint
-        angles and the torque.
+        A record is the result of one period of the control loop. None before the first one has
+        arrived.
         """
         self._read_messages()
         return self._record
@@ -233,10 +233,9 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once no more records of the site will arrive.
+        """True once no more records of the site (arm controller) will arrive.
 
-        This is the case if the run of the site has ended, or if the process of the site is
-        gone.
+        This is the case if the run of the site has ended, or if its process is gone.
         """
         self._read_messages()
         return self._is_over
@@ -586,7 +585,7 @@ class Hand(SiteClient):
         return self._send("push", force_n)
 
     def release(self) -> None:
-        """Ends the operator's influence on the arm. The force fades within 100 ms.
+        """Stops moving the arm. The force on it fades within 100 ms, so that it does not jump.
 
         Afterwards, `move`, `turn` or `push` may take hold of the arm again.
         """
@@ -608,10 +607,10 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of the message that the site followed in the newest record.
+        """Number of the message of this program that the arm followed in its newest record.
 
-        It is the number that `move`, `turn` or `push` returned. It is -1 if this program does
-        not move the arm at present.
+        It is the number that `move`, `turn` or `push` returned, or -1 if this program does not
+        move the arm at present.
         """
         hand = self.in_force
         if hand is None or hand.source != self._sender.boot:
@@ -696,7 +695,7 @@ class Hand(SiteClient):
         return [(later - earlier) / (2.0 * step_s) for later, earlier in pairs]
 
     def _wait_for_record(self) -> State:
-        """Returns the newest record of the site, and waits if none has arrived yet.
+        """Returns the newest record of the site (arm controller), and waits for the first one.
 
         Raises:
             UsageError: The run has ended before the first record.

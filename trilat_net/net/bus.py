@@ -60,7 +60,7 @@ class Query(Protocol):
 
     @property
     def payload(self) -> bytes:
-        """Content of the query, as the sender encoded it. Empty if the query has no content."""
+        """Content of a request, as its sender encoded it. Empty if it has no content."""
 
     def reply(self, payload: bytes) -> None:
         """Sends the answer to the member that asked. A query can be answered once.
@@ -185,9 +185,9 @@ class Bus(Protocol):
         """
 
     def close(self) -> None:
-        """Closes the network connection. Calling it again has no effect.
+        """Closes the network connection, so that other processes see that this one is gone.
 
-        Other members see that this member is gone, because its liveliness tokens disappear.
+        Calling it again has no effect.
         """
 
 
@@ -225,9 +225,10 @@ def matches_key(expression: str, key: str) -> bool:
 
 
 class BoundedRing(Generic[T]):
-    """A queue of limited length, which drops its oldest entry if it is full.
+    """A queue of limited length between two threads, which drops its oldest entry if full.
 
-    One thread may call `put` while another thread calls `poll`.
+    A control loop, for example, needs the newest messages rather than all. One thread may call
+    `put` while another thread calls `poll`.
 
     Args:
         capacity: Number of entries that the queue holds.

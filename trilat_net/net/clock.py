@@ -25,9 +25,9 @@ class Clock(Protocol):
     """
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of a clock that never steps, in ns.
+        """Returns the reading of a clock that never steps, in ns, to measure durations.
 
-        The zero of this clock is arbitrary. Therefore only differences of readings have a
+        The zero of this clock is arbitrary, so that only differences of readings have a
         meaning.
         """
 
@@ -39,7 +39,7 @@ class Clock(Protocol):
         """
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock has reached a time.
+        """Sleeps until the monotonic clock has reached a time, such as the next control period.
 
         Args:
             deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
@@ -65,7 +65,7 @@ class SystemClock:
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock has reached a time.
+        """Sleeps until the monotonic clock has reached a time, such as the next control period.
 
         Args:
             deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
@@ -157,10 +157,10 @@ class SkewedClock:
         self._clock.sleep_until(self._start_ns + base_duration_ns)
 
     def identity(self) -> str:
-        """Returns a string that identifies this clock, with its offset, drift and start.
+        """Returns a string that identifies this wrong clock by its offset, drift and start.
 
-        From these numbers, readers of a log can convert readings of this clock to readings of
-        the base clock.
+        From these numbers, a reader of a log can convert its readings to those of the correct
+        clock.
         """
         return (
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "

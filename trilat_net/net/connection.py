@@ -492,7 +492,7 @@ def _check_encrypted_endpoint(address: str) -> None:
 
 
 def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
-    """Refuses Zenoh settings of a user's file that the keys determine as well.
+    """Refuses a user's Zenoh settings that would contradict the encryption keys of a session.
 
     Args:
         settings: Settings of the file.

@@ -560,7 +560,9 @@ def _write_member_keys(
 
 
 def _format_member_list(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
-    """Returns the content of the file `MEMBERS` in the folder of a member, in JSON.
+    """Returns the names of all members and the expiry of their keys as JSON.
+
+    Each member (process of a session) has this text in the file `MEMBERS` beside its keys.
 
     Args:
         member: Name of the member.
@@ -713,8 +715,10 @@ def _write_folder(
 def _write_new_file(path: Path, content: bytes) -> None:
     """Writes a file that only its owner can read, such as a private key.
 
+    An existing file is never overwritten, because a lost key could not be restored.
+
     Raises:
-        FileExistsError: The file exists. Keys are never overwritten.
+        FileExistsError: The file exists.
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:

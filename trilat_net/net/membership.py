@@ -41,10 +41,10 @@ from .wire import M, decode, encode, split_states
 
 
 def new_boot() -> int:
-    """Returns a random 64-bit number that identifies one start of one process (a "boot").
+    """Returns a random 64-bit number that identifies one start of one process.
 
-    If a process is restarted under the same name, the other processes recognise it by the new
-    number.
+    If a process is restarted under the same name, the other processes recognise the new one by
+    the new number.
     """
     return secrets.randbits(64)
 
@@ -198,7 +198,7 @@ class EventPublisher:
         return event
 
     def update(self, **fields: object) -> None:
-        """Changes fields of the identity. Later queries receive the changed identity.
+        """Changes fields of this process's identity, which other processes can query.
 
         Args:
             **fields: New values of fields of `Info`. All other fields stay unchanged.
@@ -206,9 +206,9 @@ class EventPublisher:
         self.info = msgspec.structs.replace(self.info, **fields)
 
     def answer_queries(self) -> None:
-        """Replies with the current identity of the member to all queries that are waiting.
+        """Replies to all waiting queries of other processes with the identity of this process.
 
-        The method does not wait. Therefore a control loop may call it.
+        The method does not wait, so that a control loop may call it.
         """
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
@@ -333,9 +333,10 @@ class Membership:
 
     @property
     def is_leader(self) -> bool:
-        """True if this member is the leader: the first site of the scenario.
+        """True if this process is the leader of the session: the first site of the scenario.
 
-        The leader decides when the session starts, and all other sites follow its schedule.
+        The leader decides when the session starts, and all other sites (arm controllers) follow
+        its schedule.
         """
         return self._sites[:1] == (self.local_info.member,)
 

@@ -97,9 +97,10 @@ class OffsetEstimate(NamedTuple):
     drift_high: float
 
     def extrapolate_ns(self, local_ns: int) -> int:
-        """Returns the estimated offset at another time of the local clock, in ns.
+        """Returns the estimated offset between two clocks at another time, in ns.
 
-        The offset is assumed to grow with the estimated drift.
+        One clock may run slightly faster (drift), so that the offset is assumed to grow at the
+        estimated rate.
 
         Args:
             local_ns: The time on the local clock, in ns.
@@ -411,7 +412,10 @@ class _SlewSegment:
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
-        """Computes both lines, and the largest error on the first one."""
+        """Computes how the clock offset in use gradually approaches an estimate.
+
+        It also computes the largest error of the offset meanwhile.
+        """
         self.start_ns = start_ns
         self.estimate = estimate
         # Time at which the smoothed offset has reached (joined) the line of the estimate.
@@ -425,7 +429,9 @@ class _SlewSegment:
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the smoothed offset, the other clock minus the local clock, at a time, in ns.
+        """Returns the offset in use at a time: the other clock minus the local clock, in ns.
+
+        It approaches its estimate gradually, because a jump would disturb the control loop.
 
         Args:
             local_ns: The time on the local clock, in ns.
@@ -515,7 +521,7 @@ class SlewedOffset:
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns how far the smoothed offset can be from the true offset at a time, in ns.
+        """Returns how far the clock offset in use can be from the true offset at a time, in ns.
 
         Args:
             local_ns: The time on the local clock, in ns. It must be a time that `evaluate_ns`

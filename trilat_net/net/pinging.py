@@ -47,7 +47,9 @@ class RepeatedQuery:
         self._pending: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def repeat(self, period_ns: int = QUERY_PERIOD_NS) -> bool:
-        """Sends the query if enough time has passed since its last copy.
+        """Sends the query again if enough time has passed since it was sent last.
+
+        A query may be lost, or its receiver may have started later.
 
         Args:
             period_ns: Shortest time between two copies, in ns.
@@ -64,7 +66,7 @@ class RepeatedQuery:
         return True
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns the next reply that has arrived. The method does not wait.
+        """Returns the next reply to the query that has arrived, without waiting.
 
         Returns:
             The time at which the query was sent in ns, the key and the payload of the reply.
@@ -117,9 +119,9 @@ def answer_pings(
     """
 
     def answer(_: bytes) -> bytes:
-        """Returns the reply to a ping: the clock's readings at its arrival and at the reply.
+        """Returns the reply to a ping: the clock's readings on its arrival and at the reply.
 
-        The sender subtracts the time between the two readings from the round trip.
+        The sender subtracts the time between both readings from the measured round trip.
         """
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
@@ -328,7 +330,7 @@ class Pinger:
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """Returns True if the clock offset of each of some members is known.
+        """Returns True if the clock offsets to all of the given processes are known.
 
         Args:
             boots: Boots of these members, the numbers that identify the starts of their

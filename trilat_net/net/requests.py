@@ -233,9 +233,9 @@ class HandMessage(Request, frozen=True, kw_only=True):
 
 
 class PeerSeen(Request, frozen=True, kw_only=True):
-    """State of one peer in a `HandViewMessage`, as the site of the operator sees it.
+    """State of one arm at another site, as the site that an operator's program moves sees it.
 
-    A peer is another site whose states the site receives. The fields are those of `PeerView`.
+    The state is delayed by the network. The fields are those of `PeerView`.
     """
 
     alpha: float

@@ -139,7 +139,7 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def encode(self) -> bytes:
-        """Returns the attachment as the 33 bytes that ROS 2 programs expect."""
+        """Encodes the number, time and sender of a message as 33 bytes, as ROS 2 expects."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
 
@@ -262,7 +262,7 @@ class Ros2Member(NamedTuple):
 
 
 def _mangle(name: str) -> str:
-    """Returns a name as it stands in a token, "/arm/joint_states" as "%arm%joint_states".
+    """Returns a name as ROS 2 writes it in a token: "/arm/joints" as "%arm%joints".
 
     A token is itself a path whose parts are divided by slashes.
     """
@@ -291,7 +291,7 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
 
 
 def make_gid(token: str) -> bytes:
-    """Returns 16 bytes that identify an endpoint, computed from its token.
+    """Returns 16 bytes that identify a ROS 2 publisher or subscriber, made from its token.
 
     Args:
         token: Liveliness token of the endpoint, which no other endpoint has.
@@ -337,9 +337,9 @@ class Refusals:
         self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
-        """Counts a message that was refused. The method may be called in any thread.
+        """Counts a refused message, and tells the user when a reason occurs for the first time.
 
-        The user is told when the reason occurs for the first time.
+        The method may be called in any thread.
 
         Args:
             reason: Why the message was refused.
@@ -366,9 +366,9 @@ class Refusals:
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
-            """Passes a message to `act`. An error of `act` counts as a refusal.
+            """Passes a message to `act`, and counts it as refused if `act` raises an error.
 
-            It would otherwise end in a thread of Zenoh, where nobody sees it.
+            Without this, the error would end in a thread of Zenoh, where nobody sees it.
             """
             try:
                 act(*args, **named)
@@ -505,11 +505,10 @@ class Ros2Graph:
 
     @property
     def connected(self) -> bool:
-        """True while the router is connected.
+        """True while this program is connected to the Zenoh router of ROS 2.
 
-        The session reconnects when the router is back.
-
-        It may be False for some time if the router is restarted.
+        It may be False for some time if the router is restarted, until the connection is there
+        again.
         """
         return bool(self._session.info.routers_zid())
 
@@ -627,7 +626,7 @@ class Ros2Graph:
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
-            """Passes a message of a ROS program to `receive`. Refuses any other message."""
+            """Passes a message of a ROS 2 program to `receive`, and refuses any other."""
             attachment = parse_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
@@ -652,7 +651,7 @@ class Ros2Graph:
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
-            """Computes the response to a request of a ROS program, and sends the response."""
+            """Computes and sends the response to a request (service call) of a ROS program."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 request = parse_attachment(query.attachment)

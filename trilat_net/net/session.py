@@ -143,9 +143,9 @@ class SessionJoin:
 
     @property
     def announced_first_tick(self) -> int:
-        """First tick that this site announced when it requested to join a running session.
+        """First control period (tick) of this site, as it requested to join a running session.
 
-        The site executes its control loop from this tick on. The value is 0 if the site has not
+        The site executes its control loop from this tick on. It is 0 if the site has not
         requested to join.
         """
         if self._coming is None:
@@ -284,9 +284,10 @@ class SessionJoin:
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
-            """Returns the sort key: sites on this machine first, then the scenario's order.
+            """Returns a sort key: sites on this machine first, then the order of the scenario.
 
-            A site on this machine has the same clock, so its epoch needs no conversion.
+            A site on this machine has the same clock, so that its start time needs no
+            conversion.
             """
             return info.clock != local_clock, indices.get(info.member, -1)
 
@@ -629,7 +630,7 @@ class SessionJoin:
         )
 
     def _make_epoch(self, start: Event) -> Epoch:
-        """Returns the epoch that the leader has confirmed.
+        """Returns the common start time (epoch) of the session, which its leader has confirmed.
 
         Args:
             start: The leader's event `start`, which states the members (processes of a session)

@@ -220,7 +220,7 @@ class LinkTimingMonitor:
         self.admit(peer)
 
     def admit(self, peer: PeerClock) -> None:
-        """Restarts the measurements, after the peer (the site that sends) was restarted.
+        """Restarts the measurement of delays on a network link, after its sender was restarted.
 
         The new process may run on another machine, and therefore on another clock.
 
@@ -246,10 +246,10 @@ class LinkTimingMonitor:
         self._open_window()
 
     def _open_window(self) -> None:
-        """Starts a window of time stamps without any measurement.
+        """Begins a new interval of time, in which the smallest delay per direction is sought.
 
-        Only the smallest delay in each direction is kept, because it gives the tightest limit
-        of the offset.
+        Only the smallest delay is kept, because it gives the tightest limit of the offset
+        between the clocks.
         """
         self._smallest_outward_ns = _NO_DELAY_NS
         self._smallest_return_ns = _NO_DELAY_NS

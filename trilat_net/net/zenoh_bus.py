@@ -70,7 +70,7 @@ def share_threads() -> None:
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
-    """Error of a process that connects to a router which does not answer, or not yet.
+    """Error: the Zenoh router to which a process connects does not answer.
 
     The caller may try again, because the router may be started later.
     """
@@ -271,7 +271,7 @@ class ZenohBus:
         return put
 
     def _subscribe(self, key: str, handler: Any) -> Any:
-        """Creates a Zenoh subscriber that ignores what this connection publishes itself.
+        """Subscribes to messages through Zenoh, except those that this connection publishes.
 
         Args:
             key: Key of the messages; it may contain wildcards.
@@ -280,7 +280,7 @@ class ZenohBus:
         return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
 
     def _serve(self, key: str, handler: Any) -> Any:
-        """Creates a Zenoh object that receives queries, except those of this connection itself.
+        """Begins to receive queries through Zenoh, except those of this connection itself.
 
         Args:
             key: Key of the queries.
@@ -322,7 +322,7 @@ class ZenohBus:
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls a function for each message under a key, in threads of Zenoh.
+        """Calls a function for each message under a key, at once and in a thread of Zenoh.
 
         Args:
             key: The key, which may contain wildcards.
@@ -418,7 +418,7 @@ class ZenohBus:
         """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
-            """Reads whether a liveliness token has appeared or disappeared.
+            """Reads from a Zenoh sample which process has appeared or disappeared.
 
             Returns:
                 The key of the token, and True if it has appeared. None for a token of this
@@ -508,7 +508,7 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns the reason why Zenoh refuses a configuration. Empty if Zenoh accepts it.
+    """Returns the reason why Zenoh refuses a configuration, or "" if Zenoh accepts it.
 
     Args:
         settings: The configuration, or a part of it.

@@ -226,9 +226,9 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Releases the arm if the topic commands it at present.
+        """Stops moving the arm to the targets of a ROS 2 topic, if they move it at present.
 
-        The next target then takes hold of the arm anew.
+        The next target then takes control of the arm again.
         """
         if self._received_ns is not None:
             self._received_ns = None
@@ -336,7 +336,10 @@ class SilenceNotice:
             self._other_joints = other_joints
 
     def note_measurement(self) -> None:
-        """Notes that a message was sent to the site as a measurement."""
+        """Notes that a measurement of the robot was sent to the site (arm controller).
+
+        No notice of a silent robot is due then.
+        """
         self._has_measurement = True
         self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
 
@@ -477,17 +480,14 @@ class RobotArm:
             self._commands.put(self._pack(*ordered_torque))
 
     def _may_apply(self, torque: Sequence[float]) -> bool:
-        """Returns True if the robot may receive a torque.
+        """Returns True if a torque may be passed on to the robot.
 
-        It must be armed, and the torque must have one number for each joint.
+        The robot must be armed, and the torque must have one number for each joint.
         """
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
-        """Sends the robot its safe command, which makes it brake or hold still.
-
-        The settings of the robot contain this command.
-        """
+        """Sends the robot a command from its settings that makes it brake or hold still."""
         self._safe_ns = self._clock.monotonic_ns()
         self._commands.put(self._pack(*self._safe_command))
 
@@ -595,7 +595,9 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
-    """Checks that all numbers of a message are finite, and returns them as a list.
+    """Returns the numbers of a ROS 2 message as a list, after a check that all are finite.
+
+    NaN or an infinite number could make a robot move without control.
 
     Raises:
         ValueError: A number is not finite.
@@ -1190,7 +1192,7 @@ def _open_robot(
     ends.graph.subscribe(states_topic, cdr.JOINT_STATE, arm.receive)
 
     def report_silence() -> None:
-        """Tells the user that the robot does not measure, if a notice is due."""
+        """Tells the user that the robot sends no measurements, if such a notice is due."""
         notice = arm.silence.pop(f"/{states_topic}", site)
         if notice:
             say(notice)

@@ -159,7 +159,10 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per joint of the arm, with its inertia and gains, for a CSV file."""
+        """Returns a table with a row per joint of the arm: its inertia and its control gains.
+
+        The table is written as a CSV file.
+        """
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
@@ -229,9 +232,9 @@ class ArmGains(Result):
 
 
 def _format_cell(value: Any) -> str:
-    """Returns the text of a table cell.
+    """Returns the text of a table cell, in which a number has four digits.
 
-    A number has four digits. Any other value is its own text, and an empty one is "-".
+    A text stays as it is, and an empty value becomes "-".
     """
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -643,7 +646,11 @@ class _GainSearch:
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
-                """Returns the rate at which small motions grow with the gain k, in 1/s."""
+                """Returns the rate at which small motions about a pose grow, in 1/s.
+
+                It depends on the gain k. A negative rate means that the motions decay, so that
+                the control loop is stable.
+                """
                 law = self.build_law(math.exp(log_k))
                 root = self.find_root(law, pose, loop, sampled=sampled)
                 return root.s.real

@@ -75,7 +75,7 @@ class _ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The value of the quantity in each of the compared runs. None where a run has none."""
+        """Value of one quantity in each of the compared logs. None if a log lacks it."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -170,11 +170,11 @@ class LogComparison(Result):
 
     @property
     def links_differ(self) -> bool:
-        """True if the scenarios differ in the settings of a link, such as its delay."""
+        """True if the compared runs had different network links, for example other delays."""
         return any(difference.concerns_link for difference in self.differences)
 
     def headline(self) -> str:
-        """Returns a sentence that names the compared logs and the number of quantities.
+        """Returns the names of the compared logs and the number of quantities.
 
         Example: "a, b: 14 quantities".
         """
@@ -312,7 +312,7 @@ class LogComparison(Result):
                     yield f"{name}: no {row.quantity.name}: {entry.why}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the comparison to plain values, as `trilat compare --json` prints it."""
+        """Converts the comparison of logs to plain values for `trilat compare --json`."""
         logs = []
         for name, log in zip(self.metrics.columns, self.logs, strict=True):
             entry = {
@@ -436,7 +436,7 @@ def _select_most_different(
             differences[index] = _measure_difference(row)
 
     def rank(index: int) -> tuple[bool, float, int]:
-        """Returns the place of a row: those of `shown_keys` first, then by difference."""
+        """Returns the sort key of a table row: `shown_keys` first, then by difference."""
         return rows[index].quantity.key not in shown_keys, -differences[index], index
 
     ranked_rows = sorted(differences, key=rank)

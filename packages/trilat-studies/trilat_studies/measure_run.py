@@ -93,7 +93,7 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records later than a given time.
+        """Returns the records of control periods that are later than a given time.
 
         Args:
             t_ns: The time, in ns. A record at exactly this time is not returned.
@@ -301,12 +301,15 @@ class _CompiledRun:
 
     @property
     def is_finished(self) -> bool:
-        """True if the run has its whole duration, or an arm has left its limits."""
+        """True if the simulation has its whole duration, or if an arm has left its limits."""
         run = self.run
         return run.ran_s >= self._scenario.duration_s or run.diverged_s is not None
 
     def find_next_end(self) -> float:
-        """Returns the time up to which the next batch is simulated, in s."""
+        """Returns the time up to which the simulation continues next, in s.
+
+        A long run is simulated in batches, so that its records need little memory.
+        """
         return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
 
     def pass_records(self) -> None:

@@ -771,7 +771,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def judge(self, scene: Scene) -> Judgement:
-        """Asks the task of the episode for the reward of a step, and whether it is done.
+        """Asks the task for the reward of a step, and whether the episode is finished.
 
         Args:
             scene: State after the step.
@@ -781,22 +781,25 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     @property
     def is_running(self) -> bool:
-        """True if an episode is in progress."""
+        """True if an episode has been started by `reset` and has not ended yet."""
         return self._runs
 
     @property
     def run(self) -> FusedRun:
-        """The simulated run of the episode, which a vector environment may advance."""
+        """The simulation of the present episode.
+
+        A vector environment may advance it instead of `step`, together with other episodes.
+        """
         return self._run
 
     @property
     def total_ticks(self) -> int:
-        """Number of ticks (control periods) after which the duration of an episode is over."""
+        """Number of control periods (ticks) of a complete episode."""
         return self._ticks
 
     @property
     def plants(self) -> Mapping[str, Any]:
-        """User-written models of arms, by the name of the site that they belong to."""
+        """User-written simulation models of arms, by the name of their site (controller)."""
         return self._plants
 
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:

@@ -81,7 +81,7 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the run was completed and met every expectation of its scenario."""
+        """True if the simulation was completed and met every expectation of its scenario."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
@@ -121,7 +121,7 @@ class Trial(NamedTuple):
 
     @property
     def again(self) -> str:
-        """Shell command that repeats this trial, for the user to copy.
+        """Shell command that repeats this simulation with the same random seed, to copy.
 
         Example: "trilat test jitter --seeds 3".
         """
@@ -131,7 +131,7 @@ class Trial(NamedTuple):
 
     @property
     def look(self) -> str:
-        """Shell command that simulates this trial and records its log, to inspect a failure."""
+        """Shell command that simulates this trial and records a log, to inspect a failure."""
         arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
@@ -367,12 +367,12 @@ class TrialReport(Result):
 
     @property
     def held(self) -> bool:
-        """True if all runs met all expectations. `trilat test` then ends with exit code 0."""
+        """True if all simulations met all expectations, so that `trilat test` exits with 0."""
         return all(result.held for result in self.results)
 
     @property
     def scenarios(self) -> dict[str, list[TrialResult]]:
-        """The results of each scenario, by its name or path, in the order of the trials."""
+        """Results of the simulations of each scenario, by its name or path, in their order."""
         groups: dict[str, list[TrialResult]] = {}
         for result in self.results:
             groups.setdefault(result.trial.source, []).append(result)
@@ -491,7 +491,7 @@ class TrialReport(Result):
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
-        """Returns a sentence with the number of runs that met all expectations.
+        """Returns the number of simulations that met all expectations, as a sentence.
 
         Example: "19 of 20 runs as expected".
         """

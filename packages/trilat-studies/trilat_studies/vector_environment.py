@@ -272,12 +272,12 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return super().call(name, *args, **kwargs)
 
     def render(self) -> tuple[Any, ...]:
-        """Returns a picture of the arms of each environment."""
+        """Returns one picture per environment, which shows its arms, as Gymnasium expects."""
         self._write_back()
         return super().render()
 
     def _write_back(self) -> None:
-        """Copies the states of jointly simulated episodes into their environments.
+        """Copies the states of episodes that were simulated together into their environments.
 
         The environments can then draw and save their episodes.
         """
@@ -630,7 +630,10 @@ class _LaneEnvs:
         }
 
     def write_back(self) -> None:
-        """Copies the states of the episodes in progress into the environments."""
+        """Copies the states of the episodes in progress into their environments.
+
+        The episodes are simulated together in common arrays, but drawn and saved one by one.
+        """
         for lane, env in enumerate(self._envs):
             is_here = self._is_loaded[lane] and self._runs[lane] is env.run
             if is_here and env.is_running and self._steps[lane]:
@@ -652,32 +655,32 @@ class _LaneEnvs:
 
     @property
     def envs(self) -> list[TeleoperationEnv]:
-        """The environments, one per lane."""
+        """The reinforcement-learning environments whose episodes are simulated side by side."""
         return self._envs
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites."""
+        """Names of the sites (arm controllers), such as "m1", equal in all environments."""
         return self._names
 
     @property
     def user(self) -> int:
-        """Index of the site whose arm the policy moves."""
+        """Index of the site (arm controller) whose arm the policy moves."""
         return self._user
 
     @property
     def is_joint(self) -> bool:
-        """True if an action is a pose of the joints."""
+        """True if an action is a set of joint angles, and False if it is a position."""
         return self._is_joint
 
     @property
     def k(self) -> NDArray[np.int64]:
-        """Number of ticks that each episode has lasted so far."""
+        """Number of control periods (ticks) that each episode has lasted so far."""
         return self._steps * self._period
 
     @property
     def rate_hz(self) -> int:
-        """Tick rate of the user's site, in Hz."""
+        """Rate of the control loop of the arm that the policy moves, in Hz."""
         return self._rate_hz
 
 
@@ -704,7 +707,10 @@ class _State:
         self._new: list[list[bool]] = []
 
     def read_links(self, name: str, i: int) -> Array:
-        """Returns one field of all links to site `i`, shape (lanes, peers, numbers)."""
+        """Returns a quantity of the network links to site `i`, shape (lanes, peers, numbers).
+
+        A lane is one of the episodes that are simulated side by side.
+        """
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
@@ -740,7 +746,7 @@ class _State:
         return self._view
 
     def observe(self, goals: Array) -> dict[str, Array]:
-        """Computes the observations of all episodes, by the names that `TeleoperationEnv` uses.
+        """Computes the observations of all episodes, with the keys of `TeleoperationEnv`.
 
         Args:
             goals: Goals of the tasks.
@@ -804,7 +810,9 @@ class _State:
 
 
 class _ReachTasks:
-    """Tasks of the class `ReachTask` in several episodes, whose rewards are computed together.
+    """State of the task `ReachTask` (move to a point) in several episodes, as arrays.
+
+    The rewards of all episodes are computed together, which is faster.
 
     Args:
         count: Number of lanes.
@@ -834,7 +842,7 @@ class _ReachTasks:
         self._last_s[lane] = task.last_s
 
     def write_back(self, lane: int, task: ReachTask) -> None:
-        """Copies the state of one task from the arrays of all tasks back into the task."""
+        """Copies the state of the task of one episode from the common arrays into the task."""
         task.reached_s = float(self._reached_s[lane])
         task.last_s = float(self._last_s[lane])
 

@@ -80,7 +80,12 @@ class LaneVector(types.Type):
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """Makes a variable a vector if one branch assigns a vector and another a number."""
+        """Returns the type of a variable that gets a vector in one branch, else a number.
+
+        Numba requires a single type per variable. It is this vector type, so that the number is
+        repeated for all eight runs. Returns None, which is an error of compilation, if the
+        vector does not contain floats or if the other value is not a number.
+        """
         is_number = isinstance(other, types.Float | types.Integer)
         return self if is_number and self.kind == "f8" else None
 

@@ -1079,9 +1079,9 @@ def _format_interval(interval: tuple[float, float | None] | None) -> str:
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the cells of a CSV row.
+    """Yields the names and values of the columns of a CSV row, which has no nested values.
 
-    An interval becomes two cells, for example "interval_low".
+    A confidence interval, for example, becomes two columns such as "interval_low".
     """
     for key, value in row.items():
         if key in ("interval", "bootstrap"):

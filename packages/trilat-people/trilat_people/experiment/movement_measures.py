@@ -237,7 +237,10 @@ class Throughput(NamedTuple):
 
     @property
     def bits_s(self) -> float:
-        """The throughput in bit/s: the index of difficulty over the mean movement time."""
+        """Throughput of pointing movements in bit/s, as Fitts's law defines it.
+
+        It is the index of difficulty over the mean movement time.
+        """
         return self.difficulty_bits / self.time_s
 
 

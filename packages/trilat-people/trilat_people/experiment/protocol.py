@@ -276,7 +276,7 @@ class PlannedTrial(NamedTuple):
 
     @property
     def file(self) -> str:
-        """File name of the trial's log: number, participants, block, trial and condition.
+        """Name of the file with the trial's log: number, participants, block, trial, condition.
 
         Example: "00017-P01-P02-b1-t03-near.mcap".
         """

@@ -65,7 +65,10 @@ class Questionnaire(Frozen, frozen=True):
 
     @property
     def is_forced(self) -> bool:
-        """True if every item must be answered, as for the choice of a perception test."""
+        """True if a participant must answer every item, as in a perception test.
+
+        In other questionnaires, an item may be left out.
+        """
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:

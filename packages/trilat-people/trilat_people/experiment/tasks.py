@@ -64,17 +64,17 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def has_limit(self) -> bool:
-        """True if a trial fails when `longest_s` is over.
+        """True if a trial fails when the participant has not finished in `longest_s` seconds.
 
-        False if every trial lasts that long.
+        False if every trial lasts exactly that long, as for following a moving target.
         """
         return True
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task is for two users together.
+        """True if two participants perform the task together.
 
-        The protocol must then name two masters.
+        The protocol of the experiment must then name two master arms.
         """
         return False
 
@@ -532,7 +532,10 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """Time after which a trial has failed if the force was not held, in s."""
+        """Time limit of a trial in s, within which the force at the wall must be held.
+
+        The trial has failed after this time.
+        """
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
@@ -560,10 +563,7 @@ class _ContactGoal(_DwellGoal):
         self._target_m: Array = start_m + task.distance_m * direction
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
-        """Returns the point at the wall that users see as the target, in m.
-
-        It does not move.
-        """
+        """Returns the fixed point on the wall that participants see as the target, in m."""
         return self._target_m
 
     def compute_measures(
@@ -626,7 +626,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False, because every tracking trial lasts exactly `duration_s`, and none fails."""
+        """False: following a moving target takes exactly `duration_s`, and cannot fail."""
         return False
 
     @property
@@ -639,7 +639,10 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def longest_s(self) -> float:
-        """Duration of every tracking trial after its target has appeared, in s."""
+        """Duration of every trial of following a moving target, in s.
+
+        It counts from the moment at which the target appears.
+        """
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path

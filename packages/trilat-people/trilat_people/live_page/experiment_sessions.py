@@ -437,7 +437,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
-                """Returns True once Ctrl-C or an experimenter's page has requested the end."""
+                """Returns True once Ctrl-C or an experimenter's page has requested to stop."""
                 return interrupt.is_requested() or page.end_requested.is_set()
 
             sessions = ExperimentSessions(

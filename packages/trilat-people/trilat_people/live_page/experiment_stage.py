@@ -278,7 +278,7 @@ class Stage:
         self._phase = "starting"
 
     def show_checking(self) -> None:
-        """Tells all pages that a trial has ended and that its log is being checked."""
+        """Shows on all open web pages that a trial has ended, and that its log is checked."""
         self._watch = None
         self._phase = "checking"
 
@@ -302,7 +302,7 @@ class Stage:
             self._feedback["succeeded"] = entry.succeeded
 
     def show_end(self) -> None:
-        """Tells all pages that the experiment has ended."""
+        """Shows on all open web pages that the experiment has ended."""
         self._request = None
         self._step = None
         self._phase = "over"

@@ -65,7 +65,10 @@ class BrowserOpening:
         return file
 
     def remove_file(self) -> None:
-        """Removes the file with the link, once the page is open or the server ends."""
+        """Removes the temporary file with the secret link of a page.
+
+        It is called once the browser has opened the page, or when the server ends.
+        """
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None

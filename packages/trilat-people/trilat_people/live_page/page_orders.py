@@ -365,7 +365,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """Who sits at the page, as the events of sites name the person: "the user of m1"."""
+        """Who uses a web page, as events of the session call the person: "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -452,9 +452,10 @@ class RoleLinks:
         return digest[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        """Returns True if a token is that of a role.
+        """Returns True if a secret text from a link (token) gives the rights of a role.
 
-        The comparison takes the same time for any token.
+        The comparison takes the same time for any token, so that nobody can guess one by
+        timing.
         """
         role_token = self._make_token(role)
         # The time of this comparison does not reveal how many characters are right.
@@ -519,7 +520,10 @@ class PageHands:
         sender.send(HandMessage, **content)
 
     def release(self) -> None:
-        """Releases all arms that the page holds, for example because the page was closed."""
+        """Releases all arms that the user of a web page moves.
+
+        This happens for example when the page is closed.
+        """
         for site in list(self._held_sites):
             message = MoveHand(site=site, grip=False)
             self.move(message, pushes=False)

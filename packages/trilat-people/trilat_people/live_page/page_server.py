@@ -144,7 +144,7 @@ class _Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Counts a new connection as a stranger, until the role of its page is known.
+        """Counts a new connection as that of a stranger, until its page has proved its role.
 
         Args:
             transport: The connection.
@@ -153,7 +153,7 @@ class _Visitor(ServerConnection):
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Removes a closed connection from the strangers.
+        """Removes a closed connection from the strangers (connections without a role).
 
         Args:
             exc: Reason why it was closed. None if it was closed in order.
@@ -410,7 +410,7 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends the server and closes its pages, waiting at most five seconds for its thread."""
+        """Ends the web server and closes its pages. Waits at most 5 s for its thread."""
         self._ending.set()
         if self._loop is not None and self._stop is not None:
             # The loop of the server may have ended already.
@@ -885,7 +885,10 @@ class PageServer:
 
     @property
     def experimenters(self) -> set[Page]:
-        """The open pages of experimenters. Those of them that take part control the session."""
+        """The open web pages of experimenters.
+
+        Those of them that take part control the session.
+        """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:

@@ -211,7 +211,10 @@ class SiteView:
 
     @property
     def ended(self) -> bool:
-        """True once the site has published its end, so that no further records are expected."""
+        """True once the site has published its end, after which it sends no more records.
+
+        A site is the controller of one arm.
+        """
         return self.reception.final_ticks is not None
 
     @property
@@ -280,7 +283,10 @@ class SessionView:
 
     @property
     def running(self) -> bool:
-        """True once every site has replied that it runs. Before that, `sites` is empty."""
+        """True once every site (arm controller) has replied that it runs.
+
+        Before that, `sites` is empty.
+        """
         return bool(self.sites)
 
     @property

@@ -295,7 +295,10 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         return
 
     def read() -> str:
-        """Returns the keys pressed since the last call. Empty if the terminal has gone."""
+        """Returns the keys that were pressed since the last call.
+
+        Empty if there were none, or if the terminal has gone.
+        """
         with suppress(OSError):
             readable, _, _ = select.select([keyboard], [], [], 0.0)
             if readable:

@@ -715,7 +715,7 @@ class BenchCell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the cell in results: task, law and link, as in "contact/wave/rtt272"."""
+        """Name of the law, task and network link in results, as in "contact/wave/rtt272"."""
         return f"{self.task}/{self.law}/{self.link}"
 
     @property
@@ -742,7 +742,7 @@ class BenchCell(NamedTuple):
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the scenario of one run: a law with its tuned gains in a task over a link.
+        """Returns the scenario of one simulation: a control law with its tuned gains in a task.
 
         Args:
             seed: Seed of the run.
@@ -781,14 +781,15 @@ class BenchPlan(NamedTuple):
 
     @property
     def links(self) -> list[str]:
-        """Names of the network links of the benchmark, in the order of its figures."""
+        """Names of the benchmark's simulated network links, in the order of its figures."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
     def runs(self) -> int:
-        """Number of runs of all cells: one per seed.
+        """Number of simulations of the benchmark: one per random seed and combination.
 
-        Confirming repetitions come in addition.
+        A combination is a control law in a task over a network link. Repetitions that confirm a
+        result come in addition.
         """
         return sum(len(cell.seeds) for cell in self.cells)
 

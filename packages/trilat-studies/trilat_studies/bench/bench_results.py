@@ -207,9 +207,9 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of runs that are judged stable.
+        """Number of simulations that were judged stable.
 
-        Runs that only came to rest do not count.
+        Runs in which the arms only came to rest do not count.
         """
         return self.count(Stability.STABLE)
 
@@ -336,9 +336,9 @@ class BenchResults(Result):
             yield _tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns a sentence with the study's name and its numbers of cells and runs.
+        """Returns one sentence with the name of the benchmark and its number of simulations.
 
-        A cell is a control law in a task over a link.
+        It also counts the combinations (cells) of control law, task and network link.
         """
         cells = count_nouns(len(self.places), "cell")
         runs = count_nouns(len(self.runs), "run")
@@ -391,9 +391,9 @@ class BenchResults(Result):
 
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the tuned gains with which the laws ran, each once.
+    """Returns the tuned gains with which the control laws were simulated, each once.
 
-    Several tasks and links may share the same gains.
+    Several tasks and network links may share the same gains.
     """
     gains_by_name = {str(cell.tuned): cell.tuned for cell in results.plan.cells}
     return list(gains_by_name.values())
@@ -797,7 +797,7 @@ def build_bench_page(
 
 
 def encode_runs(results: BenchResults) -> str:
-    """Encodes all runs as a CSV table, one line per run.
+    """Encodes all simulations of a benchmark as a CSV table, one line per simulation.
 
     Args:
         results: Results of the suite or of a part of it.

@@ -161,7 +161,7 @@ class JudgedRun(NamedTuple):
 
     @property
     def diverged(self) -> bool:
-        """True if an arm exceeded its limits, which ended the run before its time."""
+        """True if the simulation ended early because an arm exceeded its safety limits."""
         return self.end.diverged_at_s is not None
 
 

@@ -87,7 +87,10 @@ class EdgeRefinement:
         return []
 
     def list_coarse_cells(self) -> list[int]:
-        """Returns the numbers of the cells of the coarse grid, with which the sweep begins."""
+        """Returns the numbers of the parameter combinations with which a refined sweep begins.
+
+        They form a coarse grid, which is refined where neighbouring results differ.
+        """
         is_needed = np.zeros(self._shape, bool)
         for panel in self._iterate_panels():
             is_needed[panel] = self._mark_lattice()

@@ -119,7 +119,7 @@ def _read_default_settings(law: ImportedLaw) -> dict[str, Any]:
 
 
 def _list_defaults(arguments: ast.arguments) -> dict[str, Any]:
-    """Returns the defaults of a function's arguments, by name.
+    """Returns the default values of a Python function's arguments, by name.
 
     Args:
         arguments: The arguments, as Python's parser returns them.

@@ -445,9 +445,9 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
 
 
 def _find_line_style(line: MapLine) -> dict[str, Any]:
-    """Returns the plot options of a line.
+    """Returns the plot options, such as colour and dashes, of a line in a stability map.
 
-    Lines of the same kind have the same rank and style.
+    Lines of the same kind have the same style in all panels.
     """
     style_index = line.rank % len(_LINE_STYLES)
     return _LINE_STYLES[style_index]
@@ -811,7 +811,10 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 
 
 def describe_refined_cells(plane: MapPlane) -> str:
-    """Returns how many cells of a refined sweep ran, as in "1243 of 40401 cells ran"."""
+    """Returns how many parameter combinations ran, as in "1243 of 40401 cells ran".
+
+    A refined sweep simulates only those near an edge of stability.
+    """
     ran = sum(int((panel.runs > 0).sum()) for panel in plane.panels)
     cells = sum(panel.runs.size for panel in plane.panels)
     return f"{ran} of {count_nouns(cells, 'cell')} ran"
@@ -912,9 +915,9 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
 
 
 def _format_edge(edge: StabilityEdge) -> str:
-    """Returns an edge of stability as text: "40 to 60", the values between which it lies.
+    """Returns an edge of stability as text, such as "40 to 60", between which values it lies.
 
-    A line of theory has a single value, "52.3".
+    An edge that is computed from theory has a single value, such as "52.3".
     """
     if edge.low == edge.high:
         return f"{edge.low:.4g}"

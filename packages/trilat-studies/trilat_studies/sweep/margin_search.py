@@ -439,7 +439,7 @@ class SweepMargins(Result):
     def command(self) -> str:
         """Shell command that repeats this search for limits of stability.
 
-        The page with the results shows it.
+        The web page with the results shows the command, so that a user can copy it.
         """
         low = format_override_value(self.within.low)
         high = format_override_value(self.within.high)
@@ -492,7 +492,7 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields the table of the measured and predicted limits of stability."""
+        """Yields a table of the limits of stability, as simulated and as predicted."""
         yield self.table()
 
     def headline(self) -> str:
@@ -521,7 +521,9 @@ class SweepMargins(Result):
         }
 
     def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
-        """Returns the plain values of a grid point for `to_dict`: position, seed and edges.
+        """Returns the result of one combination of swept parameters as plain values for JSON.
+
+        These are its position in the grid, its random seed and its edges of stability.
 
         Args:
             point: Margin of the grid point.

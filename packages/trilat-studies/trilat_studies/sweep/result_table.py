@@ -75,11 +75,11 @@ class ResultTable:
 
     @property
     def columns(self) -> list[str]:
-        """Names of all columns, in the order of the file."""
+        """Names of all columns of the table of a sweep, in the order of the CSV file."""
         return [*self._kinds, _SCENARIO_COLUMN]
 
     def encode(self, rows: Iterable[ResultRow]) -> Iterator[str]:
-        """Yields the header of the table, and the text of each row.
+        """Yields the CSV text of a sweep's results: a header, then the text of each row.
 
         Args:
             rows: The runs, one mapping from columns to values per run.
@@ -185,7 +185,7 @@ class StoredRows(Sequence[ResultRow]):
     __hash__ = None  # type: ignore[assignment]
 
     def find_cell(self, number: int) -> list[ResultRow]:
-        """Reads the rows of one cell from the file: its runs with different random seeds.
+        """Reads the results of one combination of parameters, one row per random seed.
 
         Args:
             number: Number of the cell.
@@ -217,7 +217,7 @@ class StoredRows(Sequence[ResultRow]):
 
     @contextmanager
     def _explaining_errors(self) -> Iterator[None]:
-        """Replaces errors of a damaged table by one that names the file.
+        """Replaces errors of a damaged CSV table by an error that names the file.
 
         Raises:
             UsageError: The table cannot be read.
@@ -274,9 +274,10 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
 
 
 def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns that identify a cell, with their types: number, axes and law.
+    """Returns the columns of a CSV table that identify a combination of swept parameters.
 
-    The types serve to read the CSV table again.
+    They are its number, the value of each axis, and the control law, with the types by which
+    the table is read again.
     """
     column_types: dict[str, type] = {"cell": int}
     for axis in plan.axes:

@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
 
 class CellClass(StrEnum):
-    """Result of a run of a sweep in one word, such as stable or undecided.
+    """How a simulation of a parameter sweep ended, such as stable or undecided.
 
-    The values are the texts in tables and on pages.
+    The values are the words in tables and on pages.
     """
 
     CONVERGED = "converged"
@@ -242,7 +242,7 @@ class _CellInProgress:
         return min(2.0 * self._end_s, self._longest_s)
 
     def note_extension(self, end_s: float) -> None:
-        """Evaluates the run again after an extension, which may have shown how it ends.
+        """Judges the simulation again after it was extended, because its end was undecided.
 
         Args:
             end_s: New end of the run, in s.

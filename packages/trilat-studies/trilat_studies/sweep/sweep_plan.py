@@ -107,13 +107,13 @@ class _SweepAxis(NamedTuple):
 
     @property
     def numeric(self) -> bool:
-        """True if all values of the axis are numbers, so that it can be an axis of a map."""
+        """True if all values of a swept parameter are numbers, as an axis of a map needs."""
         if isinstance(self.texts, _Steps):
             return True
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the override that sets one value of the key, as in "link.delay_ms=50".
+        """Returns the text that sets one value of a swept parameter, as in "link.delay_ms=50".
 
         Args:
             number: Index of the value, from 0.
@@ -392,7 +392,7 @@ class SweepPlan(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """Number of combinations of all parameter values and control laws."""
+        """Number of combinations of all swept parameter values and control laws."""
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
@@ -592,7 +592,9 @@ _REFINED_AXES = 2
 
 
 def list_refined_axes(axes: Sequence[_SweepAxis]) -> list[int]:
-    """Returns the indices of the axes that a refined sweep halves: the first two numeric ones.
+    """Returns which swept parameters are refined where the results of neighbours differ.
+
+    These are the first two with numbers as values. The result has their indices.
 
     Args:
         axes: All axes of the sweep.

@@ -75,9 +75,9 @@ class SweepResults(Result):
     rows: Sequence[ResultRow]
 
     def blocks(self) -> Iterator[str]:
-        """Yields the lines of the text that `trilat sweep` prints.
+        """Yields the lines of text that `trilat sweep` prints about a parameter sweep.
 
-        The first lines describe the sweep, the others summarise its results.
+        The first lines describe the sweep, the following lines summarise its results.
         """
         yield from describe_sweep_plan(self.plan)
         yield from summarize_sweep(self)
@@ -309,13 +309,16 @@ class GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """Number of runs that were judged stable or not stable. Undecided runs are left out."""
+        """Number of simulations of a combination that were judged stable or not stable.
+
+        Undecided simulations are left out.
+        """
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
-        """Number of runs of the cell that were judged stable. It is at most `decided`."""
+        """Number of simulations of a combination that were judged stable, at most `decided`."""
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
@@ -414,7 +417,7 @@ def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator
         column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
 
     def format_point(point: GridPoint) -> dict[str, str]:
-        """Returns the texts of the line of a point, by column."""
+        """Returns the texts of one line of the CSV table, by column, for one grid point."""
         decided = point.decided
         stable_share = point.stable / decided if decided else None
         # The values must stand in the order of the columns above.
@@ -566,7 +569,10 @@ class _ValueRange:
         self.high = -math.inf
 
     def add(self, value: float | None) -> None:
-        """Counts the value of a run. None if the run lacks the quantity."""
+        """Updates the smallest and the largest value by the value of one simulation.
+
+        A value of None, for a simulation that lacks the quantity, changes nothing.
+        """
         if value is None:
             return
         self.count += 1
@@ -670,7 +676,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
 
 
 def list_next_commands(folder: Path) -> list[str]:
-    """Suggests commands with which a user can continue after a sweep.
+    """Suggests shell commands that a user may want after a parameter sweep.
 
     Args:
         folder: Folder of the sweep, which the commands name.

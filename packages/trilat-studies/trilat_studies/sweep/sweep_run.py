@@ -633,7 +633,7 @@ class _NewRuns:
         self.simulated_s = 0.0
 
     def note(self, run: CellRun) -> None:
-        """Counts a finished run, for the numbers that are printed at the end of a sweep."""
+        """Counts a finished simulation, for the totals at the end of a sweep."""
         self.runs += 1
         self.simulated_s += run.outcome.ran_s
 
@@ -652,7 +652,10 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
-        """Yields the rows of all cells, and counts why runs were computed alone."""
+        """Yields the result rows of all parameter combinations for the CSV table.
+
+        It also counts the reasons why some simulations could not run side by side with others.
+        """
         for runs in iterate_cells(plan, done):
             reasons.update(run.alone for run in runs if run.alone)
             yield from build_cell_rows(plan, runs)

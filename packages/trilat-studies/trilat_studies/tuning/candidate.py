@@ -776,7 +776,7 @@ class TuningScenario(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Name or path of the scenario, as commands take it: "paper" or "mine.toml"."""
+        """Name or path of the scenario, as commands accept it: "paper" or "mine.toml"."""
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
@@ -831,7 +831,7 @@ class TuningScenario(NamedTuple):
 
     @property
     def command(self) -> str:
-        """The command with which a user can simulate the scenario and record a log.
+        """Shell command with which a user can simulate the scenario and record a log.
 
         Example: "trilat sim paper --set link.delay_ms=200".
         """

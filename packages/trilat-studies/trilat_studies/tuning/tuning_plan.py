@@ -79,7 +79,7 @@ class Objective(StrEnum):
 
     @property
     def unit(self) -> str:
-        """Unit for tables and axes: rad for the error, s for the settling time."""
+        """Unit of the tuned quantity in tables and on axes: rad for an error, s for a time."""
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
@@ -597,7 +597,7 @@ class TuningResult(Result):
     printed: list[_PaperGainsResult]
 
     def blocks(self) -> Iterator[Any]:
-        """Yields the parts of the text that `trilat compare --tune` prints.
+        """Yields the text that `trilat compare --tune` prints about the tuning, part by part.
 
         See `compose_tuning`.
         """
