@@ -963,9 +963,9 @@ class FusedRun:
 
     @property
     def theta_hat(self) -> Array:
-        """Arm parameters that the control laws estimate, after the last tick, shape (N, P).
+        """Arm parameters that adaptive control laws have estimated so far, shape (N, P).
 
-        N is the number of sites, and P is the number of parameters.
+        N is the number of sites (one per arm), and P is the number of parameters.
         """
         return np.array(self._tables.site["theta_hat"][:, 0])
 

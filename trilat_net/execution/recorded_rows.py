@@ -180,7 +180,7 @@ class PlainRows:
     def _is_first_of_run(self, row: int) -> bool:
         """True if a record is complete although it does not follow the record before it.
 
-        Such a record is the first one of a series that compiled code can execute.
+        Compiled code can execute a series of recorded control periods from such a record on.
         """
         return bool(self._is_complete[row])
 

@@ -179,7 +179,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
     How this arm would have reacted to other torques is not known.
 
     Raises:
-        UsageError: A replaced site has such an arm.
+        ScenarioError: A site that is to be executed again has such an arm.
     """
     for name in original.external:
         if name not in replaced:
@@ -574,10 +574,9 @@ class RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of the log, and leaves out the ticks before it.
+        """Continues at the next record of an incomplete log, as earlier inputs are unknown.
 
-        The inputs of these ticks are not known. If there is no further record, the site is
-        done.
+        If there is no further record, the site (arm controller) is done.
         """
         index = bisect.bisect_right(self._recorded_ticks, self.k)
         self.k = self._last_tick + 1

@@ -459,7 +459,9 @@ class RecordedInputs(Generic[Change]):
         return certain_ticks, probable_ticks
 
     def _find_newest_listed(self, row: int, peer: int) -> int:
-        """Returns the newest sample (sent state) of a peer in the last records before a row.
+        """Returns the newest state of a peer that the latest records of a site list.
+
+        The site has received this state. A peer is another site (arm controller).
 
         Returns:
             Tick of the sample. -1 if these records (results of control periods) list no sample

@@ -713,7 +713,9 @@ class _TwinRuns:
         return float(last_second.max(initial=-np.inf) - self._scale[n])
 
     def _end_path(self, n: int) -> None:
-        """Notes that a twin's difference from the run has decayed to rounding errors.
+        """Notes that the difference between a displaced copy (twin) and the run has decayed.
+
+        What is left of the difference are rounding errors.
 
         Args:
             n: Index of the twin, a displaced copy of the run.

@@ -338,7 +338,7 @@ class VerifyResult:
             self.integrity = other.integrity  # one failed log suffices to fail the whole check
 
     def add_difference(self, difference: RecordDifference) -> None:
-        """Counts one more record that differs from the repeated execution.
+        """Counts one more record that differs from the repetition of its control period.
 
         Args:
             difference: The difference. It is stored as `first` if it is the earliest one.

@@ -145,7 +145,7 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if the delays on the link differ between the log and the rerun.
+        """True if the delays on a network link differ between the recorded and the new run.
 
         The delay is measured as the age of the received data when they are used. Its mean and
         its largest value are compared.

@@ -74,9 +74,9 @@ class RangeSet:
         self._forget_lowest()
 
     def _forget_lowest(self) -> None:
-        """Removes the ranges with the lowest numbers if there are more than permitted.
+        """Removes the ranges with the lowest numbers, if there are more than permitted.
 
-        Thus the memory stays bounded, whatever a sender does (L6).
+        The memory thus stays bounded, whatever numbers a faulty or hostile sender uses (L6).
         """
         del self._ranges[: -self._max_ranges]
 
@@ -308,9 +308,9 @@ class Account:
 
     @property
     def expected(self) -> int:
-        """Number of messages that are known to have been published.
+        """Number of messages that a process has published, as far as a receiver knows.
 
-        Numbers that never had a message (`unpublished`) are not counted.
+        Skipped numbers that never had a message (`unpublished`) are not counted.
         """
         return self.last + 1 - self.unpublished
 
@@ -321,7 +321,7 @@ class Account:
 
     @property
     def gaps(self) -> list[list[int]]:
-        """Ranges of missing numbers in ascending order, as pairs [first, last].
+        """Numbers of the messages that are missing, as pairs [first, last] in ascending order.
 
         For example [[10, 12]] if the messages 10, 11 and 12 are missing. There are at most
         `MAX_GAPS` pairs: those with the highest numbers.
@@ -330,10 +330,9 @@ class Account:
 
     @property
     def largest_gap(self) -> int:
-        """Number of missing messages in the largest gap, 0 if no message is missing.
+        """Number of messages in the longest series of missing messages. 0 if none is missing.
 
-        A long gap means an interruption, while the same number of single losses may be
-        harmless.
+        A long series means an interruption, while as many single losses may be harmless.
         """
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
@@ -388,7 +387,9 @@ class Account:
         return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Marks a number as received: removes it from the gaps, or extends the known numbers.
+        """Marks the number of a message as received.
+
+        It is removed from the missing numbers, or extends the known numbers.
 
         Returns:
             False if the number had been marked as received before.

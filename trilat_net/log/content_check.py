@@ -221,10 +221,9 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Composes the metadata that a channel of the session has in a log.
+        """Returns the description of a channel that a correct log of the session contains.
 
-        They are the same that `LogWriter` writes, so that a lost definition of a channel can be
-        restored.
+        A recovery restores a lost description with it.
 
         Args:
             topic: Topic of the channel.

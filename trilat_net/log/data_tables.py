@@ -107,9 +107,10 @@ class Column(NamedTuple):
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a column of numbers, shape (K,), with NaN for missing values.
+        """Returns the values of a numeric column as an array, with NaN for missing values.
 
-        Exports to formats without missing values use it, such as NumPy files.
+        The shape is (K,). Exports to formats without missing values use it, such as NumPy
+        files.
         """
         if self.known is None or self.known.all():
             return self.values
@@ -176,7 +177,7 @@ class Table:
     def to_data_frame(self) -> "polars.DataFrame":
         """Converts a table of a log to a polars data frame with the same columns.
 
-        A missing value is null.
+        A missing value becomes null.
 
         Raises:
             UsageError: polars is not installed.
@@ -458,7 +459,7 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that the site's control law sends to its peers.
+    """Yields the columns of the numbers that a site's control law sends to other sites.
 
     Their names begin with "ch_". For example "ch_force_m1_nm" is a torque that is sent to m1.
     """

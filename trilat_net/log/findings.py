@@ -78,9 +78,10 @@ class Finding:
             self.places.append(_ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
-        """Summarises the problems of the check in one line.
+        """Summarises the problems that one check of a log has found, in one line.
 
-        There must be at least one problem.
+        The line has the first problem and the number of further problems. There must be at
+        least one.
 
         Returns:
             The first problem and the number of further problems.
@@ -103,7 +104,7 @@ class Finding:
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns the result of the check as one row of JSON: its name, text and outcome.
+        """Returns the result of one check of a log as plain values: its name, text and outcome.
 
         "judged" is False if the check could not be made. The single problems are left out,
         because their summary is in the text.

@@ -80,10 +80,10 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Frees the reserved disk space, so that the last part of the log fits on a full disk.
+        """Frees the reserved disk space, so that the last part of a log fits on a full disk.
 
-        The recorder calls this when an error stops the writing. Later calls of `grow` reserve
-        nothing.
+        This happens when the disk refuses data, or when the file is closed. Later calls of
+        `grow` reserve nothing.
         """
         self._is_possible = False
         self.size = 0
@@ -93,9 +93,9 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Allocates the bytes of a file from the offset `begin` to before the offset `end`.
+    """Reserves disk space for a file from one offset up to another.
 
-    If the file system cannot allocate space, zeros are written.
+    If the file system cannot reserve space, zeros are written.
 
     Raises:
         OSError: The disk has no room.
@@ -165,7 +165,7 @@ class _FileSync:
             self._disk_error = error
 
     def wait(self) -> None:
-        """Waits until the thread that syncs the file has ended.
+        """Waits until a thread has forced the written data of the log onto the disk.
 
         The file must not be closed before, as the thread uses its descriptor.
         """
@@ -174,7 +174,7 @@ class _FileSync:
 
 
 def _datasync(descriptor: int) -> None:
-    """Syncs the data of a file to the disk.
+    """Forces the written data of a file onto the disk, so that a power failure loses nothing.
 
     Where the system has `fdatasync`, it is preferred to `fsync`, because it leaves out metadata
     that are not necessary to read the file.
@@ -348,7 +348,7 @@ class LogFile:
             raise
 
     def _write_pending(self) -> None:
-        """Passes the stored data to the operating system, and remembers the end of the file.
+        """Passes the bytes in memory to the operating system, and notes where the file ends.
 
         After an error, the next call continues behind the bytes that were accepted.
 
@@ -380,7 +380,7 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True if the file is complete: it ends with the end mark of the MCAP format.
+        """True if the log is complete: it ends with the end mark of the MCAP format.
 
         Only such a file gets its final name. Another one keeps the suffix ".active", and can be
         recovered.
@@ -418,7 +418,7 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes the file and removes it, because the log is not wanted.
+        """Closes and removes the file of a log that is not wanted.
 
         An error while closing is ignored, since no data need to be saved.
         """

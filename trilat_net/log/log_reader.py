@@ -182,7 +182,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return "" if has_records else "no site has a record in this log"
 
     def require_records(self) -> None:
-        """Raises an error if no site has a record, so that there is nothing to judge.
+        """Raises an error if the log has no record, so that there is nothing to judge.
 
         Raises:
             LogError: No site has a record.
@@ -361,10 +361,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns the events of a member, sorted by its starts and by their numbers.
+        """Returns the events of one process of the session, such as "lost", in their order.
 
-        A member that is started again numbers its events from 0 again. The starts are in the
-        order in which they first appear in the file.
+        A process that is started again numbers its events from 0 again. The starts are in the
+        order in which they first appear in the file, and the events of a start by number.
         """
         events = self._decode(topic, Event)
         boots = list(dict.fromkeys(event.boot for event in events))
@@ -421,9 +421,10 @@ class Log(Result, Mapping[str, SiteLog]):
         ]
 
     def warn_of_failures(self) -> None:
-        """Issues a Python warning if the run diverged or a program that moves an arm failed.
+        """Issues a Python warning if an arm left its limits, or if a user's program failed.
 
-        The warning names the line of code that called the caller of this method.
+        The program is one that moves an arm. The warning names the line of code that called the
+        caller of this method.
         """
         for failure in self.failed_hands:
             warnings.warn(failure, RuntimeWarning, stacklevel=3)
@@ -466,7 +467,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of this file, from 1, if the recorder split the log into several files.
+        """Number of this file, from 1 on, if a long log was split into several files.
 
         It is 0 for a log in a single file, for several files that were opened together, and for
         a file without a valid number.
@@ -552,10 +553,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of ticks that each site (arm controller) states in its "end" event, by site.
+        """Number of control periods (ticks) that each site states when it ends, by site.
 
-        A number above that of the scenario is reduced to it. Sites without such an event are
-        missing.
+        A site (arm controller) states it in its "end" event; sites without such an event are
+        missing. A number above that of the scenario is reduced to it.
         """
         ticks = {}
         for event in self.events:
@@ -756,10 +757,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._sites[site]
 
     def _read_site(self, site: str) -> SiteLog:
-        """Creates the view of one arm's records that `log[name]` returns.
+        """Creates the object with all records of one arm that `log[name]` returns.
 
         Raises:
-            LogError: A tick (control period) is beyond the length of the scenario.
+            LogError: A control period is beyond the length of the scenario.
         """
         channel = self._channel(self._topic(site, topics.STATE))
         site_log = SiteLog(
@@ -855,7 +856,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return shown_ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
-        """Decodes the statistics that a site published about its links, such as losses.
+        """Returns the statistics that a site published about its network links, such as losses.
 
         Args:
             site: Name of the site.
@@ -883,7 +884,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages([stats[n] for n in order], log_ns[order], publish_ns[order])
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Decodes the events of all members of the session, in the order of their arrival.
+        """Returns the events of all processes of the session, in the order of their arrival.
+
+        An event is a notable occurrence, such as a lost connection. Each has the time of
+        arrival at the recorder and the time of sending.
 
         Returns:
             The events, with the time of arrival at the recorder and the time of sending of

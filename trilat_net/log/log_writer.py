@@ -63,7 +63,7 @@ class _LogViews(Protocol):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes.
+        """Upper limit for the size of messages for viewers that are not written yet, in bytes.
 
         A writer adds this size when it decides whether the next message still fits into the
         file.
@@ -79,7 +79,7 @@ class _LogViews(Protocol):
         """
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages for viewers, at the end of the log.
+        """Writes the remaining messages for viewers such as Foxglove, at the end of the log.
 
         Args:
             log_ns: Arrival time of the last message of the session, in Unix time, in ns.
@@ -281,7 +281,7 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Adds a message for viewers.
+        """Adds a message to the log that viewers such as Foxglove display.
 
         Args:
             topic: Topic of the message.
@@ -384,9 +384,9 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if a limit of size or duration divides the log into several files (parts).
+        """True if a limit of size or duration divides a log into several files.
 
-        Without a limit, a log has several parts only if an existing log was continued.
+        Without a limit, a log has several files only if an existing log was continued.
         """
         return self.split_bytes is not None or self.split_ns is not None
 
@@ -501,7 +501,7 @@ class LogParts:
         self._previous = path.name
 
     def _begin_next_part(self) -> None:
-        """Finishes the current part, and begins the next one.
+        """Finishes the file that is being written, and begins the next file of the same log.
 
         Raises:
             LogRefused: The file cannot be created, or the disk refused the data.

@@ -290,7 +290,7 @@ class McapReader:
     def damaged(self) -> list[mcap_records.Damage]:
         """Parts of the file that could not be read, among the parts examined so far.
 
-        A channel is also listed if only some of its messages were read, which limits the
+        A channel of which only some messages were read is listed, too. This limit bounds the
         memory.
         """
         return self.scanner.damaged + self._more_damage
@@ -365,8 +365,8 @@ class McapReader:
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, and reports the progress.
 
-        The progress is reported after the caller has handled a record, which is when the
-        generator continues.
+        The progress is reported when the generator continues, that is, after the caller has
+        handled a record.
         """
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
@@ -414,7 +414,7 @@ class McapReader:
 
     @property
     def _gave_up(self) -> bool:
-        """True if the file has so many damaged parts that the reader has stopped.
+        """True if the reader has stopped because the file has too many damaged parts.
 
         The limit bounds the time and the memory that a file of random bytes can cost.
         """
@@ -636,8 +636,8 @@ class McapReader:
     def _clear_run(self) -> chunk_walk.MessageRun:
         """Returns the arrays that receive the next messages of a chunk, with counts of zero.
 
-        The large arrays are used again and again. There is a count for each slot, a small
-        number that stands for a channel.
+        A chunk is a compressed block of messages. The large arrays are used again and again.
+        There is a count for each slot, a small number that stands for a channel.
         """
         sums = np.zeros((4, len(self._slots)), np.int64)
         self._run = self._run._replace(
@@ -705,7 +705,7 @@ class McapReader:
                 yield _MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
-        """Compares the file with its digests, to find out whether it was changed.
+        """Finds out by digests in the file whether the file was changed after it was written.
 
         The file must have been read to its end.
 
@@ -894,7 +894,7 @@ class ChannelMessages:
         return self._data[start : self._ends[number]].tobytes()
 
     def _reserve(self, size: int) -> NDArray[np.uint8]:
-        """Returns the array of all payloads, with space for further bytes at its end.
+        """Returns the array with the contents of all messages, with room for more at its end.
 
         The array grows at least twofold, so that many small additions stay cheap.
 

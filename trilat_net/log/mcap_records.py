@@ -74,7 +74,7 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """Error that a part of a file makes no sense. Its text states the reason.
+    """Error: a part of an MCAP file makes no sense. The text of the error states the reason.
 
     It is used only within the package `log`: a scan catches it and continues at the next
     readable part, and a check reports it.
@@ -300,7 +300,7 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record, without the fields for its kind and its length.
+        """Content of the record as bytes, without the fields for its kind and its length.
 
         It is read from the file at first use, so that a scan of a large file is fast.
         """
@@ -319,7 +319,9 @@ class ScannedRecord:
         return self._scanner.head(self.frame)
 
     def unpack(self) -> bytes:
-        """Returns the records in a chunk. It is unpacked once, however often this is called.
+        """Returns the decompressed records of a chunk, a compressed block of messages.
+
+        It is decompressed once, however often this is called.
 
         Raises:
             UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
@@ -438,7 +440,9 @@ class RecordScanner:
         )
 
     def _end_at(self, footer_end: int) -> None:
-        """Checks that the end mark follows the footer, and sets the attributes about the end.
+        """Checks that an MCAP file has its end mark after the footer, its last record.
+
+        The attributes about the end of the file are set.
 
         Args:
             footer_end: Offset of the first byte after the footer.
@@ -477,7 +481,7 @@ class RecordScanner:
         return chunk_offset
 
     def _frame_at(self, offset: int) -> RecordFrame:
-        """Returns the place of the record that begins at an offset.
+        """Returns kind, position and length of the MCAP record that begins at an offset.
 
         Raises:
             UnreadableRecord: There is no record, or it reaches beyond the end of the file.
@@ -563,7 +567,7 @@ class RecordScanner:
         return crc
 
     def footer(self) -> records.Footer | None:
-        """Reads the footer of the file, which states where the index is.
+        """Reads the footer of the file, its last record, which states where the index is.
 
         Returns:
             The footer. None if the file is not finished and therefore has no footer.
@@ -572,7 +576,7 @@ class RecordScanner:
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
-        """Checks the summary at the end of the file, which contains its index, by its checksum.
+        """Checks the summary at the end of an MCAP file, which has its index, by its checksum.
 
         Args:
             footer: Footer of the file, which states the checksum.

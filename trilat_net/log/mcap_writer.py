@@ -59,7 +59,7 @@ class Sink(Protocol):
     """
 
     def write(self, data: bytes, /) -> int:
-        """Accepts bytes. A file writes them at once, and a buffer stores them until `flush`.
+        """Accepts bytes for the file. Some implementations store them until `flush`.
 
         Args:
             data: The bytes.
@@ -80,7 +80,7 @@ def _pack_text(text: str) -> bytes:
 
 
 def _pack_text_map(texts: Mapping[str, str]) -> bytes:
-    """Encodes a map of texts as MCAP files require.
+    """Encodes a dictionary of strings as MCAP files require.
 
     The length of the encoded map in bytes comes first, then each key and each value.
 
@@ -183,8 +183,8 @@ class McapWriter:
     def open_chunk_bytes(self) -> int:
         """Largest size of the messages that were added but not written yet, in bytes.
 
-        These messages form the open chunk. The size includes the index of the messages. It is 0
-        if there are no such messages.
+        These messages form a block that is written at once (the open chunk). The size includes
+        the index of the messages. It is 0 if there are no such messages.
         """
         if not self._open_chunk:
             return 0
@@ -281,9 +281,9 @@ class McapWriter:
             self.flush()
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Writes a metadata record, a named map of texts, such as the facts about a session.
+        """Writes a named dictionary of strings into the file, such as facts about a session.
 
-        It precedes the messages of the open chunk in the file.
+        It precedes the messages of the open chunk (block that is not written yet) in the file.
 
         Args:
             name: Name of the metadata.
@@ -432,7 +432,7 @@ class McapWriter:
         self._stream.flush()
 
     def _pack_statistics(self) -> bytes:
-        """Encodes the statistics record, from which readers learn the size of the log.
+        """Encodes the MCAP record from which readers learn the size of the log.
 
         It contains the numbers of all kinds of records, and the first and last arrival time.
         """

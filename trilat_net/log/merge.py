@@ -149,9 +149,9 @@ def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
 
 
 def _recorder_boot(part: LogContents) -> int:
-    """Returns the number that identifies the start of the recorder that wrote a part.
+    """Returns the random number that identifies the process that recorded a file.
 
-    The number is 0 if the part has no readable message of the recorder.
+    The number is 0 if the file has no readable message of the recorder.
     """
     kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
     for channel, kind in kinds.items():
@@ -265,10 +265,10 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
 
 
 def _describe_message(topic: str, key: Hashable) -> str:
-    """Returns a noun phrase for the message with a key, see `_list_keys`.
+    """Returns a noun phrase for a message, for a sentence about differing files.
 
     For example, the key 12 on the topic of the records (results of control periods) of "m1" is
-    "the record of tick 12 of m1".
+    "the record of tick 12 of m1". For the keys see `_list_keys`.
     """
     member, kind = topic.split("/")[-2:]
     match key:

@@ -222,7 +222,9 @@ def _decode_fields(
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder that decodes only some fields of a record, and skips the others.
+    """Returns a decoder for some fields of an encoded record, which skips all other fields.
+
+    This is faster than decoding the whole record.
 
     Args:
         fields: Names of the fields.
@@ -238,7 +240,7 @@ def _find_decoder(
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder of structs with some fields. Other fields of a payload are skipped.
+    """Creates a decoder for some fields of encoded records. Other fields are skipped.
 
     Args:
         types: Types of the fields, by name.

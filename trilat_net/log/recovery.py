@@ -109,17 +109,17 @@ class Recovery(Result):
 
     @property
     def lossless(self) -> bool:
-        """True if the new file contains everything that the source file contains.
+        """True if the recovered file contains everything that the damaged file contains.
 
         False if some bytes could not be read or assigned. `lost` then describes them.
         """
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of the recovery, with the keys of `trilat log recover --json`.
+        """Returns the result of the recovery of a damaged log as plain values, for JSON.
 
-        The entries say what was saved ("messages", "coverage"), and what was lost
-        ("lost_bytes", "missing").
+        `trilat log recover --json` prints them. The entries say what was saved ("messages",
+        "coverage"), and what was lost ("lost_bytes", "missing").
         """
         return {
             "file": self.path.as_posix(),
@@ -279,7 +279,7 @@ def _recover(
 
 
 def _check_output(working: Path, result: Recovery) -> None:
-    """Opens the new file as a test, and adds a loss to the result if this fails.
+    """Opens the recovered file as a test, and adds a loss to the result if this fails.
 
     Args:
         working: The new file, under its temporary name.
@@ -477,7 +477,7 @@ class _FileCopy:
             raise UnreadableRecord(f"this record has the unknown kind {opcode}")
 
     def _copy_metadata(self, content: bytes) -> None:
-        """Copies a metadata record, unless the recovery writes this record itself.
+        """Copies a named dictionary from the damaged file, unless it is written anew anyway.
 
         Raises:
             UnreadableRecord: The metadata are those of another session.
@@ -841,7 +841,7 @@ class _FileCopy:
         return self._register_copy(number, new_number, definition.topic)
 
     def _open_session_channel(self, topic: str) -> tuple[int, str]:
-        """Registers a channel of the session in the new file, as `LogWriter` would define it.
+        """Defines a channel of the session in the recovered file, as `LogWriter` would do it.
 
         Args:
             topic: Topic of the channel.
@@ -949,7 +949,7 @@ class _FileCopy:
         return ""
 
     def _report_final_losses(self) -> None:
-        """Adds the losses that are known only after all records were read.
+        """Adds the losses that are known only after the whole damaged file was read.
 
         For example, messages of a channel that no record defines, because a definition may
         follow its messages.
@@ -1097,7 +1097,9 @@ _LAST_NS = (1 << 64) - 1
 
 
 def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
-    """Returns the channel number, sequence number, arrival time and sending time of a message.
+    """Decodes the first fields of an MCAP message: its channel, its number and both times.
+
+    The result has the channel number, sequence number, arrival time and sending time.
 
     Raises:
         UnreadableRecord: The message is too short.

@@ -310,7 +310,7 @@ class RecoverySurvey:
         self.definitions = list(filter(is_genuine, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
-        """Finds the chunks that are not in their original places.
+        """Finds chunks (blocks of messages) of a damaged file that are at a wrong position.
 
         Returns:
             A description of the problem for each of these chunks, by the offset of the chunk.
@@ -362,7 +362,7 @@ class RecoverySurvey:
 
 
 def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
-    """Returns the offset of the summary at the end of a file, if its checksum is valid.
+    """Returns the offset of the summary at the end of an MCAP file, if its checksum is valid.
 
     If the summary is missing or damaged, the size of the file is returned.
     """

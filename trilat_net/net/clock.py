@@ -47,10 +47,9 @@ class Clock(Protocol):
         """
 
     def identity(self) -> str:
-        """Returns a string that identifies the monotonic clock.
+        """Returns a string that is equal in two processes if they share a monotonic clock.
 
-        Readings of two processes can be compared only if their clocks have the same identity.
-        This is the case for processes on one machine.
+        This is the case on one machine. Only then can readings of both processes be compared.
         """
 
 

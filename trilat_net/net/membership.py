@@ -398,7 +398,7 @@ class Membership:
         return [name for name in awaited_members if name not in known_members]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """Returns True if a process of a member is gone, and another process has replaced it.
+        """Returns True if a process is gone, and another one has taken its name.
 
         Args:
             name: Name of the member.

@@ -397,7 +397,7 @@ class ZenohBus:
         )
 
     def announce(self, key: str) -> None:
-        """Announces that this member is present, until the connection is closed or lost.
+        """Shows other processes that this one is present, until its connection ends.
 
         Args:
             key: Key of the liveliness token by which other members see this member.

@@ -118,10 +118,10 @@ class HandImpedance(Result):
     responses: tuple[_SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the identified hand to plain values for a JSON file.
+        """Converts the identified model of a person's hand to plain values for a JSON file.
 
-        The values are the matrices, their intervals and the measured responses. The command
-        `trilat linear --operators` reads the file.
+        The values are the matrices of mass, damping and stiffness, their confidence intervals
+        and the measured responses. The command `trilat linear --operators` reads the file.
         """
         return {
             "site": self.site,
@@ -181,10 +181,10 @@ class HandImpedance(Result):
         yield f"in a scenario, without the mass of the hand: hands = [{{ {table_text} }}]"
 
     def _tabulate_matrices(self) -> TextTable:
-        """Returns a table with a row for each of M, B and K, and a column for each entry.
+        """Returns a table of the identified mass M, damping B and stiffness K of a hand.
 
-        The columns are named by their axes, as in "xy". Each cell has the value and half the
-        width of its interval.
+        There is a row for each matrix, and a column for each entry, named by its axes, as in
+        "xy". Each cell has the value and half the width of its confidence interval.
         """
         axes = "xyz"[: len(self.K)]
         entries = list(product(range(len(axes)), repeat=2))

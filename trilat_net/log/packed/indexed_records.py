@@ -104,9 +104,10 @@ class IndexedRecords:
 
     @property
     def boots(self) -> Ints:
-        """Number that identifies the start of the process (boot) in each record, shape (K,).
+        """Random number that identifies the start of the process in each record, shape (K,).
 
-        It is an unsigned number of 64 bits, given as the signed number with the same bits.
+        A restarted process has another number. It has 64 bits and no sign, but is given as the
+        signed number with the same bits.
         """
         return self._heads[:, _BOOT]
 
@@ -138,7 +139,7 @@ class IndexedRecords:
         return field in _INTS
 
     def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
-        """Returns integers that follow a position (mark) in each record.
+        """Reads integers at known distances behind a position in each encoded record.
 
         The result has the shape (K, number of gaps). A gap is the number of bytes before an
         integer.
@@ -200,9 +201,9 @@ class IndexedRecords:
         return bits
 
     def _gather_floats(self, mark: int, places: Sequence[int]) -> Ints:
-        """Returns the bits of numbers at fixed offsets from a position (mark) in each record.
+        """Reads the bits of floats at fixed distances behind a position in each encoded record.
 
-        The result has the shape (K, count of offsets).
+        The result has the shape (K, number of distances).
         """
         bits = np.zeros((len(self), len(places)), np.int64)
         record_scan.gather_floats(
@@ -238,7 +239,7 @@ class IndexedRecords:
         return places
 
     def vectors(self, fields: Sequence[str]) -> dict[str, Array]:
-        """Returns some vectors of each record.
+        """Reads some vectors, such as joint angles, from all encoded records.
 
         Args:
             fields: Names of the vectors.

@@ -76,7 +76,7 @@ _SIZES = _list_sizes()
 
 @leaf
 def _read_int(data: Bytes, offset: int) -> int:
-    """Decodes the integer (MessagePack) that begins at an offset.
+    """Decodes the integer that begins at an offset, in the binary format MessagePack.
 
     The result is a signed number of 64 bits. An unsigned number of 2^63 or more becomes the
     negative number with the same bits.
@@ -98,9 +98,9 @@ def _read_int(data: Bytes, offset: int) -> int:
 
 @leaf
 def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the offset after a literal, the constant bytes between two values of a record.
+    """Returns the offset after constant bytes that every encoded record has at this point.
 
-    The result is -1 if the record has other bytes there.
+    The result is -1 if the record has other bytes there, so that it must be decoded otherwise.
     """
     after: int = offset + layout.lengths[literal]
     if after > end:
@@ -254,9 +254,10 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
-    """Returns the index of the operating mode whose name begins at an offset. -1 for no mode.
+    """Returns the index of the controller's operating mode whose name begins at an offset.
 
-    A name has at most eight letters. It is compared with all names as one integer.
+    The result is -1 if no mode has this name. A name has at most eight letters, so that it is
+    compared as one integer.
     """
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED

@@ -649,7 +649,7 @@ def _list_pseudonyms(protocol: Protocol) -> list[str]:
 
 
 def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields a sentence for each problem with the pseudonyms of participants.
+    """Yields a sentence for each mistake in the pseudonyms of an experiment's participants.
 
     Two participants have the same pseudonym, or a force limit names one that nobody has.
     """
@@ -701,10 +701,10 @@ def _find_form_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_group_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with the users and the number of participants.
+    """Yields a sentence for each mistake in the number of participants of an experiment.
 
     Some designs balance the orders of conditions only if the number of groups is a multiple of
-    the number of orders.
+    the number of orders. The users that a task needs are checked, too.
     """
     users = protocol.users
     name_count = len(_list_pseudonyms(protocol))

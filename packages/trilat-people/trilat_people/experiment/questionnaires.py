@@ -94,9 +94,10 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
-        """Returns True if a value is on the scale, or is a missing answer that is allowed.
+        """Returns True if an answer is on the scale, or is missing and may be missing.
 
-        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on.
+        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on. None is a missing
+        answer.
         """
         if value is None:
             return not self.is_forced

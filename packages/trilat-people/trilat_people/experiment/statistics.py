@@ -40,9 +40,10 @@ _ROUNDING = 1e-12
 
 
 def import_scipy_stats() -> Any:
-    """Imports and returns the module `scipy.stats`.
+    """Imports and returns the module `scipy.stats`, when statistics are needed.
 
-    It takes longer to import than everything else of an experiment, and trials do not need it.
+    The import takes longer than all other imports of an experiment together, and trials do not
+    need it.
     """
     # The import takes half a second, and most commands do not need it.
     from scipy import stats

@@ -55,7 +55,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def longest_s(self) -> float:
-        """Longest duration of a trial after its target appears, in s.
+        """Longest duration of a trial, from the appearance of its target on, in s.
 
         With a time limit (`has_limit`), a trial that has not succeeded by then has failed.
         Without one, every trial lasts exactly that long.
@@ -210,9 +210,10 @@ class TrialGoal:
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> "Outcome | None":
-        """Judges whether the trial ends now, after the target has appeared.
+        """Decides in each control period whether the trial succeeds, fails or continues.
 
-        Each task implements it. The arguments and the result are those of `judge`.
+        Each task implements this method, which is called after the target has appeared. For the
+        arguments and the result see `judge`.
         """
         raise NotImplementedError
 
@@ -265,10 +266,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task needs two users.
+        """True if two participants reach the target together.
 
-        A second user is needed to receive the control of the slave arm from the first user
-        during the trial (handover).
+        The first one then hands over the control of the slave arm to the second one during the
+        trial.
         """
         return self.handover_s is not None
 
@@ -550,9 +551,9 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
 
 class _ContactGoal(_DwellGoal):
-    """Goal of a trial of `ContactTrial`: to press a wall with a force for some time.
+    """Decides when a trial has succeeded in which a wall is pressed with a force for some time.
 
-    The position plays no role: only the force is judged.
+    Only the force is judged, not the position. See `ContactTrial`.
     """
 
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
@@ -631,9 +632,9 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if the tracking task needs two users.
+        """True if two participants follow a moving target together.
 
-        The two users then see different targets, and must agree on a position of the slave arm.
+        They see different targets, and must agree on a position of the slave arm.
         """
         return self.apart_m > 0.0
 

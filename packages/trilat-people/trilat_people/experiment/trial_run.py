@@ -281,7 +281,7 @@ class ExperimentTrial:
         return magnitude_n
 
     def _place_end_effector(self, q: Array) -> EndEffectorRows:
-        """Returns the slave's end effector in K records: positions and Jacobians.
+        """Computes the positions and Jacobians of the slave's end effector from K records.
 
         Args:
             q: Joint positions, shape (K, n), in rad or m. The joints count as being at rest.
@@ -618,10 +618,10 @@ class SyntheticTrial(ExperimentTrial):
         return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
-        """Runs the trial in virtual time, writes its log, and returns its result.
+        """Simulates a trial with a model of the participant, and writes its log.
 
         A first run without a log finds out when the trial ends, so that the log stops soon
-        after.
+        after. Returns the result of the trial.
 
         Args:
             path: Path of the log.

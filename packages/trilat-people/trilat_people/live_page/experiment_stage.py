@@ -73,7 +73,7 @@ class TrialWatch:
 
     @property
     def over(self) -> bool:
-        """True once the session of the trial can end.
+        """True once the session in which a trial takes place can end.
 
         After an abort, the session can end at once. After the outcome, it continues for
         `END_DELAY_NS`, so that the log contains what follows.
@@ -268,7 +268,7 @@ class Stage:
         return request
 
     def show_trial(self, watch: TrialWatch) -> None:
-        """Tells all pages that the session of a trial is about to begin.
+        """Shows on all open web pages that a trial is about to begin.
 
         Args:
             watch: Object that judges the trial while its session runs.
@@ -473,7 +473,7 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns the fields of a step that only experimenters may see, such as the condition.
+        """Returns what only experimenters may see of the present step, such as the condition.
 
         Participants who knew the condition might expect an effect.
 

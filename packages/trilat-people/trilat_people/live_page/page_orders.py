@@ -87,7 +87,7 @@ class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """Request of a page to receive or return the right to move arms and change settings.
+    """Request of a web page to receive or return the right to move arms and change settings.
 
     Attributes:
         want: True to ask for the right, False to return it.
@@ -112,7 +112,7 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Request of a page to stop all arms at once. Every role may send it, also a watcher.
+    """Request of a web page to stop all arms at once. Everybody may send it, also a watcher.
 
     The session continues: the arms come to rest until somebody releases them.
     """
@@ -160,7 +160,7 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """Request of a page to mark the present moment in the log by an event with a text.
+    """Request of a web page to mark the present moment in the log, by an event with a text.
 
     Attributes:
         text: The text, for example "contact".
@@ -197,7 +197,7 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """Request of a page to end the session in an orderly way, so that its log is complete.
+    """Request of a web page to end the session in an orderly way, so that its log is complete.
 
     Only sessions that were started together with their page accept it.
     """
@@ -219,7 +219,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """Request of a page to end the running trial of an experiment, and to repeat it later.
+    """Request of a web page to end the running trial of an experiment, and to repeat it later.
 
     Attributes:
         why: The reason, for the journal of the experiment.
@@ -374,10 +374,10 @@ class Role:
 
     @property
     def query(self) -> str:
-        """Part of a page's web address that states the role, such as "as=m1" or "watch".
+        """Part of a web page's address that states the role of its user, such as "as=m1".
 
-        The text "as=m1" stands for the view of the user of site m1. It is empty for an
-        experimenter.
+        "as=m1" is the role of the user of the arm m1, and "watch" that of a watcher. The text
+        is empty for an experimenter.
         """
         fields: list[str] = []
         if self.kind == "watcher":
@@ -442,7 +442,7 @@ class RoleLinks:
         return None
 
     def _make_token(self, role: Role) -> str:
-        """Returns the secret token in the link of a role. It grants the rights of the role.
+        """Returns the secret text (token) in a link, which grants the rights of one role.
 
         The token is a keyed digest of the role. Nobody without the server's secret can guess
         it.
@@ -690,7 +690,7 @@ class OrderDesk:
         self._open_queries[site, channel] = _OpenQuery(inbox, sent_ns, request)
 
     def mark(self, site: str, text: str) -> None:
-        """Queues a text that a site publishes as an event, to mark this moment in the log.
+        """Requests a site to publish an event with a text, which marks this moment in the log.
 
         Args:
             site: Name of the site that publishes the event.

@@ -519,7 +519,7 @@ class PageServer:
                 self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        """Listens for browsers and serves pages, until the end of the server is requested.
+        """Accepts connections of browsers and serves web pages, until the server shall end.
 
         It sets `address`, the link with the port that was chosen, and then reports that it is
         ready.
@@ -618,7 +618,7 @@ class PageServer:
             await asyncio.sleep(max(0.002, remaining_s))
 
     def _poll_stage(self) -> None:
-        """Lets the experiment judge the new records, and writes its marks into the log.
+        """Lets the experiment judge new records of the arms, and writes its marks into the log.
 
         A mark is, for example, "trial 3 begins". Without an experiment nothing happens.
         """
@@ -630,9 +630,10 @@ class PageServer:
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
-        """Makes the next frame, the message from which pages draw the present state.
+        """Composes the next message (frame) from which web pages draw the present state.
 
-        The replies of sites to requests of pages are collected too. The latest 20 are kept.
+        The replies of sites (arm controllers) to requests of pages are collected, too. The
+        latest 20 are kept.
         """
         self._frame_number += 1
         for site, channel, is_accepted, text in self._desk.replies:
@@ -651,9 +652,9 @@ class PageServer:
         self._frames_as_site.clear()
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Returns the response to an HTTP request.
+        """Returns the response to an HTTP request of a browser.
 
-        The library calls this function for each request, before it opens a WebSocket.
+        The WebSocket library calls this function for each request, before it opens a WebSocket.
 
         Returns:
             The response with a file or an error. None to open a WebSocket.
@@ -703,10 +704,10 @@ class PageServer:
         return None
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        """Serves one page until its connection ends.
+        """Exchanges messages with one web page until its connection ends.
 
-        A page of a user takes part at once. A page of an experimenter does so if no other page
-        of an experimenter takes part.
+        The page of a user may move its arm at once. The page of an experimenter controls the
+        session if no other page of an experimenter does.
         """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
@@ -743,7 +744,7 @@ class PageServer:
             self._pages.discard(page)
 
     def _close_page_for(self, role: Role) -> None:
-        """Closes an older page if there are too many pages of a role for a new one.
+        """Closes an older web page of a role if no more pages of this role may be open.
 
         The arms that the person at the closed page holds are released.
 
@@ -765,7 +766,7 @@ class PageServer:
         task.add_done_callback(self._closing.discard)
 
     def _receive(self, page: Page, text: str | bytes) -> None:
-        """Decodes and handles a message of a page, unless the page sends too many.
+        """Decodes and handles a message of a web page, unless the page sends too many.
 
         A message that releases an arm is always handled, because holding the arm could be
         dangerous.
@@ -816,7 +817,9 @@ class PageServer:
             self._control_session(page, message)
 
     def _note_drawn_frame(self, page: Page, frame_number: int) -> None:
-        """Notes that a page has drawn a frame, so that further frames can be sent to it.
+        """Notes that a web page has drawn a state of the arms, and can receive newer ones.
+
+        A slow browser is thereby not flooded.
 
         Args:
             page: The page.
@@ -912,10 +915,10 @@ class PageServer:
         self.refused["was not asked"] += 1
 
     def _settle_requests(self) -> None:
-        """Decides on requests to take part that nobody has answered in time.
+        """Decides on requests for the control of a session that nobody has answered in time.
 
-        The page may take part if the asked pages have gone, or if the time is over and they no
-        longer hold an arm.
+        A page receives the control if the asked pages have gone, or if the time is over and
+        they no longer hold an arm.
         """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
@@ -930,9 +933,10 @@ class PageServer:
                 page.asks = None
 
     def _list_held_sites(self, page: Page) -> list[str]:
-        """Lists the sites whose arms a page holds, according to the newest frame.
+        """Lists the arms that the person at a web page holds, by the names of their sites.
 
-        Only the sites' records say who holds an arm. Before the first frame the list is empty.
+        Only the records of sites (arm controllers) say who holds an arm. Before the first
+        record the list is empty.
         """
         sites = (self._frame or {}).get("sites", {})
         held_sites: list[str] = []
@@ -1025,7 +1029,9 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
-        """Returns the present step of the experiment for a page. Empty without an experiment.
+        """Returns what a web page shows of the present step of an experiment.
+
+        The result is empty without an experiment.
 
         Args:
             page: The page.
@@ -1090,7 +1096,7 @@ class PageServer:
         return numbers
 
     def _list_notices(self, page: Page) -> list[dict[str, Any]]:
-        """Lists the replies of sites that a page has not received yet.
+        """Lists the replies of sites (arm controllers) that a web page has not received yet.
 
         The replies name keys and commands, which only an experimenter can use. Pages of other
         roles receive only which sites refused to stop.

@@ -68,7 +68,7 @@ def _round(values: Array, digits: int = 5) -> list[Any]:
 
 
 class _ArmFrames:
-    """Composes the parts of a page's messages that describe one arm: shape, pose and forces.
+    """Composes the parts of messages to a web page that describe one arm: shape, pose, forces.
 
     Args:
         scenario: Scenario of the session.
@@ -88,7 +88,7 @@ class _ArmFrames:
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
-        """Describes what does not change during the session, so that a page can draw the arm.
+        """Describes the constant properties of an arm, so that a web page can draw it.
 
         Returns:
             Role, colour, joints, walls, limits and further constants of the arm, as plain
@@ -137,10 +137,9 @@ class _ArmFrames:
         }
 
     def _describe_hand(self) -> Json | None:
-        """Describes how people can hold the arm: by force or position, and in which limits.
+        """Describes how people can hold the arm: by force or position, and within which limits.
 
-        None if the scenario has no operator of the kind "live" at this site, so that nobody can
-        hold the arm.
+        None if the scenario (the settings of the session) does not let people hold this arm.
         """
         hand = self._hand
         if hand is None:
@@ -183,7 +182,7 @@ class _ArmFrames:
         }
 
     def describe_start(self) -> Json:
-        """Computes where the joints of the arm are before the first tick of the session.
+        """Computes where the joints of the arm are before the first control period.
 
         Returns:
             The pose as `describe_pose` returns it, with the tick -1 and no bodies.
@@ -441,7 +440,7 @@ class SessionFrames:
         }
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
-        """Describes a session that has not begun: its present and its missing members.
+        """Describes for a web page which processes a session that has not begun waits for.
 
         Args:
             scenario: Scenario of the session. None until a member has sent it.
@@ -522,10 +521,10 @@ class SessionFrames:
         self.points.add(point)
 
     def _add_energies(self) -> None:
-        """Adds the new values of the energies V and supplied to the energy plot.
+        """Adds new values of the stored and the supplied energy to the plot on the web page.
 
-        There is a value for each complete tick. At most one per `ENERGY_PERIOD_S` becomes a
-        point.
+        There is a value for each complete control period. At most one per `ENERGY_PERIOD_S`
+        becomes a point.
         """
         new_energies = self._view.advance_energy()
         if new_energies is None:
@@ -817,7 +816,7 @@ def _count_samples(receiving: SiteView, peer: str) -> Json:
 
 
 def _describe_alarm(alarm: LifeAlarm) -> Json:
-    """Returns an alarm for a page.
+    """Returns an alarm, for example about a stopped arm, in the form that a web page shows.
 
     The page has a button for the command that ends the alarm. Therefore the advice does not
     name a shell command.
@@ -832,7 +831,7 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
 
 
 def render_event(event: Event) -> Json:
-    """Formats an event of the session for the list of events on a page.
+    """Formats an event of the session, such as a lost connection, for the list on a page.
 
     Args:
         event: The event.

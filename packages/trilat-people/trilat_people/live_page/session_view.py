@@ -77,9 +77,10 @@ class Tail(Generic[T]):
         self.count = 0
 
     def add(self, entry: T) -> None:
-        """Adds an entry. If the list is full, its oldest entry is dropped.
+        """Adds an entry to the end of a list of limited length.
 
-        A reader that was too slow then misses the dropped entry.
+        If the list is full, its oldest entry is dropped. A reader that was too slow then misses
+        this entry.
 
         Args:
             entry: The entry, for example a point of a plot.
@@ -291,10 +292,10 @@ class SessionView:
 
     @property
     def ended(self) -> bool:
-        """True once there is nothing more to observe.
+        """True once there is nothing more to observe of the session.
 
-        This is the case if every site has published its end or has left the network, or if
-        `finish` was called. A session that has not begun has not ended.
+        This is the case if every site (arm controller) has published its end or has left the
+        network, or if `finish` was called. A session that has not begun has not ended.
         """
         if not self.running:
             return False
@@ -316,7 +317,7 @@ class SessionView:
         return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
     def finish(self) -> None:
-        """Marks the session as ended, also if the end of a site was not received.
+        """Marks the session as ended, even if the message about the end of a site was lost.
 
         The process that runs the session calls this when the processes of all sites have ended.
         """
@@ -344,10 +345,10 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """Time for which no running site has been heard, in s. It is 0 while any site is heard.
+        """Time for which no running site (arm controller) has been heard, in s.
 
         Displays then say that they wait, because either the session or their own connection is
-        gone.
+        gone. It is 0 while any site is heard.
         """
         silences_s: list[float] = []
         for site in self.sites.values():
@@ -454,9 +455,10 @@ class SessionView:
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
-        """Receives the replies of members, and observes the sites once all of them run.
+        """Receives the replies of a session's processes, and observes its sites once they run.
 
-        The scenario comes with the first reply. An invalid scenario is counted as dropped.
+        A site is the controller of one arm. The scenario (settings of the session) comes with
+        the first reply. An invalid scenario is counted as dropped.
         """
         for info in self._query.poll():
             self.members[info.member] = info
@@ -569,9 +571,9 @@ class SessionView:
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
-        """Gives up the records before the first message, if the observer has joined late.
+        """Gives up requesting records that a site sent before a late observer joined.
 
-        All events of the site are still requested.
+        All events of the site (arm controller) are still requested.
 
         Args:
             site: The site.

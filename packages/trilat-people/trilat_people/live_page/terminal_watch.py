@@ -165,7 +165,7 @@ class SessionWatch:
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
-        """Sites that need attention because they hold, are stopped or have a fault.
+        """Arm controllers (sites) that need attention: they hold, are stopped or have a fault.
 
         Each entry contains the name of the site and its alarm. Empty if there are none.
         """
