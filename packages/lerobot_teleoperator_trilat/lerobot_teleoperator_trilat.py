@@ -254,9 +254,10 @@ class TrilatTeleoperator(Teleoperator):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode of the live hand that a scenario allows at a site.
+    """Returns whether a program may move a site's arm by "force" or by "position".
 
-    A live hand is an operator whose commands come from another program.
+    The scenario (settings of the session) decides this in its entry for a live operator (hand),
+    whose commands come from another program.
 
     Args:
         scenario: The scenario of the session.

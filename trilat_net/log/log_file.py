@@ -368,7 +368,7 @@ class LogFile:
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes the data of an incomplete flush, so that the file ends at the previous flush.
+        """Removes partly written data, so that the file ends where a complete flush ended.
 
         A log that ends with half a chunk could only be read after a recovery.
         """

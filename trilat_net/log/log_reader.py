@@ -946,7 +946,7 @@ class Log(Result, Mapping[str, SiteLog]):
         )
 
     def tables(self) -> Iterator[Table]:
-        """Yields every table of the log, for example to export all of them.
+        """Yields every table of the log, such as the joint angles of one arm, for exports.
 
         The tables of each site come first, then the table of the events. Only one of them is in
         memory at a time.

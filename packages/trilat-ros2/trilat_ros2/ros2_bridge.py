@@ -294,8 +294,8 @@ class DominanceTopic:
     def send_request(self) -> None:
         """Asks the site to use the newest weights with which its arm follows the other arms.
 
-        The method waits for the reply of the site. If no new weights have arrived since the
-        last call, it does nothing.
+        The method waits for the reply of the site (arm controller). If no new weights have
+        arrived since the last call, it does nothing.
 
         Raises:
             TrilatError: The site refuses the weights.

@@ -242,12 +242,9 @@ def _format_cell(value: Any) -> str:
 
 
 def _describe_run(run: Mapping[str, Any]) -> str:
-    """Returns a sentence on a simulated run that checks the edge of stability or the gains.
+    """Returns a sentence on a simulation that confirms the limit of stability or the gains.
 
     Example: "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
-
-    Args:
-        run: The run, as in `ArmGains.runs`.
     """
     share = run["share"]
     gains = "these gains" if share is None else f"{share:g} of the edge"
@@ -935,10 +932,10 @@ def tune_arm(
 def _tabulate_joints(
     scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
 ) -> list[dict[str, Any]]:
-    """Returns the rows of `ArmGains.joints`: inertia and gains of each joint, with units.
+    """Returns the inertia and the control gains of each joint of an arm, with units.
 
     A row also has the position error at which the spring reaches the torque limit of the joint.
-    It is None for a joint without a limit.
+    It is None for a joint without a limit. See `ArmGains.joints`.
 
     Args:
         scenario: Scenario with the arm.

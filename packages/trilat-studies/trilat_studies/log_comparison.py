@@ -63,7 +63,7 @@ _SUBJECTS = {
 
 
 class _ComparisonRow(NamedTuple):
-    """One quantity in several runs, as a row of a table.
+    """One measured quantity, such as a mean error, in several runs, as a row of a table.
 
     Attributes:
         quantity: The quantity.
@@ -80,7 +80,7 @@ class _ComparisonRow(NamedTuple):
 
 
 class _MetricComparison(NamedTuple):
-    """Metrics of several runs, side by side, as a table.
+    """Measured quantities of several runs side by side, as a table.
 
     Attributes:
         columns: Names of the runs.
@@ -129,7 +129,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricCo
 def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
     """Returns a comparison of runs as plain values, ready for JSON.
 
-    A missing number is None, and the reason is given next to it.
+    A missing number is None, with the reason next to it.
 
     Args:
         comparison: The comparison.
@@ -254,10 +254,10 @@ class LogComparison(Result):
             yield "the same experiment"
 
     def _describe_undelayed_errors(self) -> str:
-        """Returns a phrase with the largest distance from where the peers are, for each run.
+        """Returns a phrase with each arm's largest distance from where its peers really were.
 
-        The ordinary errors compare a site with what it has received of its peers, so that a
-        longer delay hardly shows in them.
+        The ordinary errors compare an arm with what it has received of its peers (the other
+        arms), so that a longer delay hardly shows in them.
         """
         texts = []
         for row in self.metrics.rows:
@@ -274,7 +274,7 @@ class LogComparison(Result):
         )
 
     def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
-        """Returns a sentence with the judgement of each run and the metric that differs most.
+        """Returns a sentence with the judgement of each run and the quantity that differs most.
 
         Args:
             rows: The metrics that differ most.

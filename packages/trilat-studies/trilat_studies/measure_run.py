@@ -206,7 +206,7 @@ def run_in_batches(
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        """Passes the collected records of a site to its receiver as arrays, and clears them.
+        """Passes the collected records of an arm on as arrays, and begins a new collection.
 
         Statistics over arrays are much faster than record by record. Nothing happens if no
         records were collected.
@@ -277,7 +277,7 @@ def run_compiled_in_batches(
 
 
 class _CompiledRun:
-    """Run in the compiled loop whose records are passed on batch by batch.
+    """A simulation by compiled code that passes the results on in batches of records.
 
     Args:
         scenario: Scenario to run.
@@ -313,9 +313,9 @@ class _CompiledRun:
         return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
 
     def pass_records(self) -> None:
-        """Passes the records since the last call to the receiver of each site.
+        """Passes the records since the last call on to the function that evaluates an arm.
 
-        The batches do not contain which samples of the peers were in use.
+        They do not state which states (samples) of other arms were in use.
         """
         no_columns = slice(0, 0)  # for vectors that the site does not have
         records_of_sites = self.run.pop_records()
@@ -350,7 +350,7 @@ class WholeRun(NamedTuple):
 
 
 def run_whole(scenario: Scenario) -> WholeRun:
-    """Runs a scenario in the compiled loop, and keeps all records in memory.
+    """Simulates a scenario by compiled code, and keeps all records in memory.
 
     Measures of the whole run, such as an impedance, need all records at once.
 
@@ -479,7 +479,7 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the statistics of an interval of time with the next records of the arm.
+        """Updates the statistics of an interval of time by the next records of an arm.
 
         Records outside of the interval are ignored.
 
@@ -520,7 +520,7 @@ class WindowStats:
         self._peaks[key] = max(previous, largest)
 
     def _add_wall_force(self, force: Array) -> None:
-        """Updates the statistics of the force that the walls of the site exert on its arm.
+        """Updates the statistics of the force that walls exert on an arm, within the interval.
 
         A hit is a record with contact that follows a record without contact.
 
@@ -642,7 +642,7 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the largest errors, torques, sample ages and all other statistics of the arm.
+        """Updates the errors, torques, sample ages and other statistics by further records.
 
         Args:
             rows: The next records of the arm. They must follow the records of the previous
@@ -744,6 +744,8 @@ class SiteStats:
     def end(self, end_ns: int) -> RecordBatch:
         """Returns the records of the last second of the run, for the metrics `end_...`.
 
+        A metric such as the error at rest is evaluated there.
+
         Args:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
                 than others, fewer records are returned.
@@ -754,7 +756,7 @@ class SiteStats:
 
     @property
     def buckets(self) -> Array:
-        """Summary of the arm's motion, from which the end of the run is judged.
+        """Summary of the motion of an arm, by which the end of the run is judged.
 
         A row has the extreme values of a short interval of time, see `RecordBatch.reduce`.
         """
@@ -763,10 +765,10 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """Torque of operator and environment in the last record, in N m, shape (n,).
+        """External torque of operator and environment in the last record, in N m, shape (n,).
 
-        By it, the judgement of the end tells whether an operator still acts on the arm. Before
-        the first record it is a single zero.
+        It shows whether an operator still acts on the arm when the run ends. Before the first
+        record it is a single zero.
         """
         if not self._tail:
             return np.zeros(1)
@@ -1227,7 +1229,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Compares the pose of each site in its last record with the expected pose.
+    """Compares the final pose of each arm with the pose that the scenario expects.
 
     Yields:
         An outcome for each site with an expected pose. The joint with the largest error counts.

@@ -366,7 +366,7 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the table rows in which a measure of the experiment can be found.
+        """Returns the rows of the result table that contains a given measure.
 
         Depending on the measure, a row is a trial, a participant or pair, or a completed
         questionnaire.

@@ -454,7 +454,7 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text about the progress, with a table of the conditions.
+        """Yields the text about the progress of the experiment, with a table of the conditions.
 
         The table states the median completion time of each condition, in which a trial that was
         not completed counts as longer than any other.

@@ -57,7 +57,7 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
 
 
 def _read_same_shape(**values: ArrayLike) -> list[Array]:
-    """Returns several arrays of samples as floats, after checking that their shapes agree.
+    """Converts several recorded series to arrays of floats, and checks their equal length.
 
     Args:
         **values: Arrays of K samples with D axes, shape (K, D), by the name for messages.
@@ -76,7 +76,7 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
 
 
 def _integrate(values: Array, rate_hz: float) -> float:
-    """Returns the integral over time of K samples, shape (K,), by the trapezoidal rule.
+    """Returns the integral over time of K equally spaced values, by the trapezoidal rule.
 
     Args:
         values: The samples, at a constant rate.

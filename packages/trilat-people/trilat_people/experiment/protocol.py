@@ -797,9 +797,10 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
 def limit_forces(
     scenario: Scenario, protocol: Protocol, group: Sequence[str]
 ) -> dict[str, Any]:
-    """Returns sites with lower force limits, for participants who must not push hard.
+    """Lowers the force limits of the arms of participants who must not push hard.
 
-    The protocol states these participants and their limits under `force_limit_n`.
+    The protocol states these participants and their limits under `force_limit_n`. The result
+    has the changed settings of their sites (arm controllers).
 
     Args:
         scenario: Scenario of the condition.

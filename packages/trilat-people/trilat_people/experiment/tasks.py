@@ -741,7 +741,9 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Computes the position of an end effector from the state that its site sends, in m.
+    """Computes the position of the slave's end effector from a state of its arm, in m.
+
+    The state is the one that the site (arm controller) sends to other sites.
 
     Args:
         arm: Arm of the site.

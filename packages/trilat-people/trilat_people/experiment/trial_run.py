@@ -334,9 +334,10 @@ class ExperimentTrial:
         )
 
     def _judge_log(self, log: Log) -> Outcome | None:
-        """Judges a recorded trial, record by record, as a live trial is judged.
+        """Decides from the recorded log of a trial when it succeeded or failed.
 
-        A run that diverged, because an arm exceeded its limits, has failed at that time.
+        It is judged record by record, as a trial in progress is judged. A trial in which an arm
+        left its limits has failed at that time.
 
         Returns:
             The outcome. None if the log ends before the trial does.
@@ -525,10 +526,9 @@ class SyntheticTrial(ExperimentTrial):
     people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        """Returns the synthetic participants of the trial, by the sites whose arms they move.
+        """Creates models of the participants of a trial, by the sites whose arms they move.
 
-        Each call returns participants at the start of the trial, because a player keeps a
-        state.
+        Each call creates them anew, because a model keeps a state during a trial.
 
         Args:
             scenario: Scenario of the trial.

@@ -75,9 +75,9 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """Message of a page that it has drawn the last frame, so that the next one can be sent.
+    """Message of a web page that it has drawn a state, so that the next one can be sent.
 
-    A frame is a message of the server that describes the present state of the session.
+    The server describes the present state of the session in messages called frames.
 
     Attributes:
         n: Number of the frame that was drawn.
@@ -266,7 +266,7 @@ class _TokenBucket:
 
 
 class MessageLimits:
-    """Limits how many messages a page may send, for each kind of message and for all together.
+    """Limits how many messages a web page may send, per kind of message and in total.
 
     A page that sends more messages than a person can cause is faulty or hostile. The messages
     in excess are dropped.
@@ -529,7 +529,7 @@ class PageHands:
             self.move(message, pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
-        """Finds out whether this page is the one that holds the arm of a site.
+        """Returns True if the user of this web page holds the arm of a site.
 
         Args:
             site: Name of the site.
@@ -625,7 +625,7 @@ class OrderDesk:
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Requests sites to stop their arms at once, ahead of all waiting requests.
+        """Requests arm controllers (sites) to stop at once, ahead of all waiting requests.
 
         Waiting requests that would release the same arms are withdrawn.
 
@@ -732,10 +732,11 @@ class OrderDesk:
     def _handle_reply(
         self, site: str, channel: str, request: ChangeRequest, payload: bytes
     ) -> None:
-        """Stores the reply of a site for the pages, or repeats a refused stop in an older form.
+        """Stores the reply of a site to a request, so that web pages can show it.
 
-        A site of an older program does not know the field `source` and refuses the whole
-        request, but its arm must stop too. A reply that cannot be decoded is counted.
+        A refused stop is repeated in an older form: a site of an older program does not know
+        the field `source` and refuses the whole request, but its arm must stop too. A reply
+        that cannot be decoded is counted.
         """
         try:
             reply = decode(payload, ChangeReply)

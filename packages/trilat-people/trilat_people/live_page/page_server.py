@@ -503,9 +503,9 @@ class PageServer:
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, part: str, error: Exception) -> None:
-        """Counts a failure of the page, and prints the first failure of each kind.
+        """Counts an error of the web server, and prints the first error of each kind.
 
-        The page is no part of the session, so the server continues after any error.
+        The server takes no part in the control of the arms, and continues after any error.
 
         Args:
             part: Part of the page that failed, for example "frame".
@@ -946,7 +946,7 @@ class PageServer:
         return held_sites
 
     async def _send(self, page: Page) -> None:
-        """Sends a page the newest frame, each time the page has drawn an earlier frame.
+        """Sends a web page the newest state, each time the page has drawn an earlier one.
 
         The first message is a greeting with the constants of the session. A page for a site
         that the session does not have is closed. The coroutine ends with the connection.
@@ -1114,10 +1114,10 @@ class PageServer:
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns the frame for the user of an arm, who sees the other arms delayed.
+        """Returns what the user of one arm may see, in which the other arms appear delayed.
 
         It has no plots and no events, which would reveal the present state. All pages of the
-        arm get the same frame.
+        arm get the same message (frame).
 
         Args:
             site: Name of the site that controls the arm.
@@ -1131,9 +1131,9 @@ class PageServer:
         return {**self._frames_as_site[site], **hidden_fields}
 
     def _describe_all(self, page: Page) -> dict[str, Any]:
-        """Returns the frame for a page that sees everything, with new points and events.
+        """Returns the state for a web page that sees everything, with new points and events.
 
-        The page remembers how many points and events were sent to it. Its first frame has all
+        The page remembers how many points and events were sent to it. The first message has all
         that are kept.
 
         Args:

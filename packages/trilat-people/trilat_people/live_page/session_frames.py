@@ -270,7 +270,7 @@ class _ArmFrames:
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
-        """Describes who holds the arm in the last record, with which strength, and its target.
+        """Describes who holds the arm at present, how firmly, and where the arm shall go.
 
         Empty if nobody can hold the arm.
 
@@ -322,9 +322,9 @@ class _ArmFrames:
         return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
     def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force of the control law that a user feels in the last record, in N.
+        """Returns the force of the remote arms that a user feels at the present, in N.
 
-        The force follows from the law's torque without gravity compensation.
+        It follows from the torque of the control law without gravity compensation.
 
         Returns:
             The components of the force. Empty if the masses of the arm are not known.
@@ -457,9 +457,10 @@ class SessionFrames:
         }
 
     def make_frame(self) -> Json | None:
-        """Composes the frame of this moment from the records since the previous frame.
+        """Composes the present state of all arms for web pages, as one message (frame).
 
-        The new points are also added to the plots `points` and `energies`.
+        It covers all records since the previous frame. New points are also added to the plots
+        `points` and `energies`.
 
         Returns:
             The present state of all arms and links, as plain values for JSON. None until every
@@ -600,10 +601,10 @@ class SessionFrames:
         }
 
     def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
-        """Returns the age of a site's record at a time, in ms.
+        """Returns how old the shown pose of an arm is at a given time, in ms.
 
-        The users of an experiment or a demonstration see there how old the pose of a remote arm
-        is.
+        The users of an experiment or a demonstration see there how late a remote arm appears to
+        them.
 
         Args:
             site: Name of the site.
@@ -654,7 +655,7 @@ class SessionFrames:
         return pose
 
     def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
-        """Describes the present state of one site and its arm, as a part of a frame.
+        """Describes the present state of one arm and its controller (site) for web pages.
 
         Args:
             name: Name of the site.
@@ -719,7 +720,7 @@ class SessionFrames:
     def _describe_new_records(
         self, name: str, site: SiteView
     ) -> tuple[Json, list[float], bool]:
-        """Describes the newest state of an arm, with the extremes since the previous frame.
+        """Describes the newest state of an arm, with the extremes since the last description.
 
         Without new records, the newest record is evaluated again.
 
@@ -791,10 +792,10 @@ class SessionFrames:
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns how many samples of a peer have arrived, and with which delay.
+    """Returns how many messages of a peer have arrived at a site, and with which delay.
 
-    A sample is the state that a peer, another site, publishes in a control period. The
-    receiving site counts them in its statistics.
+    A message (sample) is the state that a peer, another site, publishes in a control period.
+    The receiving site counts them in its statistics.
 
     Args:
         receiving: View of the receiving site.

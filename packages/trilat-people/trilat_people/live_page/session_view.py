@@ -307,8 +307,9 @@ class SessionView:
     def has_left(self) -> bool:
         """True if every site has disappeared from the network for longer than `AWAY_NS`.
 
-        The time counts from the last sign of a site: the end of its liveliness token, or its
-        last message. A short loss of the connection therefore does not end the observation.
+        The time counts from the last sign of a site (arm controller): its last message, or the
+        notice that it is gone. A short loss of the connection therefore does not end the
+        observation.
         """
         if self._left_ns is None:
             return False
@@ -324,10 +325,10 @@ class SessionView:
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
-        """Computes for how long no message of a running site has arrived.
+        """Returns for how long no message of a running site has arrived, in s.
 
-        A silence shorter than `MIN_SILENCE_NS` counts as 0, because it is normal. A site that
-        has ended is not silent.
+        A site is the controller of one arm. A silence shorter than `MIN_SILENCE_NS` counts as
+        0, because it is normal. A site that has ended is not silent.
 
         Args:
             site: The site.
@@ -615,7 +616,7 @@ class SessionView:
             self._store_event(name, site, content)
 
     def _store_record(self, name: str, site: SiteView, record: State) -> None:
-        """Stores a record in the window of its site, and applies the changes that it states.
+        """Stores a received record of an arm, and notes the changes of settings that it states.
 
         Records that were sent again may come late. Only a newer one becomes the site's
         `record`.

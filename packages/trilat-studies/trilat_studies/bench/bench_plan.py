@@ -407,7 +407,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Identifier of these gains in the file of all tuned gains.
+        """Identifier of these control gains in the file of all tuned gains.
 
         It consists of the kind of scenario (`form`), the name of the control law, and the round
         trip of the links in ms.
@@ -720,9 +720,9 @@ class BenchCell(NamedTuple):
 
     @property
     def inputs(self) -> str:
-        """Digest of everything that determines these runs: base scenario, task, link and gains.
+        """Hash of everything that determines these simulations: scenario, task, link and gains.
 
-        Stored runs with another digest are out of date and are not used.
+        Stored results with another hash are out of date and are not used.
         """
         parts = (
             _load_base_text(self.form),
@@ -734,9 +734,9 @@ class BenchCell(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name of this law, task and link in the journal of finished runs.
+        """Name under which the journal of finished runs stores this law, task and link.
 
-        The name contains the digest `inputs` of the scenario and the gains. Therefore runs with
+        The name contains the hash `inputs` of the scenario and the gains. Therefore runs with
         other gains are not mistaken for these runs.
         """
         return f"{self.name} {self.inputs}"
@@ -794,7 +794,7 @@ class BenchPlan(NamedTuple):
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns the part of the plan for one law in one task over one link, by its name.
+        """Returns one combination of law, task and link, by its name "contact/wave/rtt272".
 
         Args:
             name: Name of the cell, as in "contact/wave/rtt272": task, law and link.
@@ -879,7 +879,7 @@ def plan_bench(
 
 
 def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[str]) -> str:
-    """Returns the error text for a selection of which no cell can run.
+    """Returns the error text if the user has selected laws that run in no selected task.
 
     Args:
         tasks: Names of the selected tasks.

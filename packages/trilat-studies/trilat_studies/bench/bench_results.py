@@ -214,7 +214,7 @@ class BenchCellResult(NamedTuple):
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Counts the runs of the cell with a given judgement of their stability.
+        """Counts the simulations with a given judgement, for example "not stable".
 
         Args:
             stability: The judgement to count, for example `Stability.NOT_STABLE`.
@@ -295,10 +295,10 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """The results of the benchmark or of a part of it, to be printed, written and searched.
+    """Results of the benchmark or of a part of it, to be printed, written and searched.
 
-    The benchmark runs control laws in several tasks over several links. `places` has one result
-    per cell: a law in a task over a link.
+    The benchmark simulates control laws in several tasks over several network links. `places`
+    has one result per combination of law, task and link.
 
     Attributes:
         plan: Plan of the suite.
@@ -539,7 +539,7 @@ def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
 
 
 def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
-    """Returns the entries of a law's row in the table of properties, without its name.
+    """Returns the properties of a control law in a task, as entries of a row of a table.
 
     Args:
         law_results: The results of the law in the task, one per link.
@@ -674,9 +674,9 @@ def _tabulate_round_trips(results: BenchResults) -> TextTable:
 
 
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
-    """Returns the mean error of a law in a task over a link, in rad.
+    """Returns the mean position error of a law in a task over a link, in rad.
 
-    None if the law did not run there, or if a run diverged or missed its wall.
+    None if the law did not run there, or if an arm left its limits or missed its wall.
     """
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
@@ -819,7 +819,7 @@ _CELL_COLUMNS = ("task", "law", "link", "form")
 
 
 def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
-    """Returns the columns that identify a cell: task, law, link and form.
+    """Returns the columns that identify a result in a table: task, law, link and form.
 
     The form is the kind of scenario: how many arms, and whether gravity acts on them.
     """
@@ -827,9 +827,10 @@ def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
 
 
 def _build_row(result: BenchCellResult) -> dict[str, Any]:
-    """Returns the row of a cell in JSON and CSV: judgements, and means with intervals.
+    """Returns the results of one law in one task over one link, as a row of a table.
 
-    Unknown numbers are None, for example the force of the wall in a task without a wall.
+    It has judgements, and means with intervals, for JSON and CSV. Unknown numbers are None, for
+    example the force of the wall in a task without a wall.
 
     Args:
         result: Results of the cell.

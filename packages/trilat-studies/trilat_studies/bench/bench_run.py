@@ -695,7 +695,9 @@ def _estimate_impedance(
 def _run_window(
     item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
 ) -> _TipMotion | None:
-    """Executes a run with other settings, and returns the user's motion within a window.
+    """Repeats a simulation with other settings, and returns how the user's hand moved.
+
+    Only a given interval of time is returned. None if an arm left its limits.
 
     Args:
         item: The run.
