@@ -126,8 +126,8 @@ class Judgement(NamedTuple):
 class EpisodeTask(Protocol):
     """Interface of the task of an episode: it draws a goal and computes the rewards.
 
-    A user can implement it. The environment calls `begin` at the start of each episode, and
-    `judge` after each step.
+    A user can write a class of this form for a reinforcement-learning environment, which calls
+    `begin` at the start of each episode, and `judge` after each step.
     """
 
     goal: Array
@@ -474,7 +474,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             load_scenario(self._base, {key: values[end] for key, values in self._vary.items()})
 
     def build_hand_site(self, scenario: Scenario) -> HandSite:
-        """Returns the site and the settings of the operator that applies the actions.
+        """Returns the arm that the agent moves, with the limits of its force or position.
 
         Args:
             scenario: The experiment of one episode, in which the user's site has such an
@@ -585,9 +585,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
-        """Returns True if the end effector of a site can reach a position.
+        """Returns True if the end effector of an arm can reach a position.
 
-        Tasks that draw random goals use it.
+        Tasks that draw random goals use it, so that every goal can be reached.
 
         Args:
             q: Joint angles of each site, from which the search for a pose starts, in rad.
@@ -622,10 +622,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Collects what the user can observe of a state, as arrays by name.
+        """Collects what an agent can observe of a state, as arrays by name.
 
         Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer (other
-        site).
+        arm).
         """
         view = scene.view
         peers = view.peers

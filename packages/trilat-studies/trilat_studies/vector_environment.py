@@ -403,7 +403,9 @@ class _LaneEnvs:
         self._goals: Array = np.zeros((count, *np.shape(env.task.goal)))
 
     def load(self, is_stepped: Flags) -> None:
-        """Puts new episodes, begun since the last step, into the lanes of their environments.
+        """Starts new episodes in place of those that have ended since the last step.
+
+        Episodes are simulated side by side, each in the place (lane) of its environment.
 
         Args:
             is_stepped: True for environments of the vector environment that are to be stepped.
@@ -531,7 +533,7 @@ class _LaneEnvs:
             self._write_lane(lane, ends=True)
 
     def _advance(self, is_active: Flags) -> None:
-        """Simulates the control periods (ticks) of one step in all active lanes.
+        """Simulates one step of all active episodes, which consists of many control periods.
 
         The operator applies an action only after its delay, which may begin within a step. The
         step is then simulated in two parts.
@@ -572,7 +574,9 @@ class _LaneEnvs:
         return q if self._is_joint else self.place_end_effectors(self._user, q)
 
     def place_end_effectors(self, i: int, q: Array) -> Array:
-        """Returns the position of a site's end effector in each lane, shape (lanes, 2), in m.
+        """Returns the end effector's position of one arm in all episodes, in m.
+
+        The shape is (lanes, 2), with one lane for each episode that is simulated side by side.
 
         Args:
             i: Index of the site.
@@ -685,7 +689,7 @@ class _LaneEnvs:
 
 
 class _State:
-    """State of all jointly simulated episodes after a step, from which results are computed.
+    """State of all jointly simulated episodes after a step, to compute observations from.
 
     Args:
         envs: The environments.
@@ -827,7 +831,7 @@ class _ReachTasks:
         self._last_s = np.zeros(count)
 
     def load(self, lane: int, task: ReachTask, site: int) -> None:
-        """Copies the state of one task, such as its goal, into the arrays of all tasks.
+        """Copies the goal and further state of one task into the arrays of all tasks.
 
         Args:
             lane: Lane of the episode.
@@ -847,7 +851,9 @@ class _ReachTasks:
         task.last_s = float(self._last_s[lane])
 
     def judge(self, state: _State, is_judged: Flags) -> tuple[Array, Flags]:
-        """Computes the rewards of a step, and which tasks are done, as `ReachTask.judge` does.
+        """Computes the rewards of a step in all episodes, and which tasks are done.
+
+        The results are those of `ReachTask.judge`.
 
         Args:
             state: State after the step.
@@ -923,7 +929,7 @@ def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
 
 
 def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Returns the information of one environment in the form that the environment itself uses.
+    """Returns the additional information about one environment from that of all of them.
 
     Args:
         infos: Information of all environments.

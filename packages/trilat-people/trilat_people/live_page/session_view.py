@@ -220,10 +220,10 @@ class SiteView:
 
     @property
     def complete(self) -> int:
-        """Number of the last tick up to which no record of the site can still arrive.
+        """Control period (tick) up to which all records of the site are there or lost for good.
 
-        A record is the result of one tick, a period of the site's control loop. Every record up
-        to this tick has arrived or is lost for good. The value is -1 before the first record.
+        A record is the result of one tick. No earlier record can still arrive. The value is -1
+        before the first record.
         """
         record_account = self.reception.accounts[topics.STATE]
         gap = record_account.find_requestable_gap()

@@ -695,7 +695,7 @@ def _estimate_impedance(
 def _run_window(
     item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
 ) -> _TipMotion | None:
-    """Repeats a simulation with other settings, and returns how the user's hand moved.
+    """Repeats a simulation with other settings, and returns how the user's arm moved.
 
     Only a given interval of time is returned. None if an arm left its limits.
 

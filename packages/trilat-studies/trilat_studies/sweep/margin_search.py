@@ -107,10 +107,10 @@ def search_key_margin(
     results: dict[float, bool | None] = {}
 
     def classify(value: float) -> bool | None:
-        """Returns whether the scenario is stable at a value of the searched key.
+        """Returns whether the scenario is stable at a value of the searched parameter.
 
-        Scan and bisection may come to the same value. It is run once, and the result is kept.
-        None means that the run is undecided.
+        Scan and bisection may come to the same value. It is simulated once, and the result is
+        kept. None means that the run is undecided.
         """
         if value not in results:
             results[value] = stable(value)
@@ -379,7 +379,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
-        """Runs the scenario with a value of the searched key, as a cell of a sweep is run.
+        """Simulates the scenario with a value of the searched parameter, and judges the run.
 
         Args:
             value: Value of the searched key.
@@ -410,9 +410,9 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the edge that is nearest to a value. None if there are no edges.
+    """Returns the predicted limit of stability that is nearest to a measured one.
 
-    The table shows the edge of theory that is nearest to the measured one.
+    None if there are no predicted limits.
     """
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
@@ -600,7 +600,7 @@ class SweepMargins(Result):
 
 
 def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
-    """Returns two table cells: a measured edge, as in "40 to 41", and its stable side.
+    """Returns two table cells: a limit of stability as in "40 to 41", and its stable side.
 
     Args:
         margin: The edges of the grid point.
@@ -622,7 +622,9 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
 
 def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
-    """Returns two table cells: an edge from theory, and its difference from the measured edge.
+    """Returns two table cells: a limit of stability from theory, and its deviation.
+
+    The deviation is the difference from the measured limit.
 
     Args:
         span: The measured edge. None if there is no edge, and thus no difference.

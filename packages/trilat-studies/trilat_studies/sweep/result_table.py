@@ -60,9 +60,9 @@ def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> It
 
 
 class ResultTable:
-    """Columns of the file results.csv of a sweep, with which its rows are written and read.
+    """Columns of the file results.csv of a parameter sweep, to write and read its rows.
 
-    The columns depend on the sweep: each swept key has one.
+    Each swept parameter has a column, so that the columns depend on the sweep.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -231,7 +231,7 @@ class StoredRows(Sequence[ResultRow]):
 
 
 def read_rows(file: Path, plan: SweepPlan) -> Sequence[ResultRow]:
-    """Reads the table of results of a sweep. The rows of a large table stay in the file.
+    """Reads the results of a parameter sweep. The rows of a large table stay in the file.
 
     Args:
         file: The CSV table.

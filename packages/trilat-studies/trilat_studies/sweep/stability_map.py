@@ -90,7 +90,7 @@ class PlaneAxis(NamedTuple):
 
     @property
     def positions(self) -> Array:
-        """Positions at which the values are drawn along the axis, shape (K,) for K values.
+        """Positions at which the K swept values are drawn along an axis of a map, shape (K,).
 
         Equally spaced values are drawn at their own positions. Other values, as in 1, 10, 100,
         are drawn at equal distances, at their indices.
@@ -153,9 +153,9 @@ class MapPanel(NamedTuple):
 
     @property
     def share(self) -> Array:
-        """Fraction of runs that are stable at each grid point of the panel.
+        """Fraction of simulations that are stable, at each grid point of a panel of the map.
 
-        Undecided runs, for example too short ones, are left out. NaN if all runs of a grid
+        Undecided simulations, for example too short ones, are left out. NaN if all of a grid
         point are undecided. The shape is (number of y values, number of x values).
         """
         stable = self.stable
@@ -166,10 +166,10 @@ class MapPanel(NamedTuple):
 
 
 class MapPlane(NamedTuple):
-    """The measured part of a stability map: panels over the same two axes.
+    """Results of the simulations in a stability map: panels over the same two parameters.
 
-    If only one swept axis has numeric values, the vertical axis y has an empty key and a single
-    value.
+    If only one swept parameter has numeric values, the vertical axis y has an empty key and a
+    single value.
 
     Attributes:
         scenario: Name of the swept scenario.
@@ -322,7 +322,9 @@ def build_plane(
 
 
 class _PanelRuns:
-    """Counts the runs of a panel by grid point and class, and averages their growth exponents.
+    """Counts the simulations of one panel of a map by grid point and by how they ended.
+
+    It also averages their growth exponents.
 
     Args:
         x: Horizontal axis.
@@ -370,7 +372,7 @@ _CLASS_INDEX = {verdict.value: index for index, verdict in enumerate(CELL_CLASSE
 
 
 def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
-    """Returns the title of a panel, such as "p d, delay 200 ms".
+    """Returns the title of a panel of the stability map, such as "p d, delay 200 ms".
 
     Numbers are given with the name and unit of their key. Other values are given alone, with
     spaces for underscores, except for the name of a law, which stays as it is.
@@ -812,7 +814,7 @@ _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imag
 
 
 def compute_borders(axis: PlaneAxis) -> Array:
-    """Returns the borders of the cells along an axis, halfway between the values.
+    """Returns the borders of a map's cells along an axis, halfway between the swept values.
 
     If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
 

@@ -154,7 +154,7 @@ class CellResult(msgspec.Struct, frozen=True):
 
 
 def build_unsimulated_result(verdict: CellClass, reasons: str) -> CellResult:
-    """Returns the result of a cell without a run.
+    """Returns the result of a parameter combination that was decided without a simulation.
 
     Args:
         verdict: Class of the cell.
@@ -201,7 +201,7 @@ def check_sweepable(scenario: Scenario) -> None:
 
 
 class _CellInProgress:
-    """A cell whose run is in progress.
+    """A simulation of a parameter sweep that is in progress, and may still be extended.
 
     Args:
         scenario: Scenario of the cell. Its `duration_s` is the first duration.
@@ -221,10 +221,10 @@ class _CellInProgress:
         self.run = FusedRun(scenario, SETTLED_ERROR_RAD)
 
     def note_first_end(self) -> None:
-        """Evaluates the run at the end of the scenario's duration.
+        """Judges the simulation at the end of the planned duration, before any extension.
 
-        Totals, such as the RMS error, are taken here, before any extension. A run that chatters
-        at a wall is not extended, see `classify_cell`.
+        Totals, such as the RMS error, are taken here. A run that chatters at a wall is not
+        extended, see `classify_cell`.
         """
         self._totals = self.run.totals._asdict()
         self._evaluate()
@@ -252,10 +252,10 @@ class _CellInProgress:
         self._evaluate()
 
     def judge(self) -> CellResult:
-        """Returns the result of the cell, with the decision of the stability certificate.
+        """Decides how the simulation ended, with the help of the stability certificate.
 
-        It is called once, after the last extension, because the decision needs the roots of the
-        loop and takes longer than an evaluation.
+        It is called once, after the last extension, because the certificate needs the roots of
+        the control loop and takes longer than an evaluation.
         """
         judged = judge_virtual_run(self._scenario, self.run)
         decision = judged.decision
@@ -309,7 +309,9 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
 
 class _JudgedCell(NamedTuple):
-    """Result of a cell that was run side by side with others, if possible.
+    """Result of a parameter combination that was simulated side by side with others.
+
+    It may have been simulated alone, if it has a property that does not permit this.
 
     Attributes:
         result: Result of the cell.
@@ -400,9 +402,10 @@ def measure_exponent(scenario: Scenario) -> float | None:
 
 
 def judge_linearly(scenario: Scenario) -> CellResult:
-    """Classifies a cell by the rightmost characteristic root of its linear loop, without a run.
+    """Decides without a simulation whether a parameter combination is stable.
 
-    The cell is undecided if the scenario has no linear loop, or if nothing moves.
+    The linearised control loop is stable if the real parts of all its characteristic roots are
+    negative. The result is undecided if the scenario has no linear loop, or if nothing moves.
 
     Args:
         scenario: Scenario of the cell.

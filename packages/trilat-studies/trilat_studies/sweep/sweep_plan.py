@@ -171,7 +171,7 @@ def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
 
 
 def _join_values(values: Any) -> str:
-    """Returns the values of an axis as the text that follows "KEY=".
+    """Returns the values of a swept parameter as the text after "KEY=" in a command.
 
     Args:
         values: Finished text, a list, an array or a single value. A string that is a word, such
@@ -243,7 +243,7 @@ def _parse_decimal(key: str, text: str) -> Decimal:
 
 
 def _parse_list(key: str, text: str) -> tuple[str, ...]:
-    """Returns the values of a list "v1,v2,v3" as texts.
+    """Splits the values of a swept parameter, written as "v1,v2,v3", into separate texts.
 
     Args:
         key: Scenario key of the axis, for error messages.
@@ -430,7 +430,7 @@ class SweepPlan(NamedTuple):
         return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Loads the scenario of the sweep, with further overrides such as those of one cell.
+        """Loads the scenario of the sweep with further settings, such as one delay of many.
 
         Args:
             more: Further overrides KEY=VALUE.
@@ -735,7 +735,7 @@ def _check_law_name(law: str) -> None:
 
 
 def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> tuple[str, ...]:
-    """Returns the overrides that give a control law to every site.
+    """Returns the settings that give the same control law to every arm.
 
     Args:
         written: Scenario as its author wrote it.
@@ -767,12 +767,12 @@ def _list_law_overrides(
 
 
 def _check_axes(plan: SweepPlan, law_index: int) -> None:
-    """Checks that a sample of the cells under one law can run.
+    """Checks that the parameter combinations of a sweep can be simulated with one control law.
 
-    Checking all cells of a large grid would take too long. The sample has up to
-    `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their first
-    values, and the corners of the grid. A single combination that is not valid is allowed: the
-    sweep refuses this cell alone.
+    Checking all combinations (cells) of a large grid would take too long. The checked ones have
+    up to `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their
+    first values, and the corners of the grid. A single combination that is not valid is
+    allowed: the sweep refuses this cell alone.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -816,7 +816,7 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
 
 
 def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
-    """Returns True if a cell is a valid scenario.
+    """Returns True if a parameter combination (cell) of a sweep is a valid scenario.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

@@ -99,7 +99,7 @@ class SweepResults(Result):
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
-        """Returns the table rows of one combination of parameter values, one row per seed.
+        """Returns the results of one combination of swept parameters, a row per random seed.
 
         Args:
             number: Number of the cell.
@@ -113,7 +113,7 @@ class SweepResults(Result):
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
-        """Converts the row of a run in the table to an object with named fields.
+        """Converts the table row of a simulation to an object with named fields.
 
         Fields that are missing from the row, because an older version wrote it, have the
         default values of `CellResult`.
@@ -157,7 +157,7 @@ def iterate_cells(
 
 
 def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
-    """Yields the table rows of one cell, a combination of swept parameters: one row per run.
+    """Yields the results of one combination of swept parameters, one row per simulation.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -170,7 +170,9 @@ def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[Result
 
 
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
-    """Returns the row of a finished run: cell, results, and the command that repeats it.
+    """Returns the table row of a finished simulation, with the command that repeats it.
+
+    It has the parameter values (cell) and the results.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -332,7 +334,7 @@ class GridPoint(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the share of stable runs among the decided ones.
+        """95 % confidence interval of the probability that a decided simulation is stable.
 
         The method is Wilson's. Also if 10 runs of 10 are stable, the lower end is below 1,
         because other seeds might give another result.
@@ -368,7 +370,9 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
 
 
 def iterate_grid_points(results: SweepResults) -> Iterator[GridPoint]:
-    """Yields the summary of each grid point, as `collect_grid_points` returns them.
+    """Yields the summary of each combination of swept parameters.
+
+    `collect_grid_points` returns the same as a list.
 
     Args:
         results: Results of the sweep, in which the rows of a cell stand together.

@@ -330,7 +330,7 @@ def run_cell(task: CellItem) -> CellRun:
 
 
 def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
-    """Returns the result of a run that was refused, with the reason in place of numbers.
+    """Returns the result of a simulation that was refused, with the reason and no numbers.
 
     Args:
         task: The run.
@@ -397,7 +397,7 @@ def _build_scenario(task: CellItem) -> Scenario:
 
 
 def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
-    """Measures what the sweep needs besides the class of a cell, and returns the whole result.
+    """Measures what a sweep needs besides how a simulation ended, and returns all results.
 
     Args:
         task: The run.
@@ -440,7 +440,7 @@ site tick.
 
 
 def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Returns True if a sweep is large enough to compute several runs side by side (in lanes).
+    """Returns True if a sweep is so large that simulating several runs at once pays off.
 
     The code for these SIMD lanes must be compiled first, which takes some ten seconds.
 
@@ -639,7 +639,7 @@ class _NewRuns:
 
 
 def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -> Counter[str]:
-    """Writes the table of results, cell by cell.
+    """Writes the results of a parameter sweep into a CSV table, combination by combination.
 
     Args:
         folder: Folder of the sweep.
@@ -707,10 +707,11 @@ class _SweepWork:
         self._tally = tally
 
     def execute(self) -> None:
-        """Executes all runs, or in a refined sweep those along the stability edge.
+        """Simulates all parameter combinations, or in a refined sweep those near an edge.
 
-        A refined sweep proceeds in rounds. The runs of a round show on which side of the edge
-        their cells lie, and this determines the cells of the next round.
+        A refined sweep proceeds in rounds. The runs of a round show on which side of the
+        stability edge their combinations (cells) lie, and this determines the cells of the next
+        round.
         """
         plan = self._plan
         if not plan.refine:
@@ -823,9 +824,9 @@ class _SweepWork:
 
 
 def find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
-    """Returns on which side of the stability edge the runs of a cell lie.
+    """Returns whether a parameter combination lies on the stable side of an edge.
 
-    The side is stable, unstable or undecided, by the majority of the runs. It is not known if
+    The side is stable, unstable or undecided, by the majority of its runs. It is not known if
     every run was refused. If the sweep measures growth exponents, a run with an exponent of at
     most 0 is stable.
 

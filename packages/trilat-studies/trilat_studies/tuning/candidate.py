@@ -264,7 +264,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Word for this class in printed text, such as "stable" for a candidate that settled.
+        """Word for how a candidate of a tuning ended, in printed text, such as "stable".
 
         Where possible, it is the word that the judgement of a single run uses.
         """
@@ -820,10 +820,10 @@ class TuningScenario(NamedTuple):
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """Texts of the scenario and of its twin, which a worker process reads.
+        """Texts of the scenario, and of the same scenario without walls and some operators.
 
-        The twin is the same scenario without walls and without operators who push the arms
-        without a target pose. Its text is None if the scenario has no such parts.
+        A worker process reads them. The second one leaves out operators who push the arms
+        without a target pose. It is None if the scenario has no such parts.
         """
         twin = build_twin(self.scenario)
         twin_text = None if twin is None else twin.text
@@ -857,7 +857,7 @@ class CandidateItem(NamedTuple):
 
 
 def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Packs the runs of a control law with chosen gains for a worker process.
+    """Packs the simulations of one choice of control gains as work for another process.
 
     Args:
         seeds: The scenario with the law and its gains, once for each random seed. At least one.

@@ -340,7 +340,7 @@ _GRAVITY_ONLY = "gravity"
 
 
 def _list_search_spaces() -> Iterator[SearchSpace]:
-    """Yields the search spaces of the built-in laws that have gains to tune.
+    """Yields the gains and their ranges for each built-in control law that can be tuned.
 
     The law `known` has the gains of `adaptive` except for the adaptation gain Gamma.
     """
@@ -355,7 +355,7 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
 
 
 def _read_range(gain: str, entry: GainRange) -> _TunedGain:
-    """Returns the tuned gain that an entry of a built-in law's attribute `tune` describes.
+    """Returns a control gain to tune, with its range as a built-in law states it in `tune`.
 
     Args:
         gain: Name of the gain.
