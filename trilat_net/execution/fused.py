@@ -82,7 +82,9 @@ def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 
 
 def scale_differences(x: Array, y: Array, factor: float) -> Array:
-    """Changes the distance between the numbers of two runs by a factor: y + factor (x - y).
+    """Scales the difference between the states of two simulations: y + factor (x - y).
+
+    With a factor below 1, for example, the first one comes closer to the second one.
 
     Args:
         x: Numbers of a run.
@@ -552,12 +554,11 @@ class FusedRun:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
-        """Lets a user's plant move the arm of a site up to the next tick of the site.
+        """Lets a user's own program compute the motion of an arm in one control period.
 
-        A plant is a program that computes the motion of an arm, and a tick is a period of the
-        site's control loop. The plant moves once per tick, by the control torque of the last
-        executed tick. The new state of the arm is copied to the arrays of the run, from which
-        the next tick reads it.
+        Such a program is called a plant, and a control period a tick. The plant moves once per
+        tick, by the control torque of the last executed tick. The new state of the arm is
+        copied to the arrays of the run, from which the next tick reads it.
 
         Args:
             i: Index of the site.
@@ -811,10 +812,10 @@ class FusedRun:
                 law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the numbers of a site's state before its next tick, as NumPy arrays.
+        """Returns the state of one simulated arm and its controller (site), as NumPy arrays.
 
-        A site simulates the process that runs one arm, and a tick is a period of its control
-        loop. The arrays belong to the simulation, so the caller must not change them.
+        It is the state before the next tick, a period of the control loop. The arrays belong to
+        the simulation, so the caller must not change them.
 
         Args:
             i: Index of the site in the order of the scenario.
@@ -841,7 +842,7 @@ class FusedRun:
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
-        """Returns how far this run is from another run, in one field of the state.
+        """Returns how far the state of this simulation is from that of another, in one field.
 
         Args:
             other: The other run of the same scenario.
@@ -855,7 +856,7 @@ class FusedRun:
         return float(np.abs(difference).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the run, and returns the states at 100 times of its last quarter.
+        """Continues the simulation, and returns the states at 100 times of its last quarter.
 
         Args:
             until_s: Time at which the run ends, in s.
@@ -914,10 +915,11 @@ class FusedRun:
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest error and largest speed in every interval of 50 ms, an array for each site.
+        """Largest error and largest speed of each arm, in every interval of 50 ms.
 
-        Each array has the shape (intervals, 2). The columns are the largest synchronisation
-        error |e| of any joint in rad, and the largest joint speed |qd| in rad/s.
+        There is one array per arm, of the shape (intervals, 2). The columns are the largest
+        synchronisation error |e| of any joint in rad, and the largest joint speed |qd| in
+        rad/s.
         """
         return tuple(map(max_over_joints, self.buckets))
 
@@ -971,7 +973,7 @@ class FusedRun:
 
     @property
     def memories(self) -> list[Array]:
-        """Numbers that users' control laws keep from tick to tick, after the last tick.
+        """Internal state of each control law that a user has written, after the last tick.
 
         A tick is one period of the control loop. There is one array per site (simulated process
         that runs one arm). The array of a site with a built-in law is empty.
@@ -1220,7 +1222,7 @@ def _write_actions(feed_actions: Array, first_tick: int, actions: Array) -> None
 
 
 def _count_coordinates(setup: SiteSetup) -> int:
-    """Returns the number of target coordinates of a site's live operator.
+    """Returns how many coordinates a person or program may command to move an arm.
 
     An action contains the three numbers grip, number and source, followed by the target and the
     velocity of each coordinate, see `HandInForce`.

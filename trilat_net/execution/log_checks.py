@@ -400,9 +400,10 @@ def _join_names(names: Sequence[str]) -> str:
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of ticks of each site as a string, such as "m1 3-7, 12; s 5".
+    """Returns the ranges of control periods (ticks) of each site that a log lacks, as text.
 
-    At most `_MAX_GAPS_NAMED` ranges are listed. The others are counted.
+    An example is "m1 3-7, 12; s 5". At most `_MAX_GAPS_NAMED` ranges are listed. Further ones
+    are counted.
 
     Args:
         gaps: Site (arm controller), first tick (control period) and last tick of each range.

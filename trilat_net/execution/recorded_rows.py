@@ -223,7 +223,7 @@ class PlainRows:
 
     @cached_property
     def _memory(self) -> tuple[IntArray, IntArray]:
-        """Internal states of the site and its control law (field `mem`) in all records.
+        """Internal states of the control law and its site in all records (their field `mem`).
 
         The first array has the index of the first number of each record in the second array,
         and the total length, shape (K + 1,). The second array has the bits of the numbers.
@@ -232,7 +232,7 @@ class PlainRows:
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads some records in the form that the compiled loop needs.
+        """Reads some records as arrays, to execute their control periods by compiled code.
 
         Args:
             first: Index of the first record (result of a control period).

@@ -224,7 +224,7 @@ class RecordedInputs(Generic[Change]):
         return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Removes and returns the changes that take effect up to a tick (control period).
+        """Removes and returns the changes of settings that take effect up to a control period.
 
         Args:
             tick: Last tick whose changes are returned.
@@ -412,11 +412,11 @@ class RecordedInputs(Generic[Change]):
     def _find_waiting(
         self, row: int, peer: int, used_tick: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Finds the samples of a peer that were waiting in its link before a given record.
+        """Finds received states that were still delayed by a link at the time of a record.
 
-        A sample, the state that a peer sends, waits at the receiver until the delay of the link
-        has passed. If records are missing from the log, it is not certain which samples had
-        arrived.
+        A sample, the state that a peer (another site) sends, waits at the receiver until the
+        delay of the link has passed. If records are missing from the log, it is not certain
+        which samples had arrived.
 
         Args:
             row: Index of the record, among the records of the receiver.

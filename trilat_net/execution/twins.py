@@ -299,7 +299,9 @@ def _list_joints(scenario: Scenario) -> tuple[str, ...]:
 
 
 def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
-    """Returns a push of all joints in a random direction.
+    """Returns a small displacement of all joints in a random direction.
+
+    It is applied to a copy of the run, to see whether the difference grows.
 
     Args:
         scenario: Description of the experiment.
@@ -528,10 +530,10 @@ class _TwinRuns:
         return Twins(paths, self._joints, self._speed, self._same)
 
     def _execute_window(self, end_s: float) -> None:
-        """Executes the run and its twins to the end of a window, and measures the differences.
+        """Continues a run and its displaced copies (twins), and measures their differences.
 
-        A twin that has not been pushed yet equals the run. Therefore it is not executed, but
-        copied from the run when its push is due.
+        A twin that has not been displaced yet equals the run. Therefore it is not executed, but
+        copied from the run when its displacement is due.
 
         Args:
             end_s: End of the window, in s.
@@ -698,9 +700,10 @@ class _TwinRuns:
             self._scale[n] -= math.log(factor)
 
     def _find_recent_peak(self, n: int, end_s: float) -> float:
-        """Returns the logarithm of a twin's largest velocity difference in the last second.
+        """Returns how far apart a run and its displaced copy were in the last second.
 
-        Positions do not show a decay, because a twin may come to rest at another position.
+        It is the logarithm of the largest difference of velocities. Positions do not show a
+        decay, because the copy (twin) may come to rest at another position.
 
         Args:
             n: Index of the twin, a displaced copy of the run.
@@ -816,9 +819,9 @@ class _LaneTwinRuns(_TwinRuns):
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
-    """Returns the ends of the windows of a run, in s, in ascending order.
+    """Returns the times at which the differences between runs are measured, in s, ascending.
 
-    Windows end at multiples of 50 ms, and at the times of the pushes.
+    They are the multiples of 50 ms, and the times at which copies of the run are displaced.
 
     Args:
         end_s: Duration of the run, in s.

@@ -474,10 +474,10 @@ class _SiteVerifier:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _repeat_plain(self, row: int, next_tick: int) -> int:
-        """Executes the ticks of some ordinary records by the compiled loop, which is faster.
+        """Executes the control periods of some records again by compiled code, which is fast.
 
-        A record is ordinary (plain) if the state before it is known, and the log contains all
-        of its inputs. The compiled loop ends before the first record that differs.
+        This is possible for a record if the state before it is known, and the log contains all
+        of its inputs (a plain record). The execution ends before the first record that differs.
 
         Args:
             row: Index of the first record.
@@ -518,9 +518,9 @@ class _SiteVerifier:
         return repeated_count
 
     def _examine_record(self, row: int, next_tick: int) -> int:
-        """Examines one record: whether it has the expected tick, and equals a new execution.
+        """Checks one record: whether it has the expected tick, and repeats with equal results.
 
-        Gaps and differences are added to the result.
+        A tick is a control period. Gaps and differences are added to the result.
 
         Args:
             row: Index of the record.
@@ -693,7 +693,7 @@ class _SiteVerifier:
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Reports a record that does not come from the process that is executed again.
+        """Reports a record that was written by another process than the one that is repeated.
 
         Returns:
             The difference, if the record (result of a control period) states another start of
@@ -940,7 +940,8 @@ def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
     """Returns the records of all sites (arm controllers) of a log, by site and tick.
 
-    A site that is executed again looks up the samples of the other sites in it.
+    A tick is a control period. A site that is executed again looks up in them what it received
+    from other sites.
 
     Args:
         log: The log.

@@ -187,7 +187,7 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the event that tells that a site has ended, as a message for the log.
+        """Returns the message that tells readers of the log that a site has ended.
 
         Args:
             t_ns: Time of the event, in ns after the epoch (the common start time). By default,
@@ -198,9 +198,9 @@ class SiteChannels:
         return self.make_new_event_entry("end", text, end_ns)
 
     def make_new_event_entry(self, kind: str, text: str, t_ns: int) -> SiteEntry:
-        """Returns a new event of the site as a message for the log.
+        """Returns a notable occurrence at a site (event) as a message for the log.
 
-        The event gets the next event number of the site.
+        The event gets the next event number of the site (arm controller).
 
         Args:
             kind: Kind of the event, for programs.
@@ -283,7 +283,7 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Converts an event of a site, such as a change of its mode, to a log entry.
+        """Converts an event of a site, such as a change of its mode, to a message for a log.
 
         A site is a process that runs one arm. It published the event in an earlier run.
 
@@ -516,10 +516,10 @@ def _find_ready(
 
 
 def compute_boot(scenario: Scenario, site: str) -> int:
-    """Returns the number that identifies the start of a site in virtual time.
+    """Returns the number by which logs of simulations identify the start of a site.
 
-    In a live session, every start of a process gets a random number. In virtual time, the
-    number is a function of the scenario, so that repeated runs write the same log.
+    In a live session, every start of a process gets a random number. In a simulation (virtual
+    time), the number is a function of the scenario, so that repeated runs write the same log.
 
     Args:
         scenario: Description of the experiment.

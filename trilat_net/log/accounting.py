@@ -229,11 +229,10 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """States that the sender has published at least the messages 0 to `published` - 1.
+        """Notes that the sender has published at least the messages 0 to `published` - 1.
 
-        Those that have not arrived count as missing from now on. Without such a statement,
-        messages missing at the end would remain unnoticed, because no later number reveals the
-        gap.
+        Those that have not arrived count as missing from now on. Without this, messages missing
+        at the end would remain unnoticed, because no later number reveals the gap.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
@@ -543,10 +542,11 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Smallest fraction of recorded or checked ticks of any site, from 0 to 1.
+        """Smallest fraction of control periods of any site that were recorded, from 0 to 1.
 
-        A run is known only as well as its worst site. The fraction is 0 if no site has ticks,
-        and a single site without ticks does not lower it.
+        A run is known only as well as its worst site (arm controller). In the result of a
+        check, the fraction is that of checked periods. It is 0 if no site has any, and a single
+        site without any does not lower it.
         """
         if not any(self.expected.values()):
             return 0.0
@@ -585,7 +585,7 @@ class Coverage(NamedTuple):
         return f"judged {self}{shortage}"
 
     def to_json(self) -> dict[str, list[int]]:
-        """Converts the numbers of recorded or checked ticks to plain values for JSON.
+        """Returns how many control periods of each site were recorded or checked, for JSON.
 
         Returns:
             For each site the pair [recorded or checked ticks, all ticks]. A tick is one period

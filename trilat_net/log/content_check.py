@@ -368,10 +368,11 @@ class ContentCheck:
             raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the number (boot) that identifies the present start of a member's process.
+        """Returns the number that identifies the present start of a process, or None.
 
-        All messages of one start contain it. In virtual time, it is computed from the scenario.
-        Otherwise it is read from the latest accepted message. None if there is no such message.
+        All messages of one start contain this number (boot). In virtual time, it is computed
+        from the scenario. Otherwise it is read from the latest accepted message. None if there
+        is no such message.
         """
         if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)

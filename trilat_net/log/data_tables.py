@@ -117,7 +117,7 @@ class Column(NamedTuple):
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of consecutive rows as plain Python values, for files such as CSV.
+        """Returns some consecutive values of the column as plain Python values, as for CSV.
 
         Args:
             first: Index of the first row.
@@ -578,7 +578,7 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Builds the table with the records of a site, one row per tick of its control loop.
+    """Builds a table of an arm's angles, torques and so on, one row per control period.
 
     Args:
         site: Records (results of control periods) of the site (arm controller).
@@ -652,10 +652,10 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
 
 
 def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Builds the table of the samples that arrived at a site from its peers.
+    """Builds a table of the messages that a site received, with their delays.
 
-    A sample is the state that a peer, another site, publishes in one tick. The table has one
-    row per sample, in the order of arrival.
+    A message (sample) is the state that a peer, another site (arm controller), publishes in one
+    tick (control period). The table has one row per message, in the order of arrival.
 
     Args:
         site: Records of the receiving site, which list the arrivals.

@@ -118,7 +118,7 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """The results of several checks, by name of the check, in the order of their first use.
+    """Results of several checks of a log, by name of the check, in the order of first use.
 
     A name that does not exist yet gets a result without problems when it is read. Thus a check
     can add a problem by `findings["records"]` at any place.
@@ -132,7 +132,8 @@ class Findings(dict[str, Finding]):
 class CheckReport(Result):
     """Base class of the results of commands that check a log in several respects.
 
-    It derives from the findings whether the log passed, and the exit code of the command.
+    It derives from the results of the single checks whether the log passed, and the exit code
+    of the command.
 
     Attributes:
         findings: The result of each check.

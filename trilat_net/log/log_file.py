@@ -199,10 +199,10 @@ _ADVICE = {
 
 
 def sync_folder(folder: Path) -> None:
-    """Writes the entries of a folder to the disk, so that its files survive a loss of power.
+    """Forces the names of new files in a folder onto the disk, so that they survive a crash.
 
-    Without this, a file may be stored completely, but its name may be lost. Nothing happens on
-    platforms that do not support this.
+    Without this, a file may be stored completely, but its name may be lost when the power
+    fails. Nothing happens on platforms that do not support this.
 
     Args:
         folder: The folder.

@@ -50,8 +50,9 @@ class _ViewChannels(Protocol):
 
 
 class _LogViews(Protocol):
-    """Derives messages for general viewers from the messages of a session.
+    """Interface: derives messages for general viewers from the messages of a session.
 
+    Viewers such as Foxglove cannot read the program's own format.
     `ros2.viz_channels.VizChannels` derives standard messages of ROS 2.
 
     Attributes:
@@ -518,7 +519,9 @@ class LogParts:
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
     def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
-        """Returns True if the next message would exceed a limit of the current part.
+        """Returns True if the next message would exceed a limit of the current file.
+
+        The limits are those of size and duration at which a log is divided into files.
 
         Args:
             payload_bytes: Size of the next message, in bytes.
@@ -592,7 +595,7 @@ class LogParts:
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last part, so that the log is finished and gets its final name.
+        """Completes the last file of the log, which then gets its final name.
 
         Args:
             accounts: Numbers of received and missing messages as a string, by topic, and other

@@ -133,7 +133,7 @@ class McapMessage(NamedTuple):
 
 
 class _MessageBlock(NamedTuple):
-    """The messages of one topic in a part of a chunk, still in their places in the chunk.
+    """Several messages of one topic, still in their places in a chunk of an MCAP file.
 
     A chunk is a block of messages of all topics, which is compressed as a whole. Messages are
     found and copied in blocks, because compiled code does this much faster than a loop over
@@ -324,7 +324,9 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[_MessageBlock]:
-        """Yields the messages of some topics in blocks, as `messages` finds them.
+        """Yields the messages of some topics in blocks of many messages, which is faster.
+
+        `messages` finds the same messages one by one.
 
         Args:
             topic_is_kept: Function that decides whether the messages of a topic are yielded.
@@ -471,7 +473,9 @@ class McapReader:
         return b""
 
     def _read_messages(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
-        """Yields the messages of a record, and stores its schemas and channels.
+        """Yields the messages in a record of the file, and stores definitions in it.
+
+        The definitions are schemas (formats of messages) and channels (topics).
 
         Args:
             record: The record, of a kind in `_READ`.
@@ -771,8 +775,8 @@ class McapReader:
     def _drop_slot(self, topic: str) -> None:
         """Makes `blocks` read the messages of a topic one by one instead of in blocks.
 
-        This keeps their order if the topic has several channels. A channel without a slot is
-        unknown to the compiled code, which then stops at its messages.
+        This keeps their order if the topic has several channels. The compiled code then has no
+        number (slot) for the channel, and stops at its messages.
 
         Args:
             topic: The topic.

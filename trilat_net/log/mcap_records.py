@@ -172,10 +172,10 @@ def unpack_chunk(content: bytes) -> bytes:
 
 
 def _unpack(head: ChunkHead, data: memoryview) -> bytes:
-    """Unpacks the compressed records of a chunk.
+    """Decompresses the records of a chunk, a compressed block of messages.
 
-    The memory is bounded by the size that the head states, even if the data would unpack to
-    more.
+    The memory is bounded by the size that the head of the chunk states, even if damaged data
+    would decompress to more.
 
     Raises:
         UnreadableRecord: The data are damaged, or the compression is not supported.
@@ -279,7 +279,7 @@ class Damage(NamedTuple):
 
 
 class ScannedRecord:
-    """A record that was found in a file, whose content is read only when it is needed.
+    """A record that was found in an MCAP file, whose content is read only when needed.
 
     Args:
         scanner: Scanner that has found the record.
@@ -338,7 +338,7 @@ class ScannedRecord:
 
 
 class RecordScanner:
-    """Finds the records of a file one after another, and skips damaged parts.
+    """Finds the records of an MCAP file one after another, and skips damaged parts.
 
     Every program that reads a file, whether it checks, recovers or verifies it, reads the
     records that this scanner yields.

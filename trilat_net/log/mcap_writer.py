@@ -171,7 +171,7 @@ class McapWriter:
 
     @property
     def end_bytes(self) -> int:
-        """Largest number of bytes that the end of the file (summary and end mark) may need.
+        """Upper limit of the bytes that the end of the file (index and end mark) may need.
 
         This much disk space must be reserved so that the file can be finished. The messages of
         the chunk that is still open are not included, see `open_chunk_bytes`.

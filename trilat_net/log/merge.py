@@ -27,10 +27,10 @@ from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
 
 
 def merge_parts(parts: Sequence[LogContents]) -> LogContents:
-    """Merges the contents of the parts of a session.
+    """Joins the contents of several files into which the log of a session was divided.
 
-    The recorder states at the end of each part how many messages it received. The counts of a
-    channel do not apply to the merged log and are left out. The other counts, such as dropped
+    The recorder states at the end of each file how many messages it received. The counts of a
+    channel do not apply to the joined log and are left out. The other counts, such as dropped
     messages, are added.
 
     Args:
@@ -186,10 +186,10 @@ def identify_session(part: LogContents) -> dict[str, str]:
 
 
 def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
-    """Merges the messages of a topic, in the order of the parts.
+    """Joins the messages of a topic from several files of the same log, in file order.
 
     Messages are recognised by a key, such as the tick of a record. A message that an earlier
-    part contains already is left out.
+    file contains already is left out.
 
     Args:
         topic: The topic. At least one part contains it.

@@ -40,7 +40,7 @@ _DEFAULTS = {"sent_ns": 0}
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Decodes the tick of every record, the number of its period of the control loop.
+    """Decodes from every record the number of its control period (tick).
 
     Records of every version of the format that can be read are accepted.
 
@@ -179,7 +179,7 @@ def decode_per_peer(
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Decodes which samples of the peers arrived at the site (arm controller) in each tick.
+    """Decodes from records which states of other arms arrived in each control period.
 
     Args:
         payloads: K encoded records of the site.

@@ -141,7 +141,7 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Adds a part of the source file that was lost to the result.
+        """Notes that a part of the damaged file was lost, for the report to the user.
 
         Args:
             text: Sentence that describes the loss to the user.
@@ -450,7 +450,7 @@ class _FileCopy:
             self._result.add_loss(str(damage), damage.length)
 
     def _copy_record(self, record: ScannedRecord) -> None:
-        """Copies one record of the damaged file, with the method for records of its kind.
+        """Copies one record of the damaged file into the new one, by a method for its kind.
 
         A record is the unit of which an MCAP file consists: a chunk of messages, metadata, an
         attachment, or a part of an index.
@@ -517,7 +517,7 @@ class _FileCopy:
         self._is_empty = False
 
     def _check_regenerated(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        """Checks that a record that is not copied is really part of an index.
+        """Checks that a record that is not copied really belongs to an index of the file.
 
         The index of the new file is computed again. If the opcode (the number of the kind) of a
         record with data is damaged, the record may look like a part of an index, and its loss
@@ -744,7 +744,7 @@ class _FileCopy:
         self._define(opcode, content)
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Stores the definition of a schema or channel for the messages that need it.
+        """Stores a definition of a message format (schema) or topic (channel) until needed.
 
         If the file defines the same number twice, the first definition counts.
 

@@ -90,7 +90,7 @@ class RunningDigest:
         self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Adds messages to the digest of the messages, in the order of the file.
+        """Updates the hash of all messages of a file by further ones, in the order of the file.
 
         Args:
             data: The messages with their headers, as in an unpacked chunk of the MCAP file.
@@ -100,7 +100,7 @@ class RunningDigest:
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Adds a record that describes the messages, such as a schema, to the second checksum.
+        """Updates the hash of everything that describes the messages, such as schemas.
 
         The order of these records does not matter, and repeated records count once.
 

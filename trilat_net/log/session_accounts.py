@@ -217,7 +217,9 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Counts the ticks that a site skipped as unpublished, as its event lists them.
+        """Notes that a site skipped ticks (control periods), so that no record is missing.
+
+        The site reports this in an event, because its computer was too slow.
 
         Args:
             event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks
@@ -419,7 +421,7 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Describes the missing records for the user, one line for each site that lacks some.
+        """Tells the user how many records are missing, one line for each site that lacks some.
 
         Yields:
             A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks

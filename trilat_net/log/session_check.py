@@ -459,7 +459,7 @@ class _SessionCheck:
         self._counts += structure.counts
 
     def _read_messages(self, file: str, reader: McapReader, structure: FileCheck) -> None:
-        """Checks the records and the messages of a file, and compares it with its digests.
+        """Checks all messages of a file, and compares them with the hashes in the file.
 
         Args:
             file: Name of the file.
@@ -744,10 +744,10 @@ class _SessionCheck:
 
     @property
     def _needs_end_events(self) -> bool:
-        """True if the files must contain the event "end" of every site (arm controller).
+        """True if the checked files must contain the last event of every arm controller (site).
 
-        A site publishes this event at its end. It may be missing if only one of several parts
-        of a log is checked, or if the recorder was told not to record events.
+        A site publishes the event "end" at its end. It may be missing if only one of several
+        parts of a log is checked, or if the recorder was told not to record events.
         """
         session = self._about["session"]
         channel_filter = parse_filter_facts(self._about)

@@ -24,7 +24,7 @@ class _SiteRate(Protocol):
 
 
 class SessionScenario(Protocol):
-    """The facts about a scenario from which the messages of its session follow.
+    """Interface: the settings of a session on which the messages in its log depend.
 
     `scenario.Scenario` has these attributes. The recorder depends only on this protocol, so
     that it need not import the program that reads scenarios.

@@ -419,7 +419,7 @@ class SiteLog:
         return str(find_hook("render a site's records as HTML")(self))
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
-        """Decodes columns of all records, and makes the arrays read-only.
+        """Decodes some quantities of all records into arrays that cannot be changed.
 
         Args:
             decode_column: Function that decodes the payloads.
@@ -451,9 +451,10 @@ class SiteLog:
             ) from None
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vector fields of all records together, before they are accessed.
+        """Decodes several fields of all records together, before they are accessed.
 
-        This is three times as fast as to decode them one by one.
+        The fields are vectors such as joint angles. This is three times as fast as to decode
+        them one by one.
 
         Args:
             fields: Names of the vectors, such as "q" and "tau".
@@ -756,11 +757,11 @@ class SiteLog:
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Number of the tick of each peer whose sample the control law used, in each record.
+        """Which received state of each peer the control law used, in each of the K records.
 
-        A peer is another site, and a sample is the state that it sends in each tick (period of
-        its control loop). The key is the name of the peer. The value has the shape (K,), where
-        K is the number of records of this site. It is -1 before the first sample of the peer.
+        A peer is another site (arm controller), and a sample is the state that it sends in each
+        tick (period of its control loop). The key is the name of the peer. The value has the
+        shape (K,), with the number of the tick, or -1 before the first sample of the peer.
         """
         if self.indexed is not None:
             ticks = self.indexed.used
@@ -769,11 +770,11 @@ class SiteLog:
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Samples of the peers that arrived at the site.
+        """Messages from other arms that had arrived at this one, with their delays.
 
-        The first array contains the number of arrivals in each record, shape (K,). The second
-        array contains all arrivals in order, shape (N, 3), with the columns of `rx`: index of
-        the peer, tick of the sample, and delay in us.
+        The first array contains the number of messages (samples) in each record, shape (K,).
+        The second array contains all arrivals in order, shape (N, 3), with the columns of `rx`:
+        index of the peer, tick of the sample, and delay in us.
         """
         if self.indexed is not None:
             return freeze(self.indexed.arrivals)

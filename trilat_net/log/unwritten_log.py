@@ -28,7 +28,9 @@ _NAME = "run"
 
 
 class _UnwrittenSiteLog(SiteLog):
-    """Records of one site as arrays, with one row per tick.
+    """Results of one arm in a simulation without a log file, with one row per tick.
+
+    A tick is a control period. The class has the arrays of `SiteLog`.
 
     Args:
         scenario: Scenario of the run.

@@ -94,7 +94,7 @@ class Bus(Protocol):
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a queue of the messages that other members publish under a key.
+        """Returns a queue of the messages that other processes publish under a key.
 
         Args:
             key: The key, which may contain wildcards.
@@ -133,7 +133,7 @@ class Bus(Protocol):
         """
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a queue of the queries that other members send under a key.
+        """Returns a queue of the requests that other processes send under a key.
 
         The caller removes the queries from the queue, and replies to them when it has time. In
         contrast, `respond` replies at once.
@@ -153,7 +153,7 @@ class Bus(Protocol):
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Sends a query to all members that serve a matching key.
+        """Sends a request to all processes that serve a matching key, and collects the replies.
 
         Args:
             key: The key, which may contain wildcards.
@@ -165,7 +165,7 @@ class Bus(Protocol):
         """
 
     def announce(self, key: str) -> None:
-        """Declares a liveliness token, which shows other members that this member is present.
+        """Shows other processes that this one is present, by a liveliness token of Zenoh.
 
         The token disappears when the connection is closed or lost.
 

@@ -591,7 +591,7 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Derives the connection of a peer or a router from the command line and a Zenoh file.
+    """Derives the network connection of a process from its options and its Zenoh file.
 
     `listen_else` and `connect_else` are the defaults, see `Connection.of_member`.
 

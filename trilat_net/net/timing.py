@@ -308,9 +308,9 @@ class LinkTimingMonitor:
         return delay_ns
 
     def is_receiving(self, now_ns: int) -> bool:
-        """Returns True if a sample of the peer has arrived within the last _UNHEARD_NS.
+        """Returns True if a message of the peer has arrived recently, within _UNHEARD_NS.
 
-        A sample is the state that the peer publishes in each period of its control loop.
+        A peer (another site) publishes its state in each period of its control loop.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -490,9 +490,9 @@ class SiteTiming:
         self._fault_notice_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def deadline_ns(self, k: int) -> int:
-        """Returns the time at which the site wakes up for a tick, on its own clock, in ns.
+        """Returns the time at which the process wakes up for a tick, on its own clock, in ns.
 
-        This is the time at which the tick is due, plus the delay `turn_ns`.
+        This is the time at which the tick (control period) is due, plus the delay `turn_ns`.
 
         Args:
             k: Number of the tick (period of the control loop).
@@ -500,7 +500,7 @@ class SiteTiming:
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
-        """Lists the events that state the offsets of the peers' clocks at tick 0.
+        """Returns how far the clocks of other sites differ at the start, as events for the log.
 
         Peers (other sites) on this machine have no offset and are left out.
 

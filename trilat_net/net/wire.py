@@ -197,10 +197,10 @@ def encode_sample(
     sent_ns: int,
     echo: Sequence[Sequence[int]],
 ) -> bytes:
-    """Encodes the sample of one tick, the state that a site sends its peers.
+    """Encodes the message with which a site tells other sites its state in one tick.
 
-    A tick is one period of the control loop. A sample is a shorter message than the record of
-    the same tick, because it contains only what the peers need.
+    A tick is one period of the control loop. This message (sample) is shorter than the record
+    of the same tick, because it contains only what the peers (other sites) need.
 
     Args:
         site: Name of the site.

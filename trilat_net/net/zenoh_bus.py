@@ -95,8 +95,9 @@ class _ZenohRing(Generic[T]):
     def poll(self) -> T | None:
         """Removes the oldest usable entry from the queue and returns it. None if there is none.
 
-        Entries for which `read` returns None, such as error replies, are skipped. The queue of
-        a query also counts as empty once all replies have arrived.
+        An entry is a message or a reply. Entries for which `read` returns None, such as error
+        replies, are skipped. The queue of a query also counts as empty once all replies have
+        arrived.
         """
         try:
             while (received := self._try_recv()) is not None:
@@ -289,7 +290,7 @@ class ZenohBus:
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a queue of the messages that other members publish under a key.
+        """Returns a queue of the messages that other processes publish under a key.
 
         Args:
             key: The key, which may contain wildcards.

@@ -244,7 +244,10 @@ def _format_cell(value: Any) -> str:
 def _describe_run(run: Mapping[str, Any]) -> str:
     """Returns a sentence on a simulation that confirms the limit of stability or the gains.
 
-    Example: "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
+    An example is "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
+
+    Args:
+        run: The run, as in `ArmGains.runs`.
     """
     share = run["share"]
     gains = "these gains" if share is None else f"{share:g} of the edge"

@@ -168,9 +168,10 @@ def advance_chain_site(
     columns: IntArray,
     table: TorqueTable,
 ) -> None:
-    """Computes one tick of a site for several runs, see `advance_site`.
+    """Computes one control period of an arm for several simulations that run side by side.
 
-    All tables have a lane for each run. No two of them overlap in memory.
+    The arm is a chain of joints, see `advance_site`. All arrays have a place (lane) for each
+    simulation. No two of them overlap in memory.
 
     Args:
         k: The tick.

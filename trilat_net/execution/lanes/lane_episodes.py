@@ -49,7 +49,9 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Computes which samples all runs use in their next ticks, which differ from lane to lane.
+    """Finds which received states the arms of all runs use in their next control periods.
+
+    The runs are simulated side by side (in lanes), and each is at a control period of its own.
 
     Args:
         runs: Number of runs.

@@ -256,11 +256,12 @@ def _find_number(
 
 @lower_getattr_generic(LaneRow)
 def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
-    """Generates LLVM code for reading `row.field` of a row in one lane.
+    """Generates LLVM code that reads a field of a record of one simulation, as `row.field`.
 
-    Numba calls this function when it compiles such an expression. The result is a constant if
-    the field is equal in all lanes, a number if the field is a single number, and otherwise an
-    array whose numbers are `LANES` numbers apart in memory.
+    Numba calls this function when it compiles such an expression. Several runs are simulated
+    side by side, each in one lane. The result is a constant if the field is equal in all lanes,
+    a number if the field is a single number, and otherwise an array whose numbers are `LANES`
+    numbers apart in memory.
 
     Args:
         context: Numba's context of the compilation.
@@ -327,7 +328,7 @@ def _find_row(
     index: Any,
     row_type: Any,
 ) -> Any:
-    """Generates LLVM code for `rows[index]`, the row with an index, in one lane.
+    """Generates LLVM code for `rows[index]`: one record of one of several simulations.
 
     Args:
         context: Numba's context of the compilation.
@@ -395,10 +396,10 @@ def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _select_row(_context: Any, rows: Any, index: Any) -> Any:
-    """Generates LLVM code for a row whose index is a constant.
+    """Generates LLVM code for `rows[index]` with a constant index.
 
-    Only then does the compiler know the constant fields of this row, such as the kind of an
-    operator, and can remove the branches for other kinds.
+    Only then does the compiler know the constant fields of this record (row), such as the kind
+    of an operator, and can remove the branches for other kinds.
     """
     if not isinstance(index, types.IntegerLiteral):
         return None

@@ -168,10 +168,10 @@ def list_argument_types(
     site: SiteStructure,
     clock: types.Type = types.int64,
 ) -> tuple[Any, ...]:
-    """Returns Numba's types of the arguments with which the tick of a site is compiled.
+    """Returns the Numba types for which the code of one control period is compiled.
 
     The types contain everything that the compiled code depends on: the layouts of the arrays,
-    and properties that are equal in all runs, such as the kinds of the operators.
+    and properties that are equal in all simulated runs, such as the kinds of the operators.
 
     Args:
         layout: Data types and lengths of the arrays.
@@ -292,7 +292,7 @@ def read_assembly(run: FusedRun, i: int) -> str:
 
 @leaf
 def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
-    """Copies records from the lanes to arrays of each run.
+    """Copies the results of several simulations from common arrays to an array of each.
 
     Args:
         first: First tick of each site, shape (N,).
@@ -345,7 +345,7 @@ class _LinksOfRun:
     def set_pending(
         self, ticks: IntArray, links: NDArray[Any], states: Array, received: Array
     ) -> None:
-        """Stores the results of the latest ticks, with which the links can be updated later.
+        """Stores the latest results of a simulation, to update its network links later.
 
         Args:
             ticks: Number of ticks that each site has made.

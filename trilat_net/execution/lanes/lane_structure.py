@@ -85,7 +85,7 @@ def _list_actors(actors: Any) -> list[Any]:
 
 
 def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
-    """Returns why a run cannot be computed together with other runs, for a message to the user.
+    """Explains why a run cannot be simulated side by side with other runs, for the user.
 
     Args:
         run: The run before its first tick (control period).

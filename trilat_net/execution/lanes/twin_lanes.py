@@ -27,7 +27,7 @@ from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
-    """Error if a run and its displaced copies (twins) cannot be simulated together any more.
+    """Error: a run and its displaced copies (twins) can no longer be simulated together.
 
     The reason is that an arm left its limits, or that a control law failed. The caller then
     simulates the runs again, one by one.
@@ -98,7 +98,9 @@ class TwinLanes(LaneRun):
         self._changing = floats
 
     def step_to(self, last_ns: int) -> None:
-        """Executes all planned ticks (control periods) of the run and its twins up to a time.
+        """Continues a run and its displaced copies (twins) up to a time, tick by tick.
+
+        A tick is a control period.
 
         Args:
             last_ns: Time of the last tick to be executed, ns since the epoch.

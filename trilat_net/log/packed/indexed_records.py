@@ -156,10 +156,11 @@ class IndexedRecords:
 
     @property
     def used(self) -> Ints:
-        """Which sample of each peer the control law used in each tick, shape (K, P).
+        """Which received state of each peer the control law used in each record, shape (K, P).
 
-        A peer is another site, and a sample is the state that it sent in one tick. The number
-        of that tick is given for each of P peers, or -1 before the first sample.
+        A peer is another arm controller (site), which sends a state (sample) in each tick
+        (control period). The number of that tick is given for each of P peers, or -1 before the
+        first sample.
         """
         peers = self._exact.peers
         lengths = self._exact.lengths
@@ -216,7 +217,7 @@ class IndexedRecords:
         return bits
 
     def _vector_places(self) -> dict[str, tuple[int, int, int]]:
-        """Returns where the vectors lie in a record, by their names.
+        """Returns where the vectors, such as joint angles, lie in an encoded record, by name.
 
         Returns:
             For each vector: the column of `marks` with the position from which its offset

@@ -218,7 +218,7 @@ def _after_stamps(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _after_texts(data: Bytes, offset: int, end: int) -> int:
-    """Returns the offset after a list of texts in ASCII, such as the changes of a record.
+    """Returns the offset after a list of ASCII strings, such as the changes in a record.
 
     The result is -1 if there is no such list. Other characters than ASCII are left to the
     general decoder, which checks their encoding.
@@ -286,7 +286,7 @@ def _mask_bytes(mask: int) -> int:
 def _scan_record(
     data: Bytes, start: int, end: int, layout: Any, heads: Ints, marks: Any, counts: Any
 ) -> bool:
-    """Checks that one record has the exact layout, and finds where its values lie.
+    """Checks that one encoded record has the expected bytes, and finds where its values lie.
 
     The arguments are those of `scan_records`, for one record from `start` to before `end`.
 
@@ -423,7 +423,7 @@ def scan_records(
 
 @loop_leaf
 def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints) -> None:
-    """Reads some integers that follow each other, such as the used samples, from each record.
+    """Reads integers that follow each other, at known positions of each encoded record.
 
     Args:
         data: The encoded records, followed by padding.

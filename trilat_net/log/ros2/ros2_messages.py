@@ -486,10 +486,10 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Collects the curves that viewers draw, from some records of a site.
+    """Collects the curves that viewers draw from some records of an arm controller (site).
 
-    The curves are the joint positions q, their references q_des, the velocities qd, the
-    torques tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
+    The curves are the joint positions q, their references q_des, the velocities qd, the torques
+    tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
     theta_hat, the numbers that the control law sends, and the mode. If the sites share the pose
     x of the end effector instead, the joints have no reference. Then q is repeated in place of
     q_des, and e is x - x_des.

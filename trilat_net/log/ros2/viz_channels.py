@@ -50,10 +50,11 @@ _get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Writes the two rows of a bucket: one at once, and one half a bucket later.
+    """Writes two messages for each interval of time: one at its end, and one half later.
 
-    A row contains the values of all curves at one time. The second row is written by `flush`,
-    or before the first row of the next bucket.
+    A message contains the values of all curves of a viewer at one time (a row). An interval is
+    called a bucket. The second row is written by `flush`, or before the first row of the next
+    bucket.
 
     Args:
         write: Function that writes a row: time, values, and arrival time in Unix ns.
@@ -361,10 +362,10 @@ class _SiteBuckets:
         self._first_tick = self._bucket_ticks * next_bucket
 
     def _flush_late_records(self, log_ns: int) -> None:
-        """Writes the records that arrived after their time interval (bucket) was written.
+        """Writes for viewers the records that arrived after their interval was written.
 
-        As for other intervals, the minimum and the maximum of each curve are written, here on
-        the fast and on the slow channels at once.
+        As for other intervals (buckets), the minimum and the maximum of each curve are written,
+        here on the fast and on the slow channels at once.
         """
         if self._late_records:
             rows = self._decimate(self._late_records)

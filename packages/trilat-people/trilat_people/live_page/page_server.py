@@ -589,10 +589,9 @@ class PageServer:
             self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
-        """Receives the session's messages and makes a frame, thirty times a second.
+        """Receives new messages of the session and lets pages send its state, 30 times a s.
 
-        If one step fails, the failure is counted, and the other steps continue. In the end of
-        each round, the pages may send the new frame.
+        If one step fails, the failure is counted, and the other steps continue.
         """
         while True:
             started_ns = self._clock.monotonic_ns()
