@@ -143,7 +143,7 @@ class TrilatRobot(Robot):
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session, and waits for the first state of both sites.
+        """Joins the teleoperation session, and waits for the first state of both arms.
 
         Args:
             calibrate: Not used, because there is nothing to calibrate.
@@ -176,7 +176,7 @@ class TrilatRobot(Robot):
             self._stack = stack.pop_all()
 
     def _await_records(self, timeout_s: float) -> None:
-        """Waits until both sites have published a record, the state in one control period.
+        """Waits until both arm controllers (sites) have published their state.
 
         Raises:
             DeviceNotConnectedError: A site has published no record for `timeout_s` seconds.
@@ -291,7 +291,9 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which the operator moves an arm.
+    """Returns the names of the directions or joints in which a policy moves the arm.
+
+    They become the names of the robot's actions in LeRobot data sets.
 
     Args:
         scenario: The scenario of the session.
@@ -314,7 +316,7 @@ def run_policy(
     duration_s: float,
     fps: int,
 ) -> int:
-    """Lets a policy drive the arm of a robot at a fixed rate.
+    """Lets a trained policy move the arm of a robot, at a fixed rate.
 
     Args:
         robot: The connected robot.
@@ -345,7 +347,7 @@ def run_policy(
 
 
 def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
-    """Loads a policy that `lerobot-train` has stored.
+    """Loads a trained policy that `lerobot-train` has stored in a folder.
 
     Args:
         folder: Folder of the policy, which ends in `pretrained_model`.
@@ -368,7 +370,7 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     policy.reset()
 
     def decide(state: dict[str, list[float]]) -> list[float]:
-        """Returns the action of the policy for an observation, as plain numbers.
+        """Returns the action of the trained policy for an observation, as plain numbers.
 
         Args:
             state: Numbers of each feature of the observation. Features that the policy was not

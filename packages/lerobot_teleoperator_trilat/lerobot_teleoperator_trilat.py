@@ -174,7 +174,7 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(self._position_keys, position, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force of the arm on the operator that holds it.
+        """Returns the force of the arm on the person or program that holds it.
 
         Returns:
             The force along each axis in N, or the torque of each joint in N m in mode `joint`.
@@ -277,7 +277,9 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which the operator moves an arm.
+    """Returns the names of the directions or joints in which a person moves the arm.
+
+    They become the names of the actions in LeRobot data sets.
 
     Args:
         scenario: The scenario of the session.

@@ -202,7 +202,9 @@ class _HandActor(Protocol):
 
 
 class RunTotals(NamedTuple):
-    """Figures that summarise a whole run, returned by `FusedRun.totals`.
+    """Numbers that summarise a whole simulated run, such as its largest mean error.
+
+    `FusedRun.totals` returns them.
 
     Attributes:
         rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e

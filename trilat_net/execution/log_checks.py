@@ -113,7 +113,7 @@ class LogCheckReport(CheckReport):
         min_coverage: float = MIN_COVERAGE,
         resume_every: int = 0,
     ) -> "LogCheckReport":
-        """Executes the sites of a log again, and checks the log against the results.
+        """Executes the control periods of a log again, and checks the log against the results.
 
         Args:
             log: Log of a run or of a rerun that is to be checked.

@@ -29,7 +29,9 @@ _MASK_64 = (1 << 64) - 1
 
 
 class SampleTable(NamedTuple):
-    """The states (samples) that all sites of a log sent, for a fast look-up by site and tick.
+    """States that all sites of a log sent (samples), for a fast look-up by site and tick.
+
+    A site is the controller of one arm, and a tick one of its control periods.
 
     Attributes:
         bits: Position, velocity and external torque of each sample in the coordinates that
@@ -257,7 +259,7 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes the ticks of some records again in compiled code, to verify the records.
+        """Executes control periods of some records again in compiled code, to verify them.
 
         Args:
             repeater: Executes the ticks (control periods) of the site (arm controller).

@@ -499,7 +499,9 @@ class RecordedInputs(Generic[Change]):
 
 
 class _PeerListing(NamedTuple):
-    """Records of a site (arm controller) that list samples of one peer.
+    """Index of the records of a site that list received states of one peer.
+
+    A peer is another site (arm controller).
 
     Attributes:
         first_rows: For the tick (control period) of each sample, the row of the first record

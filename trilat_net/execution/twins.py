@@ -408,7 +408,7 @@ def _run_twins(
 
 
 class _SiteVelocities(NamedTuple):
-    """Joint velocities of one site in a window of a run, divided into intervals of 50 ms.
+    """Joint velocities of one arm in a part of a run, by intervals of 50 ms.
 
     Attributes:
         cells: Index by which an array with a row per interval and a column per joint of all
@@ -487,7 +487,7 @@ class _TwinRuns:
         inputs: RunInputs | None,
         record_count: int,
     ) -> list[Any]:
-        """Returns the run and its twins, before their first tick (control period).
+        """Creates a run and copies of it (twins), before their first control period.
 
         Args:
             scenario: The scenario.
@@ -611,7 +611,7 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> Iterator[_SiteVelocities]:
-        """Yields the joint velocities of each site in a window, by intervals of 50 ms.
+        """Yields the joint velocities of each arm in a part of a run, by intervals of 50 ms.
 
         Args:
             records: Times and records (results of control periods) of each site (arm

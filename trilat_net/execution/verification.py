@@ -173,7 +173,7 @@ def find_first_difference(
     equal: NumberEquality,
     channel: LawChannel = LawChannel(),  # noqa: B008
 ) -> RecordDifference | None:
-    """Finds the first field in which a record differs from executing its tick again.
+    """Finds the first field of a record that a repeated control period computes otherwise.
 
     Args:
         logged: Record of a tick (control period), as the log contains it.

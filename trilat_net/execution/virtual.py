@@ -76,7 +76,7 @@ from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message of a site (arm controller) that is to be written to a log.
+    """One message of an arm controller (site), ready to be written to a log.
 
     Attributes:
         site: Name of the site that sends the message.
@@ -137,7 +137,9 @@ class SiteChannels:
     def make_tick_entries(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the messages of a tick that follow its record: statistics and events.
+        """Returns the messages that follow the record of a control period in a log.
+
+        They are statistics and events.
 
         Args:
             output: Record of the tick (control period): the stored result.
@@ -306,7 +308,7 @@ class SiteChannels:
         )
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
-        """Writes a message of the site to the log, and counts it in the account of its channel.
+        """Writes a message of the site to the log, and counts it for the completeness check.
 
         Args:
             entry: The message, as one of the `make_…` methods returned it.
@@ -684,7 +686,7 @@ def record_virtual(
     hands: HandTracks = {},  # noqa: B006
     policies: Collection[str] = (),
 ) -> bool:
-    """Simulates a scenario in virtual time, and writes the log of the run to a file.
+    """Simulates a scenario faster than real time, and writes the log of the run to a file.
 
     Args:
         scenario: Description of the experiment, with its sites and links.

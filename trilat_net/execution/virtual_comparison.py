@@ -41,7 +41,7 @@ from .virtual_network import Network, RecordedNetwork, complete_deliveries, read
 
 
 class RecordComparison(NamedTuple):
-    """Result of comparing the records of a log with another execution of the same ticks.
+    """Result of comparing the records of a log with another execution of the same run.
 
     Attributes:
         records: Number of records that were compared. A record is the stored result of one
@@ -213,7 +213,7 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
 
 
 def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if a receiver still used an older sample when a given sample was due.
+    """True if a site still used an older state of its peer when a given one was due.
 
     Args:
         site_log: Records of the receiver.

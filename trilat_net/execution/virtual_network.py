@@ -279,7 +279,7 @@ def complete_deliveries(
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns when each sample (sent state) of a peer arrived for the first time.
+    """Returns when each state (sample) that a peer sent arrived for the first time.
 
     Args:
         deliveries: Arrivals at the receiver.

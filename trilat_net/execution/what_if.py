@@ -66,7 +66,7 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """A measured number, such as an error, in a log and after executing the log again.
+    """A number, such as an error, of a recorded run and of its repetition with changes.
 
     Attributes:
         before: Value in the log.
@@ -190,7 +190,7 @@ class _CommonRecords(NamedTuple):
 def _compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Computes what a rerun changed at a site, and on the links over which the site receives.
+    """Computes how a repeated run differs at one arm, and on the links to this arm.
 
     Args:
         log: The log that was executed again.
@@ -406,7 +406,7 @@ class Rerun(Result):
         writer.finish(render_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the rerun as a log to a file, with additional channels for viewers.
+        """Writes the repeated run as a log to a file, which viewers can also display.
 
         Args:
             path: File to which the log is written.

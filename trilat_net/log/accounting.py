@@ -110,7 +110,7 @@ class RangeSet:
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
-        """Returns the range of consecutive numbers in the set that contains a number.
+        """Returns the range of consecutive numbers in which a number lies. None if in none.
 
         Args:
             number: The number to look for.
@@ -153,7 +153,7 @@ SHOWN_GAPS = 20
 
 
 class Account:
-    """Counts the messages of one channel, and knows which of their numbers are missing.
+    """Counts the messages of one channel by their numbers, and knows which are missing.
 
     Attributes:
         received: Number of messages that were received, without repetitions.
@@ -572,7 +572,7 @@ class Coverage(NamedTuple):
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
 
     def describe(self, least: float) -> str:
-        """Describes in words how much of the run was recorded or checked.
+        """Tells in words how much of the run was recorded or checked.
 
         Args:
             least: Smallest fraction of ticks (control periods) that is sufficient, from 0 to 1.

@@ -202,6 +202,8 @@ class ContentCheck:
     def identify(self, payload: bytes) -> str:
         """Finds out from the content of a message to which topic it belongs.
 
+        A recovery needs this for messages whose channel is damaged.
+
         Args:
             payload: Bytes of the message.
 

@@ -409,7 +409,7 @@ def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields the four columns of the orientation in a pose, as a unit quaternion.
+    """Yields four columns of a table with an orientation, as a unit quaternion.
 
     Args:
         site: Records of the site (arm controller).

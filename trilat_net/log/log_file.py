@@ -428,7 +428,7 @@ class LogFile:
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the file, and explains an error of the disk to the user.
+        """Closes the log's file, and explains an error of the disk to the user.
 
         Args:
             error: Exception that interrupted the writing. None if nothing interrupted it.

@@ -867,7 +867,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Decodes the statistics that a site published about its links, with their times.
+        """Returns the statistics that a site published about its network links, with times.
 
         Args:
             site: Name of the site, the process that runs one arm.
@@ -918,7 +918,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:
-        """Returns a table of the log: columns with names, units and meanings.
+        """Returns a table of the log, such as an arm's records: columns with names and units.
 
         Args:
             name: Name of a site (arm controller), or "events".
@@ -1008,7 +1008,7 @@ def open_log(
 
 
 def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
-    """Opens all logs in files and folders, see `open_log`.
+    """Opens all logs in the given files and folders, see `open_log`.
 
     Args:
         sources: Paths of logs, or of folders that contain logs.

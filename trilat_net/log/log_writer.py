@@ -247,7 +247,7 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message of the session to the log, unless the filter excludes its channel.
+        """Adds one network message to the log, unless the user has excluded its channel.
 
         Args:
             key: Key of the channel.
@@ -361,7 +361,7 @@ It is used for the accounts, and for the messages for viewers that follow from o
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Where a log is stored, and when a new file (part) of it begins.
+    """Where a log is stored, and at which size or duration a new file of it begins.
 
     Attributes:
         path: Name of the log. The name of a part also contains its number.

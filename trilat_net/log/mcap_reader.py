@@ -860,7 +860,7 @@ _FIRST_BYTES = 1 << 12
 
 
 class ChannelMessages:
-    """The messages of one topic in a log, still encoded, in the order of the file.
+    """All messages of one topic in a log, still encoded, in the order of the file.
 
     Attributes:
         log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
@@ -956,7 +956,7 @@ def _clip_times(times: "array[int]") -> NDArray[np.int64]:
 
 @dataclass
 class LogContents:
-    """Everything in a log, from one file or several parts, before its messages are decoded.
+    """Everything in a log, from one file or several, before its messages are decoded.
 
     Attributes:
         sources: Names of the files.

@@ -555,7 +555,7 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 checksum of a part of the file, to compare it with a stored one.
+        """Computes the CRC-32 checksum of a part of the file, to detect changed bytes.
 
         Args:
             begin: Offset of the first byte of the part.

@@ -471,7 +471,7 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Creates the counters of a session's messages, before the messages of a file are read.
+    """Prepares the counting of a session's messages, before a file of it is read.
 
     Args:
         metadata: Metadata of the file, by name. They state the session.

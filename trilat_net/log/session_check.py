@@ -66,7 +66,9 @@ _ACCOUNTS_SINCE = 3
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """Result of checking the files of one log, as `trilat log check` prints it.
+    """Result of checking the files of one log for damage and missing messages.
+
+    `trilat log check` prints it.
 
     Attributes:
         files: Names of the files.

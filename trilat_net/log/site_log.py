@@ -508,7 +508,7 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record, without decoding the others, which is fast for a long log.
+        """Decodes a single record of an arm without all others, which is fast for a long log.
 
         Args:
             n: Index of the record in the order of ticks. -1 is the last record.
@@ -794,7 +794,7 @@ class SiteLog:
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
-        """Lists the changes of parameters that the site applied during the run.
+        """Lists the changes of settings that the arm controller (site) applied during the run.
 
         Returns:
             For each tick with changes, the changes as JSON texts in the order of application.

@@ -342,7 +342,7 @@ class _OutsideClient(SiteClient):
         connect: Sequence[str],
         keys: str | Path | None = None,
     ) -> Self:
-        """Connects to a site over the network.
+        """Connects a program to an arm controller (site) over the network.
 
         Args:
             session: Name of the session, by default the name of the scenario.
@@ -415,7 +415,7 @@ class ArmClient(_OutsideClient):
         tau_x: Sequence[float] = (),
         stamp_ns: int | None = None,
     ) -> None:
-        """Sends a measurement of the arm to its site.
+        """Sends a measurement of a real arm, such as its joint angles, to its controller.
 
         Args:
             q: Joint angles in rad.

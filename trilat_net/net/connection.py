@@ -72,7 +72,7 @@ def default_endpoint(session: str, index: int) -> str:
 def default_endpoints(
     session: str, sites: Sequence[str], *, encrypted: bool = False
 ) -> dict[str, str]:
-    """Returns the default endpoint of each site of a session, by the name of the site.
+    """Returns the network address that each site of a session has by default, by site.
 
     Args:
         session: Name of the session.

@@ -378,7 +378,7 @@ def refuse_running_session(
     session: str,
     stopped: Callable[[], bool],
 ) -> None:
-    """Checks that no site of a session is present, before its name is used for a playback.
+    """Checks that no process of a session is present, before its name is used for a playback.
 
     Args:
         bus: Network connection that would reach the session.

@@ -79,7 +79,7 @@ MOST_LETTERS = 64
 
 
 class MemberKeys(NamedTuple):
-    """The keys of one member of a session, ready for a network connection.
+    """Cryptographic keys by which one process of a session proves its identity.
 
     Attributes:
         member: Name of the member, a process that takes part in the session.

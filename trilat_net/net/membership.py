@@ -263,7 +263,7 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Settings of one site: whether it may join a running session, and whom a start awaits.
+    """Whether a site may join a running session, and which sites a start waits for.
 
     Attributes:
         may_join_late: True if this site (arm controller) may join a running session. The caller
@@ -475,7 +475,7 @@ class Membership:
             del self.others[member]
 
     def receive_identity(self, info: Info, *, may_have_started: bool) -> None:
-        """Adds a member to the list, or refuses it, when its identity arrives.
+        """Adds a process to the list of the session, or refuses it, when its identity arrives.
 
         Args:
             info: Identity of the member.

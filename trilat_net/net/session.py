@@ -346,7 +346,7 @@ class SessionJoin:
         return None
 
     def _make_late_epoch(self, coming: Event, epoch: Epoch, running: Sequence[Info]) -> Epoch:
-        """Returns the description of a running session, with this site among the members.
+        """Returns the start time and the members of a running session that this site joins.
 
         Args:
             coming: Request of this site (event `coming`) that all running sites (arm

@@ -136,7 +136,9 @@ class SentStamps:
         self._entries = array("q", [-1, 0]) * capacity  # tick and sending time, alternately
 
     def record(self, tick: int, sent_ns: int) -> None:
-        """Stores when the sample of a tick was sent. The oldest stored time is overwritten.
+        """Stores when a site sent its state of one control period (tick).
+
+        The oldest stored time is overwritten.
 
         Args:
             tick: Number of the tick (period of the control loop).
@@ -563,7 +565,7 @@ class SiteTiming:
         return [_describe_estimate(monitor, k, due_ns)]
 
     def record_sent(self, tick: int, now_ns: int) -> int:
-        """Stores when the sample of a tick was sent, so that its delay can be measured later.
+        """Stores when the state of a tick was sent, so that its delay can be measured later.
 
         Args:
             tick: Number of the tick (period of the control loop).
@@ -685,7 +687,7 @@ class SiteTiming:
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns the timing statistics of the site, and discards the measured delays.
+        """Returns timing statistics of the site, and begins new ones for measured delays.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -788,7 +790,7 @@ _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded"
 
 
 class LoopStats:
-    """Statistics of a site's control loop and its links, published ten times a second.
+    """Statistics of a control loop and its network links, published ten times a second.
 
     Args:
         site: The site (arm controller) in the simulation kernel, which counts the samples (sent

@@ -122,7 +122,7 @@ def make_zenoh_config(
     mode: ZenohMode = "peer",
     user_settings: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the complete Zenoh configuration of a member.
+    """Returns the complete Zenoh configuration for one process of a session.
 
     Args:
         listen: Endpoints at which the member listens.

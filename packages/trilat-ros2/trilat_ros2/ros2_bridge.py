@@ -326,7 +326,7 @@ class SilenceNotice:
         self._other_joints: Sequence[str] = ()
 
     def note_message(self, other_joints: Sequence[str] = ()) -> None:
-        """Notes that a message has arrived, which need not be a measurement.
+        """Notes that a message of the robot has arrived, which need not be a measurement.
 
         Args:
             other_joints: Names of the joints in the message if none of them belongs to the arm.
@@ -758,7 +758,7 @@ class _Bridge:
     def run(
         self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
     ) -> bool:
-        """Publishes the messages of the session on ROS topics until the session ends.
+        """Forwards messages of the session to ROS 2 topics until the session ends.
 
         Args:
             rate_hz: Rate at which the newest records are published, in 1/s.
@@ -899,7 +899,7 @@ def _describe_target(
 
 
 def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Lists the names by which ROS messages may call each joint of an arm.
+    """Lists the names by which ROS 2 messages may call each joint of an arm.
 
     Args:
         scenario: Scenario of the session.
@@ -929,7 +929,7 @@ def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
-        """Offers a ROS service that sends an order to one site or to all sites.
+        """Offers a ROS 2 service that sends an order, such as "stop", to one arm or to all.
 
         Args:
             order: Method of `RunningSession` that sends the order. The service has its name.
@@ -1120,7 +1120,7 @@ def publish_session(
 
 
 def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> None:
-    """Writes the configuration of RViz that shows a session.
+    """Writes a file of settings with which the viewer RViz shows the arms of a session.
 
     Args:
         ends: Connections to ROS and to the session.

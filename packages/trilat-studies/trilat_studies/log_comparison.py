@@ -92,7 +92,7 @@ class _MetricComparison(NamedTuple):
     rows: tuple[_ComparisonRow, ...]
 
     def row(self, key: str) -> _ComparisonRow:
-        """Returns the row of this comparison that shows a quantity in all logs.
+        """Returns one quantity, such as a mean error, in all compared logs.
 
         Args:
             key: Key of the quantity, such as "sharing_off".
@@ -105,7 +105,7 @@ class _MetricComparison(NamedTuple):
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricComparison:
-    """Computes the metrics of several logs, so that they can be shown in one table.
+    """Computes the same quantities from several logs, to show them in one table.
 
     Args:
         logs: The logs, which may be torn, short or empty.
@@ -151,7 +151,7 @@ def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """Comparison of the metrics and the scenarios of several logs, created by `compare`.
+    """How several logs differ, in measured quantities and in settings. `compare` creates it.
 
     Attributes:
         logs: The logs.

@@ -102,7 +102,7 @@ class RecordBatch(NamedTuple):
         return self._slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records from one time up to another.
+        """Returns the records of control periods from one time up to another.
 
         Args:
             from_ns: Start of the interval, in ns, which belongs to the interval.
@@ -146,7 +146,7 @@ class RecordBatch(NamedTuple):
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Joins consecutive batches of records of one site to a single batch.
+    """Joins consecutive batches of records of one arm into a single batch.
 
     Args:
         batches: Batches in the order of time, at least one.
@@ -509,7 +509,7 @@ class WindowStats:
             self._add_wall_force(total_force)
 
     def _raise_peak(self, key: str, values: Array) -> None:
-        """Updates a peak value of the window with the absolute values of new records.
+        """Raises the largest absolute value of a quantity, if new records exceed it.
 
         Args:
             key: Name of the peak.
@@ -838,7 +838,7 @@ def _compute_run_metrics(
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Computes the metrics of a run from the statistics of its sites.
+    """Computes quantities about a whole run from the statistics of its arms.
 
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
@@ -893,7 +893,7 @@ def _compute_run_metrics(
     sites_by_window = zip(*windows_by_site, strict=True)
 
     def find_largest(name: str) -> float | None:
-        """Returns the largest value of a statistic over all sites.
+        """Returns the largest value of a statistic, such as the peak torque, over all arms.
 
         Args:
             name: Name of the statistic, an attribute of `SiteStats`.
@@ -1035,7 +1035,7 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Computes the metrics of a recorded run from its log.
+    """Computes errors, torques and other quantities of a recorded run from its log.
 
     Args:
         log: Log of the run.

@@ -110,7 +110,7 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Result of a step of an episode: its reward, and whether the task is done or has failed.
+    """How a task judges one step: the reward, and whether the task is done or has failed.
 
     Attributes:
         reward: Reward of the step.
@@ -603,7 +603,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
-        """Returns observations as the policy gets them: a dictionary, or one array with `flat`.
+        """Returns observations as the agent receives them: a dictionary, or one array (`flat`).
 
         Args:
             parts: The parts of an observation by name, or those of several observations, which
@@ -696,7 +696,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, and draws everything that is random in it.
+        """Begins a new episode, and draws its random goal and settings.
 
         Args:
             seed: Seed of the random numbers. None continues the sequence of earlier episodes.
@@ -732,7 +732,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, info
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Applies an action and advances the episode by one step.
+        """Moves the arm by an action, and simulates the time of one step of the episode.
 
         Args:
             action: Target of the arm or force on it, depending on the mode.
@@ -846,7 +846,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return clipped
 
     def clip_actions(self, values: Array) -> tuple[Array, Any]:
-        """Clips actions to their bounds, and reports which of them exceeded the bounds.
+        """Limits actions to their allowed range, and reports which of them exceeded it.
 
         Args:
             values: An action, or several actions, one per row, as the policy gave them.
@@ -859,7 +859,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.clip(values, -limit, limit), exceeds
 
     def warn_of_clipping(self, values: Array, stacklevel: int) -> None:
-        """Warns of the first action of the environment that exceeds the bounds.
+        """Issues a Python warning at the first action of an agent outside of its range.
 
         Args:
             values: The action as the policy gave it.
@@ -876,7 +876,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def render(self) -> Any:
-        """Draws the arms and the goal as a picture of the present state.
+        """Draws a picture of the arms and the goal in their present state.
 
         Returns:
             A picture of shape (height, width, 3). None if the environment has no render mode.

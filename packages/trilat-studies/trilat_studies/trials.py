@@ -136,7 +136,7 @@ class Trial(NamedTuple):
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
     def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
-        """Compares the metrics of a run with the expectations of the scenario.
+        """Compares measured quantities of a run with the expectations of its scenario.
 
         Args:
             metrics: Metrics of the run.
@@ -164,7 +164,7 @@ class Trial(NamedTuple):
         return self.evaluate(metrics, wall_s)
 
     def check(self) -> TrialResult:
-        """Runs the trial in virtual time, and returns the result if all expectations are met.
+        """Simulates the scenario, and returns the result if all expectations are met.
 
         Raises:
             AssertionError: An expectation is not met. The text contains the reasons, and the
@@ -355,7 +355,7 @@ class _ExpectationRow(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class TrialReport(Result):
-    """Results of several trials, with the texts that report them.
+    """Results of several simulations, each compared with the expectations of its scenario.
 
     Attributes:
         results: The results, in the order of scenarios and seeds.

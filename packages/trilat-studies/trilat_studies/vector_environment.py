@@ -328,10 +328,13 @@ class _Results:
         infos[key][indices] = values
 
     def put_observations(self, indices: Any, observations: Any, is_all: bool) -> None:
-        """Writes the observations of some environments into those of all environments.
+        """Writes the new observations of some environments into the arrays of all environments.
+
+        A vector environment returns the observations of all its environments together, but only
+        some of them may have been simulated in a call.
 
         Args:
-            indices: Their environments, an index of arrays.
+            indices: Indices of the simulated environments, as NumPy accepts them.
             observations: The observations, an array or arrays by name.
             is_all: True if these are the observations of all environments.
         """
@@ -424,7 +427,7 @@ class _LaneEnvs:
                 self._load_task(lane, env)
 
     def _load_episode(self, lane: int, env: TeleoperationEnv) -> None:
-        """Puts the new episode of an environment into its lane, if its structure permits.
+        """Adds a new episode to those that are simulated side by side, if that is possible.
 
         Args:
             lane: The lane.
@@ -475,7 +478,7 @@ class _LaneEnvs:
     def step(
         self, actions: Array, exceeds: Flags, is_stepped: Flags, results: _Results
     ) -> None:
-        """Advances the environments by one step, and writes their results into `results`.
+        """Simulates one step of several episodes side by side, and writes the results.
 
         Args:
             actions: Checked actions of all environments of the vector environment.
@@ -644,7 +647,7 @@ class _LaneEnvs:
                 self._write_lane(lane, ends=False)
 
     def _write_lane(self, lane: int, *, ends: bool) -> None:
-        """Copies the state of one episode from its lane into its environment.
+        """Copies the state of one episode from the common arrays into its environment.
 
         Args:
             lane: The lane.

@@ -235,7 +235,7 @@ def _draw_uniform_delays(
 
 @lane_leaf
 def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -> None:
-    """Draws the random numbers that decide which of several samples the network loses.
+    """Draws random numbers that decide which of several messages a simulated network loses.
 
     Args:
         first: Index of the first sample (sent state).
@@ -719,7 +719,9 @@ def use_recorded_samples(
     state: Array,
     used: IntArray,
 ) -> int:
-    """Computes the same as `use_samples` for a run from a log, in which all arrivals are known.
+    """Finds which received state each arm uses, when a run from a log is repeated.
+
+    All arrivals are known from the log. The results have the form of `use_samples`.
 
     Args:
         first: First tick of each site in the block, shape (N,).

@@ -142,7 +142,9 @@ def _run_span(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Simulates several runs for some ticks, like `run_block` but with a clock for each run.
+    """Simulates several runs side by side for some control periods, each at its own time.
+
+    `run_block` does the same for runs that all are at the same time.
 
     Args:
         first: First tick of each run, shape (LANES,).

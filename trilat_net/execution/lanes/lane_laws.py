@@ -47,7 +47,7 @@ NO_LAW = "none"
 
 
 class LaneLaw(NamedTuple):
-    """Properties of a site's compiled control law on which the code of its tick depends.
+    """Properties of a control law on which the compiled code of a simulation depends.
 
     Runs for which these properties are equal share the code.
 

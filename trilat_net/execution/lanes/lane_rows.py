@@ -475,9 +475,10 @@ def allocate_words(rows: int, row_length: int) -> Words:
 
 
 def read_words(rows: NDArray[Any]) -> Words:
-    """Returns the numbers of structured rows as integers with the same bits ("words").
+    """Returns the numbers of structured records as integers with the same bits ("words").
 
-    The shape is (rows, numbers of a row).
+    Numbers of all types can then be copied by the same code. The shape is (rows, numbers of a
+    row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

@@ -278,7 +278,9 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
-    """Returns the machine code of the ticks of a site as text, in which tests look for vectors.
+    """Returns the machine code for one arm as text, in which tests look for vectors.
+
+    Vector instructions must be found there, because the simulation is slow without them.
 
     Args:
         run: The run.
@@ -642,7 +644,7 @@ class LaneRun:
         return np.clip(end, self._ticks, ticks)
 
     def _step_to(self, ticks: IntArray) -> None:
-        """Simulates all runs until they have made a number of ticks, or have ended.
+        """Continues all simulations to a number of control periods, or until all have ended.
 
         Args:
             ticks: Number of ticks of each site since the start of the runs, shape (N,).
@@ -922,7 +924,7 @@ def _check_distinct(tables: SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured rows by numbers given as integers with the same bits ("words").
+    """Overwrites structured records by numbers given as integers with the same bits.
 
     Args:
         rows: The rows; written.
@@ -952,7 +954,9 @@ def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
 
 
 def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns the indices of a field's numbers among all numbers of a row.
+    """Returns where the numbers of a field, such as "q", lie in a record.
+
+    They are given as indices among all numbers of the record (row).
 
     Args:
         layout: Data type of the row.

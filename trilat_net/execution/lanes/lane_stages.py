@@ -537,7 +537,9 @@ def keep_ended_runs(
 
 
 class RecordedHands(NamedTuple):
-    """What live operators did in a recorded run, see `ReplayedInputs`.
+    """Torques or targets with which live operators moved the arms in a recorded run.
+
+    A repetition of the run applies them again, see `ReplayedInputs`.
 
     Attributes:
         actions: Numbers of the operators, shape (N, ticks, C).
@@ -600,7 +602,7 @@ def run_block(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Simulates several runs for a block of ticks, or until all of them have ended.
+    """Simulates several runs side by side for some control periods, or until all end.
 
     Args:
         first: First tick of each site in the block, shape (N,).

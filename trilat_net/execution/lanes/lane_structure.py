@@ -152,7 +152,9 @@ def find_structure(run: FusedRun) -> RunStructure:
 
 
 def describe_structure(run: FusedRun) -> Hashable:
-    """Returns a key for sorting runs into groups, equal for runs that differ in numbers only.
+    """Returns a key for sorting runs into groups that can be simulated side by side.
+
+    The key is equal for runs that differ in numbers only, such as gains.
 
     Args:
         run: The run before its first tick.

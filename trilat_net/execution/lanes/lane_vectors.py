@@ -53,7 +53,9 @@ _LLVM_KINDS = {
 
 
 class LaneVector(types.Type):
-    """Numba's type of eight numbers, one for each of eight runs, in one vector register.
+    """Numba type of eight numbers, one for each of eight runs, in one vector register.
+
+    One SIMD instruction then computes a number of all eight runs.
 
     Args:
         kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.

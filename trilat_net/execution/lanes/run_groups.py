@@ -32,7 +32,9 @@ site tick.
 
 
 class RunGroup:
-    """Some runs that are simulated together: with vector instructions, or one after the other.
+    """Several simulations that advance together, by vector instructions where possible.
+
+    Otherwise they are computed one after the other.
 
     Args:
         members: Indices of the runs in the sequence that was divided into groups.

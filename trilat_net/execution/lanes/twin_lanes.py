@@ -55,7 +55,9 @@ def suits_twins(run: FusedRun, runs: int, ticks: Sequence[int], least_site_ticks
 
 
 class TwinLanes(LaneRun):
-    """A run and its twins (slightly displaced copies), each in a lane. The run is in lane 0.
+    """A run and slightly displaced copies of it (twins), simulated side by side.
+
+    The run has the index (lane) 0.
 
     Args:
         run: The run before its first tick (control period), which does not advance. See
@@ -154,7 +156,7 @@ class TwinLanes(LaneRun):
         return times_ns
 
     def read_records(self, i: int, columns: slice, runs: slice) -> Array:
-        """Returns numbers of the ticks that the last call of `step_to` executed.
+        """Returns results of the control periods that the last call of `step_to` executed.
 
         Args:
             i: Index of the site (arm controller).

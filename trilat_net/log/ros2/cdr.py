@@ -389,7 +389,7 @@ class _CdrReader:
         self._position = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """Decodes the next numbers of the message.
+        """Decodes the next numbers of a ROS 2 message, in the CDR format of ROS 2.
 
         Args:
             code: Type of the numbers, in the notation of the module `struct`.

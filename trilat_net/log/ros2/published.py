@@ -97,7 +97,7 @@ def list_full_topics(scenario: Scenario, session: str, table: TopicTable) -> Top
 
 
 class SiteMessages:
-    """Encodes everything that one site publishes as messages of ROS 2.
+    """Encodes everything that one arm controller (site) publishes as ROS 2 messages.
 
     Args:
         scenario: Scenario of the session.
@@ -433,7 +433,7 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Encodes the poses of all links of the arm in a tick, for viewers that draw the arm.
+        """Encodes the poses of all links of an arm for viewers, in one control period.
 
         Args:
             record: The record (result of a control period), which contains the joint positions.
@@ -455,7 +455,7 @@ class SiteMessages:
             yield self._pack_shared_frame(stamp_ns, numbers)
 
     def pack_statistics(self, stats: LinkStats) -> NamedMessages:
-        """Encodes the statistics of a site's links, such as ages and losses.
+        """Encodes statistics of network links, such as delays and losses, as ROS 2 messages.
 
         Args:
             stats: The statistics.
@@ -480,7 +480,7 @@ def _fill_rotation(values: Sequence[float]) -> list[float]:
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Encodes the status of all sites of a session for the ROS topic `/diagnostics`.
+    """Encodes the status of all arm controllers for the ROS 2 topic `/diagnostics`.
 
     Args:
         session: Name of the session.

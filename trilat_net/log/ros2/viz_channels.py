@@ -553,7 +553,7 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
         return None
 
     def make_views(session: str, epoch_unix_ns: int, put: PutMessage) -> VizChannels:
-        """Creates the messages for viewers of one file of the log.
+        """Prepares the messages for viewers, such as Foxglove, of one file of the log.
 
         Args:
             session: Name of the session.

@@ -95,7 +95,9 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Waits for the next state of the device from the service, and returns it.
+        """Waits for the next state of the haptic device: position, velocity and buttons.
+
+        A service of its manufacturer sends the states.
 
         Raises:
             ConnectionError: The service has no device, or has closed the connection.

@@ -111,7 +111,9 @@ class _Training(Frozen, frozen=True):
 
 
 class Protocol(Frozen, frozen=True):
-    """Protocol of an experiment. The attributes are the keys of its TOML file.
+    """Plan of an experiment with people, as an experimenter writes it in a TOML file.
+
+    The attributes are the keys of this file.
 
     Attributes:
         name: Name of the experiment.
@@ -337,7 +339,9 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Summarises the plan, as `trilat experiment check --json` prints it.
+        """Summarises the planned trials of an experiment as plain values, for JSON.
+
+        `trilat experiment check --json` prints them.
 
         Returns:
             Counts, conditions, and the order of the conditions for each group, ready for JSON.

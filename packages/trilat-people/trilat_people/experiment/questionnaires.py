@@ -36,7 +36,9 @@ Answers = Mapping[str, float | None]
 
 
 class Questionnaire(Frozen, frozen=True):
-    """A questionnaire of a protocol. A shipped questionnaire needs only its name.
+    """A questionnaire that participants of an experiment answer on a web page.
+
+    A shipped questionnaire, such as the NASA Task Load Index, needs only its name.
 
     Attributes:
         name: Name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
@@ -72,7 +74,7 @@ class Questionnaire(Frozen, frozen=True):
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
-        """Checks the answers that a page sent, and assigns them to the items.
+        """Checks a participant's answers from a web page, and assigns them to the questions.
 
         Args:
             values: Answers in the order of the items. None for a missing answer.
@@ -104,7 +106,7 @@ class Questionnaire(Frozen, frozen=True):
         return value in range(self.least, self.most + 1, self.step)
 
     def score(self, answers: Answers) -> float | None:
-        """Computes the score of a completed questionnaire.
+        """Computes the score of a questionnaire from a participant's answers.
 
         Args:
             answers: The answers by item.

@@ -79,7 +79,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Creates the goal of one trial: it states the target and decides when the trial ends.
+        """Creates the goal of one trial, which states its target and decides when it ends.
 
         Args:
             start_m: Position of the slave's end effector at the start, shape (2,) or (3,), in
@@ -91,7 +91,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
 
 class TrialGoal:
-    """The goal of one trial: where its target is, and when the trial ends.
+    """Target of one trial of an experiment, and the rule that decides when the trial ends.
 
     Args:
         start_m: Position of the slave's end effector at the start, in m.
@@ -120,7 +120,7 @@ class TrialGoal:
         self.appears_s = 0.0
 
     def find_target_m(self, t_s: float, user: int | None = None) -> Array:
-        """Returns the target position of the end effector, shape (2,) or (3,), in m.
+        """Returns where the end effector shall be at a time, shape (2,) or (3,), in m.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -185,7 +185,7 @@ class TrialGoal:
         position_m: Array,  # noqa: ARG002
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes measures of this task only, such as the mean force against a wall.
+        """Computes measures that only this task has, such as the mean force against a wall.
 
         Args:
             after_s: Times since the target's appearance, shape (K,), in s.
@@ -233,7 +233,9 @@ class Outcome(NamedTuple):
 
 
 class ReachTrial(TrialTask, frozen=True, tag="reach"):
-    """The task to reach targets on a ring, each opposite the previous one (ISO 9241-411).
+    """Task of an experiment: move the arm to targets on a ring, as in ISO 9241-411.
+
+    Each target is opposite the previous one.
 
     Attributes:
         targets: Number of targets.
@@ -504,7 +506,7 @@ class _ReachGoal(_DwellGoal):
 
 
 class ContactTrial(TrialTask, frozen=True, tag="contact"):
-    """The task to press a wall with a given force, and to hold the force for some time.
+    """Task of an experiment: press a wall with a given force, and hold it for some time.
 
     Attributes:
         axis: Axis of the arm's base frame along which the target is drawn, from 0.

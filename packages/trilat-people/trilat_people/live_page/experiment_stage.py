@@ -350,7 +350,7 @@ class Stage:
         return self._watch.poll(view, absent_sites)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
-        """Processes a message of a page, such as the answers to a questionnaire.
+        """Processes a message of a participant's web page, such as answers to a questionnaire.
 
         Args:
             site: Name of the user's site. Empty for an experimenter.

@@ -119,7 +119,7 @@ class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Request of a page to let stopped arms move again, or to reset arms after a fault.
+    """Request of a web page to let stopped arms move again, or to reset arms after a fault.
 
     Attributes:
         order: "enable" to let stopped arms follow the other arms again, "reset" to end faults.
@@ -182,7 +182,7 @@ class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
 
 
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
-    """Request of a page to take hold of an arm, to move it, or to release it.
+    """Request of a web page to take hold of an arm, to move it, or to release it.
 
     Attributes:
         site: Name of the process ("site") that controls the arm.
@@ -332,7 +332,7 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The rights of the person at a page, and the arm whose user's view the page shows.
+    """The rights of a person at a web page, and the arm from whose side the page shows all.
 
     Attributes:
         kind: An experimenter may do everything, a user may hold the arm of one site, and a
@@ -543,7 +543,7 @@ class PageHands:
 
 
 class _OpenQuery(NamedTuple):
-    """A request that was sent to a site, whose reply has not come yet.
+    """A request that was sent to an arm controller (site) and has not been answered yet.
 
     Attributes:
         inbox: Inbox that receives the reply.

@@ -253,7 +253,7 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """Command-line options that determine how the page of a session is served.
+    """Command-line options that determine how a session's web page is served.
 
     Attributes:
         host: Address at which the server listens.
@@ -271,7 +271,7 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the TLS settings with which the server encrypts its connections to browsers.
+        """Returns the TLS settings by which connections to browsers are encrypted.
 
         Returns:
             The settings, with the certificate and the private key from the folder `tls`. None

@@ -165,7 +165,7 @@ class _ArmFrames:
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Computes where the joints of the arm are, for a page that draws it.
+        """Computes where the joints of the arm are, for a web page that draws the arm.
 
         Args:
             q: Positions of the joints, shape (n,), in rad or m.
@@ -394,7 +394,7 @@ class SessionFrames:
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
-        """Describes what does not change during the session, for a page that draws it.
+        """Describes the constant facts about a session, for a web page that draws it.
 
         Returns:
             The sites, the links and the names of the plotted values, as plain values for JSON.

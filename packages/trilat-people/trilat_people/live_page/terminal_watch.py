@@ -48,7 +48,7 @@ def watch_session(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> int:
-    """Connects to a running session and shows it until it ends or a signal arrives.
+    """Shows a running session, as an observer, until it ends or a signal arrives.
 
     Args:
         session: Name of the session.
@@ -98,7 +98,7 @@ def watch_session(
 
 
 class SessionWatch:
-    """Composes the texts that `trilat watch` shows in a terminal about a running session.
+    """Composes the text by which `trilat watch` shows a running session in a terminal.
 
     Args:
         bus: Network connection that reaches the session.

@@ -278,7 +278,7 @@ def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
-    """Writes the results of a benchmark of control laws as a page, tables and figures.
+    """Writes the results of the benchmark of control laws as a page, tables and figures.
 
     Args:
         results: The results of the benchmark.

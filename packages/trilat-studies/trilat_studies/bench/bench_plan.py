@@ -419,7 +419,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Converts overrides of a scenario to texts KEY=VALUE, as the command line accepts them.
+    """Converts changed settings of a scenario to texts KEY=VALUE for the command line.
 
     Args:
         settings: Values by key of the scenario.
@@ -428,7 +428,9 @@ def format_settings(settings: Settings) -> list[str]:
 
 
 def load_tuning_task(form: str, law: str, round_trip_ms: int) -> TuningScenario:
-    """Loads the scenario in which the benchmark tunes a control law for a round trip.
+    """Loads the scenario in which the gains of a control law are tuned for the benchmark.
+
+    The law is tuned for one round trip of the network.
 
     Args:
         form: Kind of scenario, a key of `BASES`, such as "two" for two arms.
@@ -492,7 +494,7 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Reads gains that were tuned before from a file.
+    """Reads from a file the control gains that were tuned for the benchmark before.
 
     Args:
         path: The file.
@@ -673,7 +675,7 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
 
 
 def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes tuned gains into a file, and keeps the other gains of the file.
+    """Writes tuned control gains into a file, and keeps other gains that the file has.
 
     Args:
         tuned: The gains to write. They replace gains in the file that were tuned for the same
@@ -754,7 +756,7 @@ class BenchCell(NamedTuple):
 
 
 class BenchPlan(NamedTuple):
-    """All runs of a benchmark of control laws, or of a selected part, ready to be executed.
+    """All simulations of the benchmark of control laws, or of a part, ready to be executed.
 
     Attributes:
         study: Name of the study, which is a selection of tasks, laws and links.
@@ -830,7 +832,7 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Plans a study of the suite, or a part of it.
+    """Plans one of the studies of the benchmark of control laws, or a part of it.
 
     Args:
         study: A key of `STUDIES`.
@@ -904,7 +906,7 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Explains why the benchmark has no run of a control law in a task, for the tables.
+    """Explains in a table why the benchmark does not simulate a control law in a task.
 
     Args:
         law: Name of the control law.

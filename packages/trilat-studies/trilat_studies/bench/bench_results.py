@@ -44,7 +44,9 @@ LEAST_SEEDS = 20
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns the name under which the journal of finished runs stores the runs of a cell.
+    """Returns the name under which a journal stores the finished simulations of one law.
+
+    It belongs to one control law in one task over one network link.
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
@@ -345,7 +347,9 @@ class BenchResults(Result):
         return f"{self.plan.study}: {cells}, {runs}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat bench --json` prints them.
+        """Converts the results of the benchmark to plain values, for JSON.
+
+        `trilat bench --json` prints them.
 
         Returns:
             The study, the gains that its cells use, and the rows of all cells ("places").
@@ -364,7 +368,7 @@ class BenchResults(Result):
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
-        """Yields the results of a task, optionally those of one control law or one link only.
+        """Yields the results of one task, for all or one of the control laws and links.
 
         Args:
             task: Name of the task, such as "contact".
@@ -377,7 +381,7 @@ class BenchResults(Result):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of one law in one task over one link.
+        """Returns the result of one control law in one task over one network link.
 
         Args:
             task: Name of the task.
@@ -761,7 +765,7 @@ def _tabulate_gains(results: BenchResults) -> TextTable:
 def build_bench_page(
     results: BenchResults, command: str, pictures: Mapping[str, str] = {}
 ) -> str:
-    """Builds the page of the results in Markdown.
+    """Composes the Markdown page that reports the results of the benchmark.
 
     Args:
         results: Results of the suite or of a part of it.

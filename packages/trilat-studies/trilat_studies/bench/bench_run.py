@@ -756,7 +756,7 @@ BenchFolder = StudyFolder[BenchPlan, BenchRun]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
-    """Creates the folder of a benchmark, or opens an existing folder with finished runs.
+    """Creates the folder of a benchmark, or opens one in which some runs are finished.
 
     Args:
         plan: Plan of the benchmark.
@@ -825,7 +825,7 @@ def run_bench(
     *,
     confirm: bool = False,  # noqa: ARG001
 ) -> BenchResults:
-    """Executes the runs of a benchmark that are not finished yet.
+    """Executes those simulations of a benchmark that are not finished yet.
 
     Args:
         folder: Folder of the benchmark. Its journal contains the finished runs.

@@ -194,7 +194,7 @@ def _bisect(
 
 
 class SearchRange(NamedTuple):
-    """Key of a scenario along which edges of stability are searched, and the searched range.
+    """A setting along which the limits of stability are searched, and the searched range.
 
     Attributes:
         key: Scenario key along which edges are searched.
@@ -257,7 +257,7 @@ class GridPointMargin(NamedTuple):
 
 
 def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
-    """Parses the range of a search, such as "control.d=0.2:3".
+    """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
 
     Args:
         text: Text of the form KEY=FROM:TO.
@@ -370,7 +370,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        """Returns the scenario of this grid point and seed with a value of the searched key.
+        """Returns the scenario of one combination with a value of the searched setting.
 
         Args:
             value: Value of the scenario key along which the limit of stability is searched.
@@ -584,7 +584,7 @@ class SweepMargins(Result):
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> list[Path]:
-        """Writes the results into an existing folder, as margin.json and margin.md.
+        """Writes the limits of stability into an existing folder, as margin.json and margin.md.
 
         Args:
             folder: The folder.

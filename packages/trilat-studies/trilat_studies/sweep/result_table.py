@@ -42,7 +42,7 @@ trace exceeds the default limit of the csv module, 131 072 characters.
 
 
 def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Iterator[str]:
-    """Yields the CSV text of a header and of each row, so that a table may be large.
+    """Yields a table as CSV text line by line, so that a large one needs little memory.
 
     Args:
         rows: The rows, as values by column.
@@ -94,7 +94,7 @@ class ResultTable:
         return line
 
     def parse(self, line: Mapping[str, str]) -> ResultRow:
-        """Returns the row of a line of the CSV table, with the complete text of its scenario.
+        """Returns the results in one line of a CSV table, with the scenario's full text.
 
         Args:
             line: Texts of the line, by column.
@@ -208,7 +208,7 @@ class StoredRows(Sequence[ResultRow]):
                     yield self._name_fields(fields)
 
     def _name_fields(self, fields: Sequence[str]) -> dict[str, str]:
-        """Returns the texts of a row, in the order of the file, as texts by column.
+        """Returns the fields of one line of the CSV table by the names of their columns.
 
         Raises:
             ValueError: The row has too few or too many fields.
@@ -287,7 +287,7 @@ def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
 
 
 def format_table_cell(value: Any, kind: type) -> str:
-    """Returns the text of a cell of the CSV table, from which numbers parse back bit for bit.
+    """Converts a value to a field of a CSV table, from which a number reads back bit for bit.
 
     Args:
         value: The value. None becomes an empty text.
@@ -301,7 +301,7 @@ def format_table_cell(value: Any, kind: type) -> str:
 
 
 def _parse_cell(text: str, kind: type) -> Any:
-    """Returns the value of a cell of the CSV table; the inverse of `format_table_cell`.
+    """Converts a field of a sweep's CSV table to a value; the inverse of `format_table_cell`.
 
     Args:
         text: Text of the cell.

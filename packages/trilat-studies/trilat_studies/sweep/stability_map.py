@@ -945,7 +945,7 @@ class MapLine(NamedTuple):
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: _FineColumns) -> "MapLine":
-        """Returns this line, given at fine columns, with the columns of the map apart.
+        """Divides a line of theory into its points at a map's columns and those between.
 
         Args:
             columns: The columns at which the line is given.
@@ -1237,7 +1237,7 @@ LAW_AXIS = "law"
 
 
 class StabilityMap(NamedTuple):
-    """A complete stability map: the measurements and the lines from theory.
+    """Map of stable and unstable parameters: simulated results and lines from theory.
 
     Attributes:
         plane: The measurements, as panels.

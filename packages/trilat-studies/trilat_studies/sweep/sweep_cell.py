@@ -505,7 +505,7 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 def _build_result(
     run: FusedRun, end: RunEnd, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
-    """Returns the result of a cell, as far as its run has been simulated so far.
+    """Returns how a simulation of a sweep has ended, as far as it has been continued.
 
     Args:
         run: The run.
@@ -571,7 +571,7 @@ def diff_lines(text: str, base: str) -> LineDiff:
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
-    """Restores a text from its differences from a base, as `diff_lines` encoded them.
+    """Restores a text from its differences from another text, see `diff_lines`.
 
     Args:
         parts: Differences, as `diff_lines` returns them.
@@ -589,7 +589,7 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
 
 
 class CellRun(msgspec.Struct, frozen=True):
-    """A finished run of a sweep with its result, as the journal of the sweep stores it.
+    """A finished simulation of a sweep with its result, as the sweep's journal stores it.
 
     Attributes:
         cell: Number of the cell.

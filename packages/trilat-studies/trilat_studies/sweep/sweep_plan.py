@@ -122,7 +122,7 @@ class _SweepAxis(NamedTuple):
 
 
 def parse_axis(description: str) -> _SweepAxis:
-    """Parses the text with which a user describes an axis of a sweep.
+    """Parses a swept parameter, as a user writes it, such as "link.delay_ms=0:200:10".
 
     Args:
         description: Either "KEY=a:b:step", a range that includes b if a whole number of steps
@@ -156,7 +156,7 @@ def parse_axis(description: str) -> _SweepAxis:
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Converts the axes of a sweep, as a Python program may give them, to texts KEY=VALUES.
+    """Converts swept parameters, as a Python program may give them, to texts KEY=VALUES.
 
     Args:
         over: One text, a list of texts, or a mapping from keys to values. The values are a
@@ -188,7 +188,7 @@ def _join_values(values: Any) -> str:
 
 
 def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
-    """Returns the values of a range "first:last:step".
+    """Returns the values of a swept parameter that is written as "first:last:step".
 
     Args:
         key: Scenario key of the axis, for error messages.
@@ -318,7 +318,7 @@ _CHECKED_VALUES = 32
 
 
 class SweepCell(NamedTuple):
-    """One combination of the parameter values of a sweep and of a control law.
+    """One combination of parameter values and a control law, as a sweep simulates it.
 
     Attributes:
         number: Number of the cell, counted row by row from 0. The law changes slowest, and the
@@ -396,7 +396,7 @@ class SweepPlan(NamedTuple):
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
-        """Returns the combination of parameter values and control law with a given number.
+        """Returns a combination of parameter values and control law by its number.
 
         Args:
             number: Number of the combination, from 0, counted row by row in the grid of the
@@ -668,7 +668,7 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
 
 
 class _Base(NamedTuple):
-    """The scenario of a sweep before its axes and laws are applied.
+    """Scenario of a sweep before any parameter is varied.
 
     Attributes:
         scenario: The scenario.
@@ -844,7 +844,7 @@ def spread_indices(count: int) -> list[int]:
 
 
 def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
-    """Loads the scenario of a cell.
+    """Loads the scenario of one combination of swept parameters.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -899,7 +899,7 @@ def label_axis(key: str, scenario: Scenario | None = None) -> str:
 
 
 def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
-    """Returns a key with its value, such as "delay 200 ms" for link.delay_ms = 200.
+    """Returns a setting as a label with unit, such as "delay 200 ms" for link.delay_ms = 200.
 
     Args:
         key: Scenario key.
@@ -917,7 +917,7 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
 
 
 def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Splits a scenario key into the name and the unit of its quantity, for labels.
+    """Splits the name of a setting, such as delay_ms, into a name and a unit for labels.
 
     Args:
         key: Scenario key, such as "sites.s.control.K" or "link.delay_ms".
@@ -940,7 +940,7 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
 
 
 def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
-    """Returns the site, link or actor to which a key belongs, as the end of a label.
+    """Returns the site, link or actor to which a setting belongs, as the end of a label.
 
     Args:
         tables: Names of the tables that contain the key, from the outermost one.
@@ -969,7 +969,7 @@ def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
 
 
 def build_sweep_command(plan: SweepPlan, *more: str) -> str:
-    """Returns the command that runs a sweep. Options with default values are left out.
+    """Returns the shell command that repeats a sweep. Default options are left out.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -1003,7 +1003,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
 
 
 def format_override(key: str, value: Any) -> str:
-    """Returns the override KEY=VALUE that sets a key.
+    """Returns the text KEY=VALUE that changes one setting of a scenario.
 
     Args:
         key: Scenario key.

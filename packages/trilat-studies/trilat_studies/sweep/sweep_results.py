@@ -90,7 +90,9 @@ class SweepResults(Result):
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat sweep --json` prints them.
+        """Converts the results of a parameter sweep to plain values, for JSON.
+
+        `trilat sweep --json` prints them.
 
         Returns:
             The facts of the plan, and a row per run with the columns of the CSV table.
@@ -125,7 +127,7 @@ class SweepResults(Result):
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Builds the table of results from the finished runs of a sweep.
+    """Returns the results of a parameter sweep as table rows, one per simulation.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -209,7 +211,7 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
 def build_sim_command(
     plan: SweepPlan, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
-    """Returns the command that simulates a run again and records its log.
+    """Returns the shell command that repeats one simulation of a sweep and records a log.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -249,7 +251,7 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
 
 
 def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
-    """Returns the results as CSV text, with one line per run.
+    """Encodes the results of a parameter sweep as CSV text, one line per simulation.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -259,7 +261,7 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
 
 
 def read_results(path: Path) -> SweepResults:
-    """Reads the results of a finished sweep.
+    """Reads the results of a finished parameter sweep from its folder.
 
     Args:
         path: Folder of the sweep, or its CSV table.
@@ -356,7 +358,7 @@ def list_totals(plan: SweepPlan) -> list[str]:
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Combines the runs of a sweep that differ only in their random seeds.
+    """Summarises the simulations of a sweep that differ only in their random seeds.
 
     Args:
         results: Results of the sweep: its plan and one row per run.
@@ -453,7 +455,7 @@ _MAX_CELLS_SHOWN = 8
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns lines that tell the user how many runs a sweep has, and over which values.
+    """Tells the user how many simulations a sweep has, and over which values, as lines.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -545,7 +547,7 @@ GROWTH_EXPONENTS = "growth exponents of small pushes"
 
 
 def _list_quantities(plan: SweepPlan) -> dict[str, tuple[str, str]]:
-    """Returns the quantities whose ranges a summary prints: name and unit, by key.
+    """Returns the names and units of quantities whose ranges a summary prints, by key.
 
     Args:
         plan: The sweep, whose requested metrics come first.
@@ -614,7 +616,7 @@ class _RowTally:
 
 
 def _tally_rows(results: SweepResults) -> _RowTally:
-    """Collects the numbers of the summary of a sweep in one pass over its table of runs.
+    """Counts the results of a sweep for its summary, in one pass over all simulations.
 
     Args:
         results: Results of the sweep: its plan and one row per run.

@@ -114,7 +114,7 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
-    """Prepares the folder of a sweep: a new one, or an existing one with finished runs.
+    """Creates the folder of a sweep, or opens one in which some runs are finished.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -133,7 +133,7 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
 
 
 def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFolder:
-    """Opens the folder of a sweep that was started before.
+    """Opens the folder of a parameter sweep that was started before.
 
     Args:
         path: Path of the folder.
@@ -247,7 +247,7 @@ _RESUME_HINT = "; finished runs are kept: continue with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """Estimated duration of the runs of a sweep that remain.
+    """Estimated duration of those simulations of a sweep that remain.
 
     Attributes:
         runs: Largest possible number of runs that remain.
@@ -352,7 +352,7 @@ def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
 
 
 def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
-    """Executes several runs of a sweep, side by side where that is possible.
+    """Executes several simulations of a sweep, side by side where that is possible.
 
     Args:
         tasks: The runs, of one sweep.
@@ -386,7 +386,7 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
 
 
 def _build_scenario(task: CellItem) -> Scenario:
-    """Returns the scenario of one run of a sweep, with the values of its cell and its seed.
+    """Returns the scenario of one simulation of a sweep, with its parameters and seed.
 
     Raises:
         ScenarioError: The scenario is not valid or cannot run.
@@ -471,7 +471,7 @@ def _compile_lanes(plan: SweepPlan) -> None:
 
 
 def describe_runs_alone(finished: FinishedSweep) -> str:
-    """Returns a sentence on runs that were not computed side by side, and why.
+    """Tells the user which simulations were not computed side by side, and why.
 
     Args:
         finished: The finished sweep.
@@ -490,7 +490,7 @@ def describe_runs_alone(finished: FinishedSweep) -> str:
 def estimate_sweep(
     plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
 ) -> DurationEstimate:
-    """Estimates the duration of a sweep by running a few cells that are spread over the grid.
+    """Estimates how long a sweep takes, by a few simulations spread over its parameters.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -572,7 +572,7 @@ def run_sweep(
     known: Iterable[CellRun] = (),
     on: Workers = None,
 ) -> FinishedSweep:
-    """Runs the remaining runs of a sweep, and writes the results into its folder.
+    """Executes the remaining simulations of a parameter sweep, and writes all results.
 
     Args:
         folder: Folder of the sweep. The runs in its journal are not repeated.

@@ -808,7 +808,7 @@ class TuningScenario(NamedTuple):
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
     ) -> "TuningScenario":
-        """Returns this scenario with a given control law and given values of its gains.
+        """Returns this scenario with another control law and other values of its gains.
 
         Args:
             space: The control law.
@@ -840,7 +840,7 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """Everything that a worker process needs to run a control law with chosen gains.
+    """Everything that a worker process needs to simulate a control law with chosen gains.
 
     Attributes:
         runs: For each random seed, the text of the scenario, and the text of the same scenario
@@ -888,7 +888,7 @@ LANE_RUNS = 16
 
 
 def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[CandidateScore]:
-    """Runs several candidates with all of their seeds, side by side where that is possible.
+    """Simulates several choices of gains with all random seeds, side by side if possible.
 
     Args:
         tasks: The runs of each candidate.

@@ -163,7 +163,7 @@ class _TunedGain(NamedTuple):
 
 
 class SearchSpace(NamedTuple):
-    """The gains of one control law that are tuned, each with its unit and its range.
+    """Gains of one control law that are tuned automatically, with their units and ranges.
 
     Attributes:
         law: Name of the law. The name "known" stands for the law `adaptive` without adaptation,
@@ -376,7 +376,7 @@ PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
 
 
 def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
-    """Returns the search spaces of some laws, in their order and without duplicates.
+    """Returns which gains of the given control laws are tuned, each law once.
 
     Args:
         laws: Names of built-in laws, or classes as in "mylaws:Spring". Empty stands for

@@ -83,7 +83,9 @@ class Objective(StrEnum):
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns the objective and the effort of a candidate, as a point for its Pareto front.
+        """Returns the error (or time) and the motor effort of a candidate, to compare both.
+
+        The candidates that no other one beats in both form the Pareto front.
 
         Args:
             score: Score of the candidate.
@@ -275,7 +277,7 @@ class CandidateSearch:
     def record_scores(
         self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
     ) -> None:
-        """Stores the scores of a round, from which the next round is proposed.
+        """Stores how well some gains performed, from which the next ones are proposed.
 
         Args:
             gains: The candidates that were run.
@@ -455,7 +457,7 @@ class TuningPlan(NamedTuple):
         }
 
     def estimate_s(self, jobs: int | None = None) -> float:
-        """Estimates the duration of the search from a short run, in s of real time.
+        """Estimates from a short simulation how long the tuning takes, in s of real time.
 
         Args:
             jobs: Number of worker processes. None stands for all cores.
@@ -542,7 +544,7 @@ class TuningPlan(NamedTuple):
         return TuningResult(self, searches, printed)
 
     def _uses_lanes(self, first_candidates: Sequence[CandidateItem]) -> bool:
-        """Returns True if the runs of every law can be simulated side by side (in SIMD lanes).
+        """Returns True if several simulations of every law can be computed side by side.
 
         Args:
             first_candidates: One candidate of each law.
@@ -583,7 +585,7 @@ _EDGE = 1.02
 
 @dataclass(frozen=True, repr=False)
 class TuningResult(Result):
-    """Result of a comparison of control laws, each with the best gains that a search found.
+    """Comparison of control laws, each with the best gains that a search has found.
 
     Attributes:
         plan: The comparison: its scenario, the laws and the ranges of their gains.
@@ -721,7 +723,7 @@ class TuningResult(Result):
         return rows
 
     def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
-        """Returns the scenario of a candidate, with which its run can be repeated.
+        """Returns the scenario with the gains of one candidate, to simulate it again.
 
         Args:
             search: Search of the candidate's law.
