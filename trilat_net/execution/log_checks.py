@@ -428,7 +428,7 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
 def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Returns the finding that states how many records equal those of another execution.
+    """Returns whether a log equals another execution of its run, with the number of records.
 
     Args:
         label: Name of the check.

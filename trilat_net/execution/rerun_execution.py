@@ -71,7 +71,7 @@ _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 
 
 class _ChangedValue(NamedTuple):
-    """One value of the scenario that a rerun of a log changes.
+    """One setting, such as a gain, that differs between a recorded run and its repetition.
 
     Attributes:
         key: Dotted path of the value in the resolved scenario, for example of a gain.

@@ -987,7 +987,9 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def _open_rerun_source(log: Log) -> Log | None:
-    """Opens the log from which a rerun was made, if it is in the same folder as the rerun.
+    """Opens the log of which another log is a repetition with changed settings (rerun).
+
+    It must be in the same folder as the rerun.
 
     Args:
         log: Log of the rerun. It states the hashes of the files of its source.

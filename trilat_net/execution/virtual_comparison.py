@@ -89,7 +89,7 @@ class _LateSample(NamedTuple):
 def _compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
 ) -> RecordComparison:
-    """Compares every record of a log with another execution, bit for bit.
+    """Compares every record of a log with another execution of the run, bit for bit.
 
     Args:
         log: Log whose records are compared.

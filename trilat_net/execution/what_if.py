@@ -290,7 +290,7 @@ def _find_largest(values: Array) -> float:
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[LinkEffect]:
-    """Returns the effect of a rerun on the links over which a site (arm controller) receives.
+    """Returns how the delays on the network links to an arm differ in the repeated run.
 
     Args:
         log: The log.

@@ -309,7 +309,9 @@ class ContentCheck:
     def _check_session_message(
         self, topic: str, sequence: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Checks that a message of a member is the next one of its channel.
+        """Checks that a message from a process of the session is the next one of its channel.
+
+        A damaged file may contain messages of other sessions, which must not be copied.
 
         Args:
             topic: Topic of the channel.
@@ -388,7 +390,7 @@ class ContentCheck:
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Checks that a message has the next number of its channel.
+        """Checks that a message has the next number of its channel, so that none is repeated.
 
         Args:
             topic: Topic of the channel.

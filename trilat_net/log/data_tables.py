@@ -215,7 +215,7 @@ _COMPLETE_TEXTS = {
 
 
 class _FieldDoc(NamedTuple):
-    """Documents one field of a message, for the head of an exported table.
+    """Name, unit and meaning of one field of a message, for the head of an exported table.
 
     Attributes:
         unit: Unit of the field. Empty if it has no unit.
@@ -360,7 +360,9 @@ def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Co
 def _make_task_columns(
     site: SiteLog, arm: ArmModel, field: str, units: tuple[str, str]
 ) -> Iterator[Column]:
-    """Yields the columns of a vector that has a number per coordinate of the end effector.
+    """Yields the columns of a vector with a number per coordinate of the end effector.
+
+    An example is the position x, y and z.
 
     Args:
         site: Records of the site (arm controller).
@@ -437,7 +439,7 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
-    """Returns the column of one number of a vector, for example of joint 1 of the angles q.
+    """Returns a table column with one number of a vector, for example of joint 1 of "q".
 
     Args:
         site: Records of the site (arm controller).
@@ -485,7 +487,7 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
 
 
 def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
-    """Yields the columns of the operator, the person or program that moves the arm.
+    """Yields the columns about the operator, a person or program that moves the arm.
 
     Args:
         site: Records of the site.

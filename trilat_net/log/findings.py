@@ -20,7 +20,7 @@ _MAX_LISTED_PROBLEMS = 1000
 
 
 class _ProblemPlace(NamedTuple):
-    """A problem in a file, and the place where it was found.
+    """A problem that a check has found in a file, with its place in this file.
 
     Attributes:
         file: Name of the file.
@@ -39,7 +39,9 @@ class _ProblemPlace(NamedTuple):
 
 @dataclass(slots=True)
 class Finding:
-    """Result of one check of a log or a run, with the problems that it found.
+    """Result of one check of a log or a run, such as that of missing records.
+
+    It has the problems that the check found.
 
     Attributes:
         check: Name of the check. Every file is checked for "whole", "checksums", "records" and

@@ -1058,7 +1058,7 @@ def _read_parts(
 
 
 def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
-    """Opens one file of a log, unless the caller has opened the file already.
+    """Opens one file of a log. A file that the caller has opened already is used as it is.
 
     Args:
         source: Path, or binary file opened for reading.

@@ -48,7 +48,7 @@ _MAX_BYTES = 65_536
 
 
 class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a signature's file.
+    """Content of the file beside a log that contains its cryptographic signature.
 
     Attributes:
         format: Name and version of the format.
@@ -199,7 +199,7 @@ def check_signatures(
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
-    """Checks the signature of one log.
+    """Checks that a log has not been changed since it was signed.
 
     Args:
         path: The log.

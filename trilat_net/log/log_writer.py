@@ -177,7 +177,7 @@ class LogWriter:
     def _register_channels(
         self, scenario: SessionScenario, session: str, choice: log_layout.ChannelFilter
     ) -> dict[str, int | None]:
-        """Registers the schemas and channels of the session.
+        """Registers all topics of a session and their message formats in the log file.
 
         Args:
             scenario: Scenario of the session.

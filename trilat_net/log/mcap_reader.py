@@ -832,7 +832,7 @@ class McapReader:
 
 @dataclass
 class _PartlyReadRecord:
-    """A record with messages and definitions, and how far it has been read.
+    """A record of an MCAP file that contains messages, and how far it has been read.
 
     Attributes:
         frame: Kind and place of the record in the file.
@@ -913,7 +913,7 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Adds the next message of the topic, in the order of the file.
+        """Appends a message to those of the topic, in the order of the file.
 
         Args:
             payload: The message, encoded as published.
@@ -939,7 +939,7 @@ class ChannelMessages:
         self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the times of all K messages as arrays.
+        """Returns when each of the topic's K messages was sent and recorded, as arrays.
 
         Returns:
             The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of
@@ -993,7 +993,7 @@ class LogContents:
 def read_contents(
     stream: BinaryIO, name: str, progress: Progress | None = None, *, trusted: bool = False
 ) -> LogContents:
-    """Reads the contents of a log from one file.
+    """Reads everything in one file of a log into memory, without decoding the messages.
 
     Args:
         stream: The file, opened for reading.

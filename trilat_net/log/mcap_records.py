@@ -102,7 +102,7 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Decodes the head of a chunk, and checks that it agrees with the length of the chunk.
+    """Decodes the head of a chunk (compressed block of messages), and checks its lengths.
 
     Args:
         content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
@@ -370,7 +370,7 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads bytes of the file, but never beyond its end.
+        """Reads some bytes of the file; fewer are returned at the end of the file.
 
         Args:
             offset: Offset of the first byte in the file.
@@ -598,7 +598,7 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Checks an attachment, such as the scenario of a log, by the checksum at its end.
+    """Returns True if an attachment of a log, such as its scenario, has its stored checksum.
 
     Args:
         attachment: Content of the attachment's record.

@@ -74,7 +74,7 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
 
 
 def _check_same_session(first: LogContents, other: LogContents) -> None:
-    """Checks that two files are parts of the log of the same session.
+    """Checks that two files belong to the log of the same session, before they are joined.
 
     Raises:
         LogError: The files belong to different sessions. The text lists the differences.

@@ -60,7 +60,7 @@ def decode_ticks(payloads: Sequence[bytes]) -> Ints:
 
 
 def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Decodes some integer fields of every record, without decoding the rest of the records.
+    """Decodes some integer fields of every record, and skips all other fields.
 
     Args:
         payloads: K encoded records (results of control periods).
@@ -79,7 +79,7 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Decodes some vector fields of every record, without decoding the rest of the records.
+    """Decodes some vectors, such as joint angles, of every record, and skips other fields.
 
     Args:
         payloads: K encoded records.

@@ -75,7 +75,7 @@ _REGENERATED = frozenset(
 
 @dataclass(repr=False)
 class Recovery(Result):
-    """Result of a recovery: what was copied to the new file, and what was lost.
+    """Result of the recovery of a damaged log: what was copied and what was lost.
 
     Attributes:
         path: The source file.
@@ -387,7 +387,7 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies everything that can be read from the damaged file, and finishes the new file.
+        """Copies everything that can be read from a damaged log into a new file.
 
         Args:
             restored: Text of the scenario (the description of the experiment), from a file
@@ -1113,7 +1113,9 @@ def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
 def _create_content_check(
     survey: RecoverySurvey, accounts: SessionAccounts | None
 ) -> ContentCheck | None:
-    """Creates the check that recognises intact messages by their content, without a checksum.
+    """Creates a check that recognises intact messages by their content.
+
+    It is used where a damaged file has no checksum.
 
     Args:
         survey: Survey of the source file.

@@ -126,7 +126,7 @@ class RunningDigest:
     def judge(
         self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
     ) -> Integrity:
-        """Compares the digests of a file that was read with those that the file contains.
+        """Decides whether a file was changed, by the hashes that the file itself contains.
 
         Args:
             metadata: All metadata of the file, by name. They contain its digests.
@@ -171,7 +171,7 @@ class RunningDigest:
 
 
 def _judge_without_chain(*, is_announced: bool, finished: bool) -> Integrity:
-    """Judges a file that contains no digests.
+    """Returns the result of checking a file that contains no hashes.
 
     Args:
         is_announced: True if the beginning of the file announces digests.

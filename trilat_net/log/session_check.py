@@ -384,7 +384,7 @@ class _ChannelCheck:
 
 
 def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMessage]:
-    """Yields the messages of a file. Each record is checked before its messages are yielded.
+    """Yields the messages of a file, after a check of the record that contains them.
 
     Args:
         reader: Reader of the file.

@@ -106,7 +106,7 @@ class SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a new message with the next number to the site (arm controller).
+        """Sends a message to an arm controller (site), under the next number.
 
         Args:
             kind: Class of the message.
@@ -539,7 +539,7 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Moves the target position, towards which the operator pulls the end effector.
+        """Pulls the end effector of the arm towards a target position, like a spring.
 
         Args:
             *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
@@ -555,7 +555,7 @@ class Hand(SiteClient):
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Sets target angles of the joints, towards which the operator turns them.
+        """Pulls the joints of the arm towards target angles, like springs.
 
         Args:
             *angles_rad: Target angle of each joint, in rad.
@@ -570,7 +570,7 @@ class Hand(SiteClient):
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Sets the force with which the operator pushes the end effector.
+        """Pushes the end effector of the arm with a force, as a person would with a hand.
 
         Args:
             *force_n: Coordinates of the force that acts ON the end effector, in N.
@@ -707,7 +707,7 @@ class Hand(SiteClient):
         return record
 
     def _send(self, action: str, numbers: Sequence[float]) -> int:
-        """Sends a target or a force of the operator, and returns the number of the message.
+        """Sends a target or force to the arm controller, and returns the message's number.
 
         Args:
             action: Name of the method that the program called: "move", "turn" or "push".

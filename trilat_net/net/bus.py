@@ -143,7 +143,9 @@ class Bus(Protocol):
         """
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to the queries under a key at once, in a network thread.
+        """Replies to requests under a key at once, in a network thread.
+
+        The calculation of the reply must therefore be short.
 
         Args:
             key: The key, which may contain wildcards.

@@ -275,7 +275,7 @@ def _query_once(
     key: str,
     request: Request,
 ) -> bytes | None:
-    """Sends a request once, and waits for the first reply.
+    """Sends a request to other processes once, and waits for the first reply.
 
     Args:
         bus: Network connection that reaches the receiver.

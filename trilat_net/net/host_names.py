@@ -57,7 +57,7 @@ def _is_address(host: str) -> bool:
 
 
 def _resolve(host: str, endpoint: str) -> None:
-    """Checks that the name service can resolve a host name to an address.
+    """Checks that a host name in a network address can be resolved, before it is used.
 
     Args:
         host: The host name.

@@ -249,7 +249,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 
 
 def _read_authority(folder: Path) -> tuple[x509.Certificate, Any]:
-    """Reads the certificate and the private key of the authority.
+    """Reads the certificate and the private key that sign the keys of all processes.
 
     Args:
         folder: Folder that `create_keys` created.
@@ -463,7 +463,7 @@ def _renew_member(
     authority_key: Any,
     ends: datetime.datetime,
 ) -> tuple[x509.Certificate, str]:
-    """Signs a new certificate for the existing private key of a member.
+    """Signs a new certificate for the existing private key of one process.
 
     Args:
         folder: Folder of the member.
@@ -855,7 +855,7 @@ def _find_key_fault(
     key: Any,
     ends: datetime.datetime,
 ) -> str:
-    """Returns the first fault of the keys of a member. Empty if the keys are valid.
+    """Returns the first fault in the keys of a process. Empty if the keys are valid.
 
     Args:
         folder: Folder of the member.
@@ -905,7 +905,7 @@ def _find_key_fault(
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings of a member that uses the keys in a folder.
+    """Returns the Zenoh settings with which a process uses its keys for encryption.
 
     Args:
         folder: Folder of the member (process of a session).

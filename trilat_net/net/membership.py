@@ -172,7 +172,7 @@ class EventPublisher:
         self._queries = bus.query_inbox(topics.key(session, info.member, topics.INFO))
 
     def publish(self, kind: str, text: str, **fields: object) -> Event:
-        """Publishes an event under the next number.
+        """Publishes a notable occurrence (event) to all other processes, under the next number.
 
         Args:
             kind: Kind of the event, which programs read.

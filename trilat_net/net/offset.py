@@ -78,7 +78,7 @@ class OffsetLimit(NamedTuple):
 
 
 class OffsetEstimate(NamedTuple):
-    """Estimate of the offset and the drift of another clock relative to the local clock.
+    """Estimate of how far another clock is ahead of the local clock, and of its drift.
 
     Attributes:
         local_ns: Time on the local clock for which the estimate holds, in ns.
@@ -164,7 +164,7 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Formats an offset between two clocks, and its error bound, for the user.
+    """Writes an offset between two clocks and its error bound as text for the user.
 
     Args:
         offset_ns: The offset, in ns.
@@ -509,7 +509,7 @@ class SlewedOffset:
         self._segment = segment
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the smoothed offset between the two clocks at a time.
+        """Returns the clock offset in use at a time, which changes only gradually, in ns.
 
         Args:
             local_ns: The time on the local clock, in ns. It must not be earlier than the time

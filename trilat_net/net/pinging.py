@@ -143,7 +143,7 @@ def answer_backfill(
     boot: int,
     find: Callable[[BackfillRequest], tuple[int, list[bytes], int]],
 ) -> int:
-    """Replies to a recorder's query for messages that were lost on the way.
+    """Sends messages again that were lost on the way to a recorder, at its request.
 
     Args:
         query: The query as it has arrived from the recorder.

@@ -144,7 +144,7 @@ class Attachment(NamedTuple):
 
 
 def parse_attachment(content: Any) -> Attachment | None:
-    """Parses the attachment of a message.
+    """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
 
     Args:
         content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no

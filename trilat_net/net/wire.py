@@ -266,7 +266,9 @@ def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
 
 
 def split_states(block: bytes) -> Iterator[bytes]:
-    """Splits a block into the payloads of its records, without decoding them.
+    """Splits a network message with several records into one payload per record.
+
+    The records are not decoded.
 
     Args:
         block: One or more encoded records (results of control periods), as `join_states` joins

@@ -176,7 +176,7 @@ def open_zenoh(
     settings: Mapping[str, Any] | None,
     silent: str,
 ) -> Any:
-    """Opens a Zenoh session with the settings of `make_zenoh_config`.
+    """Connects to the Zenoh network, with the settings of `make_zenoh_config`.
 
     Args:
         listen: Endpoints at which the session listens.
@@ -306,7 +306,7 @@ class ZenohBus:
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a queue of decoded messages, each with its time of arrival.
+        """Returns a queue of decoded network messages, each with its time of arrival.
 
         Args:
             key: Key under which the messages are published. It may contain wildcards.
@@ -349,7 +349,7 @@ class ZenohBus:
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to the queries under a key at once, in a thread of Zenoh.
+        """Replies to requests under a key at once, in a thread of Zenoh.
 
         Args:
             key: Key of the queries, which may contain wildcards.
@@ -373,7 +373,7 @@ class ZenohBus:
         )
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Sends a query, and returns a queue for the replies.
+        """Sends a request to other processes, and returns a queue for their replies.
 
         Args:
             key: Key of the query. Every member (process of a session) that serves a matching

@@ -326,7 +326,7 @@ class ZenohFile:
     def endpoints(
         self, side: Literal["listen", "connect"], mode: ZenohMode
     ) -> list[Endpoint] | None:
-        """Returns the endpoints that the file names.
+        """Returns the network addresses that a user's Zenoh file names for one direction.
 
         Args:
             side: "listen" for the endpoints at which the member (process of a session) listens,
@@ -348,7 +348,7 @@ class ZenohFile:
 def check_zenoh_file(
     source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
 ) -> ZenohFile:
-    """Checks the content of a user's Zenoh file.
+    """Checks that a session can work with the settings in a user's Zenoh file.
 
     Args:
         source: Name of the file, for error messages.
@@ -501,7 +501,7 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Finds the settings that Zenoh refuses, by checking each setting alone.
+    """Finds out which settings Zenoh refuses, by trying each setting alone.
 
     Args:
         settings: Settings below `path`.

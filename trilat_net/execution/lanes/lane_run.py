@@ -216,7 +216,9 @@ def list_argument_types(
 
 
 def _type_numbers(count: int, rows: int) -> LaneTable:
-    """Returns Numba's type of a table whose rows contain one vector, `numbers`.
+    """Returns the Numba type of a table in which every row is a vector of numbers.
+
+    Compiled code addresses this vector as the field `numbers` of a row.
 
     Args:
         count: Count of numbers.

@@ -115,7 +115,7 @@ def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any
 
 @leaf
 def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the offset of the integer that follows some constant bytes (a literal).
+    """Returns the offset of an integer in an encoded record, after constant bytes.
 
     Args:
         data: The records.
@@ -487,7 +487,9 @@ def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: I
 
 @loop_leaf
 def gather_memories(data: Bytes, starts: Ints, marks: Any, counts: Any, bits: Ints) -> None:
-    """Reads the internal state of the control law (field `mem`) from every record, as bits.
+    """Reads the internal state of the control law from every encoded record, as bits.
+
+    It is the field `mem` of a record.
 
     Args:
         data: The encoded records, followed by padding.

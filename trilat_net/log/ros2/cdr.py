@@ -112,7 +112,7 @@ def _pack_stamp(stamp_ns: int) -> bytes:
 
 
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
-    """Returns the format of a list of floats, as the module `struct` defines it.
+    """Returns how a list of floats is encoded in a ROS 2 message, for the module `struct`.
 
     Args:
         offset: Position of the list, in bytes after the header.
@@ -168,7 +168,7 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Encodes one message of the type `sensor_msgs/msg/JointState`.
+        """Encodes one `sensor_msgs/msg/JointState`, the ROS 2 message about a robot's joints.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -219,7 +219,7 @@ class TransformPacker:
         self._pack = struct.Struct(struct_format).pack
 
     def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Encodes one message of the type `tf2_msgs/msg/TFMessage`.
+        """Encodes one `tf2_msgs/msg/TFMessage`, the ROS 2 message with poses of frames.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -434,7 +434,9 @@ class _CdrReader:
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Decodes a `std_msgs/msg/Header`, with which many messages begin.
+        """Decodes the time and the frame with which many ROS 2 messages begin.
+
+        Their type is `std_msgs/msg/Header`.
 
         Returns:
             The time stamp in ns on the sender's clock, and the name of the coordinate frame.

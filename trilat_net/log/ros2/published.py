@@ -224,7 +224,7 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Computes the time stamp of all messages that are made from one record.
+        """Returns the time stamp of all ROS 2 messages that are made from one record.
 
         Args:
             record: The record.
@@ -354,7 +354,7 @@ class SiteMessages:
         pose: Sequence[float],
         stamp_ns: int,
     ) -> bytes:
-        """Encodes a pose of the end effector, as position and unit quaternion.
+        """Encodes a pose of the end effector as a ROS 2 message: position and unit quaternion.
 
         Args:
             topic: Name of the topic. Successive quaternions of a topic do not jump.
@@ -371,7 +371,7 @@ class SiteMessages:
         return self._pack_vectors(stamp_ns, position, aligned_quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
-        """Returns the position of the end effector, in m.
+        """Returns the position of the arm's end effector from a record, in m.
 
         Args:
             record: The record (result of a control period), whose joint angles are used if
