@@ -104,11 +104,12 @@ class TrilatRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Keys of an observation: states of both arms, and position and force of the operator.
+        """Names and types of the numbers that LeRobot receives as an observation of the robot.
 
-        A joint has its angle in rad, its velocity in rad/s and its external torque in N m. The
-        operator has a position in m, and feels a force in N. In mode `joint` these are angles
-        in rad and torques in N m.
+        They are the states of both arms, and the position and force of the operator, the
+        program that moves the master arm. A joint has its angle in rad, its velocity in rad/s
+        and its external torque in N m. The operator has a position in m, and feels a force in
+        N. In mode `joint` these are angles in rad and torques in N m.
         """
         keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
         return dict.fromkeys(keys, float)

@@ -78,11 +78,11 @@ class LogAndRerun(NamedTuple):
 
 
 class SiteEffect(NamedTuple):
-    """Difference that a rerun makes to one site (arm controller), compared with the log.
+    """How one arm moves otherwise in a repeated run with changed settings than in the log.
 
-    A rerun executes sites of a log again, usually with changed settings. The figures are taken
-    over those ticks of which both the log and the rerun have a record (result of a control
-    period). They are None if there is no such tick.
+    The run is that of a site (arm controller). The figures are taken over those ticks of which
+    both the log and the repetition (rerun) have a record (result of a control period). They are
+    None if there is no such tick.
 
     Attributes:
         site: Name of the site.

@@ -101,9 +101,10 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
 class Log(Result, Mapping[str, SiteLog]):
-    """A recorded session: a mapping from the names of the sites to their records.
+    """A recorded session: the records of each arm controller (site), by the site's name.
 
-    `open_log` creates this object from one file, or from several files of one session.
+    For example, `log["m1"].q` are the joint angles of the arm m1. `open_log` creates this
+    object from one file, or from several files of one session.
 
     Args:
         contents: Contents of the file, or of all files together.

@@ -151,10 +151,10 @@ class Recovery(Result):
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Converts the result to texts by name, which the metadata of the new file contain.
+        """Returns what was recovered and lost as strings by name, for the recovered file.
 
-        The texts state the source file, the losses and the missing records. A reader of the new
-        file can thus recognise it as a recovered log.
+        They are stored as metadata of this file: the source file, the losses and the missing
+        records. A reader can thus recognise it as a recovered log.
         """
         losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)

@@ -112,7 +112,9 @@ class RunningDigest:
         self._descriptions.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
     def facts(self) -> dict[str, str]:
-        """Computes the checksums of everything added so far, as metadata for the file.
+        """Returns the hashes of everything in the file so far, as metadata for the file.
+
+        A reader computes them again, to find out whether the file was changed.
 
         Returns:
             Texts by name. "algorithm" is the method, "messages" the number of messages,

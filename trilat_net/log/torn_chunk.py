@@ -201,7 +201,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Splits bytes where the pages of their file begin, because damage often spans pages.
+    """Splits bytes where the pages of their file begin, as disks lose whole pages at once.
 
     Args:
         packed: The bytes.

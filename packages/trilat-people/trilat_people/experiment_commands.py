@@ -52,7 +52,7 @@ def experiment_new_command(
 def experiment_check_command(
     file: ProtocolArgument, as_json: options.JsonOption = False
 ) -> None:
-    """Prints the planned trials of an experiment, or everything that is wrong with its file."""
+    """Prints the plan of a protocol, or everything that is wrong with the protocol."""
     from .experiment.experiment_run import check_experiment
 
     terminal.print_result(check_experiment(file), as_json=as_json)

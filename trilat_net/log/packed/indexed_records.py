@@ -167,11 +167,11 @@ class IndexedRecords:
         return self._gather_ints(record_scan.USED, lengths[len(lengths) - peers :].tolist())
 
     def vector_words(self, fields: Sequence[str]) -> Ints:
-        """Returns the bits of all numbers of some vectors, shape (K, numbers).
+        """Returns some vectors of all K records as bits, to compare records bit by bit.
 
-        Bits are returned because equal bits mean equal numbers, also for NaN and signed zeros.
-        Compiled code reads the numbers at fixed distances after a position in each record, the
-        mark. The vectors lie after one of two marks. Therefore the numbers are read in up to
+        The shape is (K, numbers). Equal bits mean equal numbers, also for NaN and signed zeros.
+        Compiled code reads the numbers at fixed distances after a known position (mark) in each
+        encoded record. A record has two such positions, so that the numbers are read in up to
         two groups.
 
         Args:

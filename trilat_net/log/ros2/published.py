@@ -240,10 +240,9 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> NamedMessages:
-        """Converts a record of a site (arm controller) to ROS 2 messages.
+        """Converts the state of an arm in one control period to ROS 2 messages.
 
-        A record contains the state of the site in one period of its control loop: motion,
-        reference, torques and mode.
+        The state is a record of a site (arm controller): motion, reference, torques and mode.
 
         Args:
             record: The record. The records must be passed in the order of their times, because

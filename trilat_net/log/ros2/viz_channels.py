@@ -81,7 +81,9 @@ class _BucketOutput:
         self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the row of curve values that `add` has kept, if it was not written yet.
+        """Writes the second message of a time interval, if it was not written yet.
+
+        `add` has kept its curve values, so that messages are evenly spaced in time.
 
         Args:
             log_ns: Arrival time that the log states for the message, in Unix time, in ns.

@@ -135,9 +135,10 @@ def _read_shipped() -> dict[str, Any]:
 
 
 def find_form(questionnaire: Questionnaire) -> Questionnaire:
-    """Returns a questionnaire with its items filled in.
+    """Returns a questionnaire with the questions that participants answer.
 
-    A protocol names a shipped questionnaire without stating its items.
+    An experiment's protocol may name a shipped questionnaire without stating its questions
+    (items).
 
     Args:
         questionnaire: The questionnaire as the protocol states it.

@@ -54,7 +54,7 @@ REST_S = 0.1
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
-    """Result of a finished trial, as the journal of the experiment stores it.
+    """Result of one finished trial, as the experiment's journal file stores it.
 
     Attributes:
         cell: Number of the trial.

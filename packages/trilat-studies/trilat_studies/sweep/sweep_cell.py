@@ -94,9 +94,10 @@ _DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
 
 
 class CellResult(msgspec.Struct, frozen=True):
-    """Result of one run of a sweep: its class, and what was measured in it.
+    """Result of one simulation of a parameter sweep: how it ended, and what was measured.
 
-    Below, e is the error of a site against its reference, and qd the velocity of a joint.
+    Below, e is the error of a site (arm controller) against its reference, and qd the velocity
+    of a joint. A cell is a combination of parameter values.
 
     Attributes:
         verdict: Class of the cell.

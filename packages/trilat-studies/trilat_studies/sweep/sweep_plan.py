@@ -441,12 +441,12 @@ class SweepPlan(NamedTuple):
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns the plan of the sweep as plain values for a JSON file.
+        """Returns the plan of a parameter sweep as plain values, which a JSON file stores.
 
         `plan_from_json` restores the plan from them. The keys "judge" (how runs are judged),
-        "metrics" (which further metrics are measured) and "refine" (how often the edge is
-        refined) are left out if they have their defaults, so that plans of older versions give
-        the same file.
+        "metrics" (which further quantities are measured) and "refine" (how often the edge of
+        stability is refined) are left out if they have their defaults, so that plans of older
+        versions give the same file.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,

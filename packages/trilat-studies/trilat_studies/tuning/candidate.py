@@ -780,10 +780,11 @@ class TuningScenario(NamedTuple):
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
-        """Returns the scenario with another table [control] for each site.
+        """Returns this scenario with other control laws or gains, for example to compare them.
 
-        If all sites have the same table and a single override produces it, this override is
-        used, so that commands stay short. Otherwise there is one override per site.
+        A table [control] in a scenario file sets the law and the gains of each arm. If all arms
+        get the same law and gains, they are set by one override (a changed setting), so that
+        commands stay short. Otherwise there is one override per arm.
 
         Args:
             controls: Table of each site.
