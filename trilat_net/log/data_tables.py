@@ -137,7 +137,9 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table that is exported from a log. Its columns have equal lengths.
+    """A table that is exported from a log, such as the joint angles of an arm over time.
+
+    All its columns have the same length.
 
     Attributes:
         name: Name of the site (arm controller) whose messages the table contains, or "events".

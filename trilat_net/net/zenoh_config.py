@@ -348,7 +348,7 @@ class ZenohFile:
 def check_zenoh_file(
     source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
 ) -> ZenohFile:
-    """Checks that a session can work with the settings in a user's Zenoh file.
+    """Checks a user's file of Zenoh settings, because a session needs some fixed values.
 
     Args:
         source: Name of the file, for error messages.

@@ -589,7 +589,7 @@ class PageServer:
             self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
-        """Receives new messages of the session and lets pages send its state, 30 times a s.
+        """Receives the session's messages and offers pages its state, 30 times a second.
 
         If one step fails, the failure is counted, and the other steps continue.
         """
