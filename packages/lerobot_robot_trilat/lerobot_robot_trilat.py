@@ -104,11 +104,12 @@ class TrilatRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Keys of an observation: states of both arms, and position and force of the operator.
+        """Names and types of the numbers that LeRobot receives as an observation of the robot.
 
-        A joint has its angle in rad, its velocity in rad/s and its external torque in N m. The
-        operator has a position in m, and feels a force in N. In mode `joint` these are angles
-        in rad and torques in N m.
+        They are the states of both arms, and the position and force of the operator, the
+        program that moves the master arm. A joint has its angle in rad, its velocity in rad/s
+        and its external torque in N m. The operator has a position in m, and feels a force in
+        N. In mode `joint` these are angles in rad and torques in N m.
         """
         keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
         return dict.fromkeys(keys, float)
@@ -133,7 +134,7 @@ class TrilatRobot(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """True, because the scenario describes the arms and there is nothing to calibrate."""
+        """True: calibration is never needed, because the scenario file describes the arms."""
         return True
 
     def calibrate(self) -> None:
@@ -143,7 +144,7 @@ class TrilatRobot(Robot):
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session, and waits for the first state of both sites.
+        """Joins the teleoperation session, and waits for the first state of both arms.
 
         Args:
             calibrate: Not used, because there is nothing to calibrate.
@@ -176,7 +177,7 @@ class TrilatRobot(Robot):
             self._stack = stack.pop_all()
 
     def _await_records(self, timeout_s: float) -> None:
-        """Waits until both sites have published a record, the state in one control period.
+        """Waits until both arm controllers (sites) have published their state.
 
         Raises:
             DeviceNotConnectedError: A site has published no record for `timeout_s` seconds.
@@ -233,7 +234,10 @@ class TrilatRobot(Robot):
         return goal
 
     def disconnect(self) -> None:
-        """Releases the master and leaves the session, which continues with its other users."""
+        """Releases the master arm, and leaves the teleoperation session.
+
+        The session continues for its other users.
+        """
         self._require_hand()
         self._hand = None
         self._stack.close()
@@ -265,9 +269,10 @@ class TrilatRobot(Robot):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode of the live hand that a scenario allows at a site.
+    """Returns whether a program may move a site's arm by "force" or by "position".
 
-    A live hand is an operator whose commands come from another program.
+    The scenario (settings of the session) decides this in its entry for a live operator (hand),
+    whose commands come from another program.
 
     Args:
         scenario: The scenario of the session.
@@ -287,7 +292,9 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which the operator moves an arm.
+    """Returns the names of the directions or joints in which a policy moves the arm.
+
+    They become the names of the robot's actions in LeRobot data sets.
 
     Args:
         scenario: The scenario of the session.
@@ -310,7 +317,7 @@ def run_policy(
     duration_s: float,
     fps: int,
 ) -> int:
-    """Lets a policy drive the arm of a robot at a fixed rate.
+    """Lets a trained policy move the arm of a robot, at a fixed rate.
 
     Args:
         robot: The connected robot.
@@ -341,7 +348,7 @@ def run_policy(
 
 
 def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
-    """Loads a policy that `lerobot-train` has stored.
+    """Loads a trained policy that `lerobot-train` has stored in a folder.
 
     Args:
         folder: Folder of the policy, which ends in `pretrained_model`.
@@ -364,7 +371,7 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     policy.reset()
 
     def decide(state: dict[str, list[float]]) -> list[float]:
-        """Returns the action of the policy for an observation, as plain numbers.
+        """Returns the action of the trained policy for an observation, as plain numbers.
 
         Args:
             state: Numbers of each feature of the observation. Features that the policy was not
@@ -383,7 +390,10 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
 
 
 def main() -> None:
-    """Runs a trained policy in a session: the command `python -m lerobot_robot_trilat`."""
+    """Runs a trained policy, which moves an arm of a running teleoperation session.
+
+    This is the command `python -m lerobot_robot_trilat`.
+    """
     parser = argparse.ArgumentParser(prog="python -m lerobot_robot_trilat")
     parser.add_argument("folder", help="folder of the policy, which ends in pretrained_model")
     parser.add_argument("--site", default="m2", help="master that the policy drives")

@@ -122,7 +122,7 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """True, because the scenario describes the arm and there is nothing to calibrate."""
+        """True: calibration is never needed, because the scenario file describes the arm."""
         return True
 
     def calibrate(self) -> None:
@@ -174,7 +174,7 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(self._position_keys, position, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force of the arm on the operator that holds it.
+        """Returns the force of the arm on the person or program that holds it.
 
         Returns:
             The force along each axis in N, or the torque of each joint in N m in mode `joint`.
@@ -202,13 +202,16 @@ class TrilatTeleoperator(Teleoperator):
             command(*goal)
 
     def enable_torque(self) -> None:
-        """Allows `send_feedback` to move the arm, for example before the person intervenes."""
+        """Allows `send_feedback` to move the arm, until `disable_torque` is called.
+
+        The arm can then follow a policy before the person intervenes.
+        """
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm, so that only the person moves it and feedback has no effect.
+        """Releases the arm, so that only the person moves it, and feedback has no effect.
 
-        `enable_torque` ends this.
+        Calling `enable_torque` allows feedback again.
         """
         self._torque_enabled = False
         self._require_hand().release()
@@ -231,7 +234,10 @@ class TrilatTeleoperator(Teleoperator):
         }
 
     def disconnect(self) -> None:
-        """Releases the arm and leaves the session, which continues with its other users."""
+        """Releases the arm, and leaves the teleoperation session.
+
+        The session continues for its other users.
+        """
         self._require_hand()
         self._hand = None
         self._stack.close()
@@ -248,9 +254,10 @@ class TrilatTeleoperator(Teleoperator):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns the mode of the live hand that a scenario allows at a site.
+    """Returns whether a program may move a site's arm by "force" or by "position".
 
-    A live hand is an operator whose commands come from another program.
+    The scenario (settings of the session) decides this in its entry for a live operator (hand),
+    whose commands come from another program.
 
     Args:
         scenario: The scenario of the session.
@@ -270,7 +277,9 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 
 
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
-    """Returns the names of the axes along which the operator moves an arm.
+    """Returns the names of the directions or joints in which a person moves the arm.
+
+    They become the names of the actions in LeRobot data sets.
 
     Args:
         scenario: The scenario of the session.

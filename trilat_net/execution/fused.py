@@ -82,7 +82,9 @@ def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 
 
 def scale_differences(x: Array, y: Array, factor: float) -> Array:
-    """Changes the distance between the numbers of two runs by a factor: y + factor (x - y).
+    """Scales the difference between the states of two simulations: y + factor (x - y).
+
+    With a factor below 1, for example, the first one comes closer to the second one.
 
     Args:
         x: Numbers of a run.
@@ -200,7 +202,9 @@ class _HandActor(Protocol):
 
 
 class RunTotals(NamedTuple):
-    """Figures that summarise a whole run, returned by `FusedRun.totals`.
+    """Numbers that summarise a whole simulated run, such as its largest mean error.
+
+    `FusedRun.totals` returns them.
 
     Attributes:
         rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
@@ -476,7 +480,7 @@ class FusedRun:
 
     @property
     def memory(self) -> RunMemory:
-        """All arrays of the run, as views that change while the run advances."""
+        """All arrays of the simulated run, as views that change while the run advances."""
         return RunMemory(
             tables=self._tables,
             progress=self._progress,
@@ -553,12 +557,11 @@ class FusedRun:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
-        """Lets a user's plant move the arm of a site up to the next tick of the site.
+        """Lets a user's own program compute the motion of an arm in one control period.
 
-        A plant is a program that computes the motion of an arm, and a tick is a period of the
-        site's control loop. The plant moves once per tick, by the control torque of the last
-        executed tick. The new state of the arm is copied to the arrays of the run, from which
-        the next tick reads it.
+        Such a program is called a plant, and a control period a tick. The plant moves once per
+        tick, by the control torque of the last executed tick. The new state of the arm is
+        copied to the arrays of the run, from which the next tick reads it.
 
         Args:
             i: Index of the site.
@@ -764,23 +767,26 @@ class FusedRun:
 
     @property
     def has_programs(self) -> bool:
-        """True if users' programs act as operators, or compute the motion of an arm.
+        """True if users' own programs act as operators, or compute the motion of an arm.
 
-        The state of such programs is not part of the state of the run. Therefore the run cannot
-        be copied.
+        The run cannot be copied then, because the state of such programs is not part of its
+        state.
         """
         return bool(self._hands or self._plants)
 
     @property
     def programmed_sites(self) -> set[int]:
-        """Indices of the sites whose operator or arm is a user's program."""
+        """Indices of the sites (arm controllers) whose operator or arm is a user's own program.
+
+        Such a program is called in Python in each control period, which is slower.
+        """
         return {*self._hands, *self._plants}
 
     def copy_state(self, other: "FusedRun") -> None:
-        """Makes this run continue from exactly the same state as another run.
+        """Makes this simulated run continue from exactly the same state as another run.
 
-        Both runs must have the same scenario and the same planned ticks. The other run does not
-        change.
+        Both runs must have the same scenario and the same planned control periods. The other
+        run does not change.
         """
         self.scale_difference(other, 0.0)
 
@@ -809,10 +815,10 @@ class FusedRun:
                 law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the numbers of a site's state before its next tick, as NumPy arrays.
+        """Returns the state of one simulated arm and its controller (site), as NumPy arrays.
 
-        A site simulates the process that runs one arm, and a tick is a period of its control
-        loop. The arrays belong to the simulation, so the caller must not change them.
+        It is the state before the next tick, a period of the control loop. The arrays belong to
+        the simulation, so the caller must not change them.
 
         Args:
             i: Index of the site in the order of the scenario.
@@ -839,7 +845,7 @@ class FusedRun:
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
-        """Returns how far this run is from another run, in one field of the state.
+        """Returns how far the state of this simulation is from that of another, in one field.
 
         Args:
             other: The other run of the same scenario.
@@ -853,7 +859,7 @@ class FusedRun:
         return float(np.abs(difference).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the run, and returns the states at 100 times of its last quarter.
+        """Continues the simulation, and returns the states at 100 times of its last quarter.
 
         Args:
             until_s: Time at which the run ends, in s.
@@ -873,11 +879,7 @@ class FusedRun:
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the first site diverged, in s.
-
-        A site has diverged if its arm has left its limits. None if all sites stayed within
-        them.
-        """
+        """Time at which the first arm left its safety limits, in s. None if no arm did."""
         ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
         return min(ends_ns) / NS_PER_S if ends_ns else None
 
@@ -916,19 +918,20 @@ class FusedRun:
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest error and largest speed in every interval of 50 ms, an array for each site.
+        """Largest error and largest speed of each arm, in every interval of 50 ms.
 
-        Each array has the shape (intervals, 2). The columns are the largest synchronisation
-        error |e| of any joint in rad, and the largest joint speed |qd| in rad/s.
+        There is one array per arm, of the shape (intervals, 2). The columns are the largest
+        synchronisation error |e| of any joint in rad, and the largest joint speed |qd| in
+        rad/s.
         """
         return tuple(map(max_over_joints, self.buckets))
 
     @property
     def totals(self) -> RunTotals:
-        """Numbers that summarise the simulated run so far.
+        """Numbers that summarise the simulated run so far, such as the largest mean error.
 
-        They are the largest mean error, the control effort, and the forces and work of walls
-        and other environments. See `RunTotals` for their definitions.
+        They also contain the control effort, and the forces and work of walls and dampers. See
+        `RunTotals` for the definitions.
         """
         sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
@@ -957,23 +960,23 @@ class FusedRun:
 
     @property
     def q(self) -> Array:
-        """Joint angles of all arms after the last tick, in rad, shape (N, n).
+        """Joint angles of all arms after the last control period, in rad, shape (N, n).
 
-        N is the number of sites, and n is the number of joints.
+        N is the number of sites (one per arm), and n is the number of joints of each arm.
         """
         return np.array(self._tables.site["q"][:, 0])
 
     @property
     def theta_hat(self) -> Array:
-        """Arm parameters that the control laws estimate, after the last tick, shape (N, P).
+        """Arm parameters that adaptive control laws have estimated so far, shape (N, P).
 
-        N is the number of sites, and P is the number of parameters.
+        N is the number of sites (one per arm), and P is the number of parameters.
         """
         return np.array(self._tables.site["theta_hat"][:, 0])
 
     @property
     def memories(self) -> list[Array]:
-        """Numbers that users' control laws keep from tick to tick, after the last tick.
+        """Internal state of each control law that a user has written, after the last tick.
 
         A tick is one period of the control loop. There is one array per site (simulated process
         that runs one arm). The array of a site with a built-in law is empty.
@@ -986,9 +989,10 @@ class FusedRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """External torque of each site's last tick, in N m, one array of shape (n,) per site.
+        """External torque on each arm in the last control period, in N m, not of the motors.
 
-        It is the torque of operators and environments, not of the motors.
+        The list has one array of the shape (n,) per site, for n joints. Operators and
+        environments exert the torque.
         """
         pairs = zip(self.records, self._layouts, strict=True)
         return [row[layout.columns()["tau_x"]] for row, layout in pairs]
@@ -1036,9 +1040,9 @@ class FusedRun:
 
     @property
     def records(self) -> Array:
-        """Record of the last tick of each site.
+        """Results of the last control period (tick) of each site, one row per site.
 
-        The array has one row per site, and the columns of `Layout.columns`.
+        A site is the controller of one arm. For the columns see `Layout.columns`.
         """
         return np.array([self._last_row(i) for i in range(len(self._progress))])
 
@@ -1239,7 +1243,7 @@ def _write_actions(feed_actions: Array, first_tick: int, actions: Array) -> None
 
 
 def _count_coordinates(setup: SiteSetup) -> int:
-    """Returns the number of target coordinates of a site's live operator.
+    """Returns how many coordinates a person or program may command to move an arm.
 
     An action contains the three numbers grip, number and source, followed by the target and the
     velocity of each coordinate, see `HandInForce`.

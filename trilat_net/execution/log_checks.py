@@ -57,21 +57,24 @@ class LogCheckReport(CheckReport):
 
     @property
     def records(self) -> int:
-        """Number of records whose ticks were executed again to check them.
+        """Number of records that were checked by executing their control periods again.
 
-        A record is the stored result of one tick, that is, of one period of the control loop.
+        A record is the stored result of one control period.
         """
         return self.result.records
 
     @property
     def identical(self) -> int:
-        """Number of records that the repeated execution confirmed in every computed field."""
+        """Number of records whose control periods were executed again with the same bits.
+
+        Every field that a control period computes must agree.
+        """
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the whole report as plain values, ready for JSON.
+        """Returns the whole report on a log as plain values, ready for JSON.
 
-        The keys are those of `trilat verify --json`.
+        The keys are those that `trilat verify --json` prints.
         """
         result = self.result
         first_difference = None
@@ -110,7 +113,7 @@ class LogCheckReport(CheckReport):
         min_coverage: float = MIN_COVERAGE,
         resume_every: int = 0,
     ) -> "LogCheckReport":
-        """Executes the sites of a log again, and checks the log against the results.
+        """Executes the control periods of a log again, and checks the log against the results.
 
         Args:
             log: Log of a run or of a rerun that is to be checked.
@@ -397,9 +400,10 @@ def _join_names(names: Sequence[str]) -> str:
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of ticks of each site as a string, such as "m1 3-7, 12; s 5".
+    """Returns the ranges of control periods (ticks) of each site that a log lacks, as text.
 
-    At most `_MAX_GAPS_NAMED` ranges are listed. The others are counted.
+    An example is "m1 3-7, 12; s 5". At most `_MAX_GAPS_NAMED` ranges are listed. Further ones
+    are counted.
 
     Args:
         gaps: Site (arm controller), first tick (control period) and last tick of each range.
@@ -424,7 +428,7 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
 def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Returns the finding that states how many records equal those of another execution.
+    """Returns whether a log equals another execution of its run, with the number of records.
 
     Args:
         label: Name of the check.

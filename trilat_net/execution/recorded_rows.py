@@ -29,7 +29,9 @@ _MASK_64 = (1 << 64) - 1
 
 
 class SampleTable(NamedTuple):
-    """The states (samples) that all sites of a log sent, for a fast look-up by site and tick.
+    """States that all sites of a log sent (samples), for a fast look-up by site and tick.
+
+    A site is the controller of one arm, and a tick one of its control periods.
 
     Attributes:
         bits: Position, velocity and external torque of each sample in the coordinates that
@@ -136,7 +138,7 @@ class PlainRows:
         samples: SampleTable,
         resume_every: int = 0,
     ) -> None:
-        """Stores the records. Their arrivals are looked up when they are first needed."""
+        """Stores the records of a site. Received messages are looked up on first use."""
         self._site_log = site_log
         self._indexed = indexed
         self._samples = samples
@@ -148,7 +150,7 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the number in a record that identifies a start of the site."""
+        """Returns the random number in a record that tells two starts of a process apart."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
@@ -180,7 +182,7 @@ class PlainRows:
     def _is_first_of_run(self, row: int) -> bool:
         """True if a record is complete although it does not follow the record before it.
 
-        Such a record is the first one of a series that compiled code can execute.
+        Compiled code can execute a series of recorded control periods from such a record on.
         """
         return bool(self._is_complete[row])
 
@@ -188,7 +190,8 @@ class PlainRows:
     def _stops(self) -> IntArray:
         """Indices of all records before which compiled code must stop, in ascending order.
 
-        They lack an input of their tick, or do not follow the record before them.
+        Such a record lacks an input of its control period, or does not follow the record before
+        it. Slower code then continues.
         """
         follows = np.zeros(len(self._site_log), np.bool_)
         ticks = self._site_log.tick
@@ -222,7 +225,7 @@ class PlainRows:
 
     @cached_property
     def _memory(self) -> tuple[IntArray, IntArray]:
-        """Internal states of the site and its control law (field `mem`) in all records.
+        """Internal states of the control law and its site in all records (their field `mem`).
 
         The first array has the index of the first number of each record in the second array,
         and the total length, shape (K + 1,). The second array has the bits of the numbers.
@@ -231,7 +234,7 @@ class PlainRows:
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads some records in the form that the compiled loop needs.
+        """Reads some records as arrays, to execute their control periods by compiled code.
 
         Args:
             first: Index of the first record (result of a control period).
@@ -256,7 +259,7 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes the ticks of some records again in compiled code, to verify the records.
+        """Executes control periods of some records again in compiled code, to verify them.
 
         Args:
             repeater: Executes the ticks (control periods) of the site (arm controller).
@@ -306,5 +309,9 @@ def _read_plants(block: IndexedRecords) -> Array:
 
 
 def can_repeat(site: Site) -> bool:
-    """True if compiled code can execute recorded ticks of a site again."""
+    """True if compiled code can execute the recorded control periods of a site again.
+
+    Compiled code is much faster than Python, but cannot call a user's own control law. A site
+    is the controller of one arm.
+    """
     return not site.parts.has_user_law

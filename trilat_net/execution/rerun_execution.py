@@ -71,7 +71,7 @@ _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
 
 
 class _ChangedValue(NamedTuple):
-    """One value of the scenario that a rerun of a log changes.
+    """One setting, such as a gain, that differs between a recorded run and its repetition.
 
     Attributes:
         key: Dotted path of the value in the resolved scenario, for example of a gain.
@@ -110,9 +110,10 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """Kind of the rerun: "closed loop" if every site is executed, otherwise "open loop".
+        """Kind of the repeated run: "closed loop" if every site is executed, else "open loop".
 
-        In an open loop, the sites that are not executed keep their records and do not react.
+        In an open loop, sites (arm controllers) that are not executed keep their records, so
+        that they do not react to changes.
         """
         return "open loop" if self.recorded else "closed loop"
 
@@ -173,9 +174,12 @@ def resolve_rerun_request(
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Refuses to execute a site whose arm is a real robot or a user's program.
+    """Refuses to repeat the run of a site whose arm is a real robot or a user's program.
 
     How this arm would have reacted to other torques is not known.
+
+    Raises:
+        ScenarioError: A site that is to be executed again has such an arm.
     """
     for name in original.external:
         if name not in replaced:
@@ -475,7 +479,11 @@ class RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        """Creates the site in its initial state, and collects its inputs from the log."""
+        """Creates a site in its initial state, and collects its recorded inputs from the log.
+
+        A site is the controller of one arm. A rerun repeats a recorded run with something
+        changed.
+        """
         site_log = log[name]
         scenario = request.scenario
         setup = scenario.setup(name)
@@ -511,14 +519,14 @@ class RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site has executed its last tick and nothing is left to do."""
+        """True if the site has executed its last control period, so that nothing is left."""
         return self.diverged or self.k > self._last_tick
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the tick that is executed next, in ns after the epoch.
+        """Nominal time of the control period that is executed next, in ns after the epoch.
 
-        The epoch is the common start time of the sites.
+        The epoch is the common start time of the sites (arm controllers).
         """
         return self.k * NS_PER_S // self._site.rate_hz
 
@@ -566,10 +574,9 @@ class RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of the log, and leaves out the ticks before it.
+        """Continues at the next record of an incomplete log, as earlier inputs are unknown.
 
-        The inputs of these ticks are not known. If there is no further record, the site is
-        done.
+        If there is no further record, the site (arm controller) is done.
         """
         index = bisect.bisect_right(self._recorded_ticks, self.k)
         self.k = self._last_tick + 1
@@ -686,7 +693,10 @@ class RerunExecution:
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
-        """Creates the executed sites, and connects them by the samples that they compute."""
+        """Creates the sites that are executed again, and connects them with each other.
+
+        A site (arm controller) then receives what the others compute, not what was recorded.
+        """
         self._log = log
         self._request = request
         self._recent: dict[str, dict[int, Arrival]] = {name: {} for name in request.replaced}
@@ -787,9 +797,9 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: RerunSite) -> None:
-        """Stores the newest sample (state) of an executed site, which its peers will receive.
+        """Stores the newest state of an executed site, which its peers will receive.
 
-        A sample that is so old that it cannot arrive any more is removed.
+        A state that is so old that it cannot arrive any more is removed.
         """
         output = site.output
         recent = self._recent[site.name]

@@ -202,7 +202,10 @@ class RecordedInputs(Generic[Change]):
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
-        """Collects the samples and changes of one site, before its first tick is executed."""
+        """Collects what a site received in a recorded run, before its first control period.
+
+        These are the samples (states that other sites sent) and the changes of settings.
+        """
         self._site_log = site_log
         self._states = site_log.states if states is None else states
         self._links = links
@@ -214,11 +217,14 @@ class RecordedInputs(Generic[Change]):
 
     @property
     def next_change_tick(self) -> int | None:
-        """Tick at which the next change takes effect. None if there are no further changes."""
+        """Control period (tick) at which the next change of the settings takes effect.
+
+        None if there are no further changes in the recorded run.
+        """
         return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Removes and returns the changes that take effect up to a tick (control period).
+        """Removes and returns the changes of settings that take effect up to a control period.
 
         Args:
             tick: Last tick whose changes are returned.
@@ -406,11 +412,11 @@ class RecordedInputs(Generic[Change]):
     def _find_waiting(
         self, row: int, peer: int, used_tick: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Finds the samples of a peer that were waiting in its link before a given record.
+        """Finds received states that were still delayed by a link at the time of a record.
 
-        A sample, the state that a peer sends, waits at the receiver until the delay of the link
-        has passed. If records are missing from the log, it is not certain which samples had
-        arrived.
+        A sample, the state that a peer (another site) sends, waits at the receiver until the
+        delay of the link has passed. If records are missing from the log, it is not certain
+        which samples had arrived.
 
         Args:
             row: Index of the record, among the records of the receiver.
@@ -453,7 +459,9 @@ class RecordedInputs(Generic[Change]):
         return certain_ticks, probable_ticks
 
     def _find_newest_listed(self, row: int, peer: int) -> int:
-        """Returns the newest sample (sent state) of a peer in the last records before a row.
+        """Returns the newest state of a peer that the latest records of a site list.
+
+        The site has received this state. A peer is another site (arm controller).
 
         Returns:
             Tick of the sample. -1 if these records (results of control periods) list no sample
@@ -491,7 +499,9 @@ class RecordedInputs(Generic[Change]):
 
 
 class _PeerListing(NamedTuple):
-    """Records of a site (arm controller) that list samples of one peer.
+    """Index of the records of a site that list received states of one peer.
+
+    A peer is another site (arm controller).
 
     Attributes:
         first_rows: For the tick (control period) of each sample, the row of the first record

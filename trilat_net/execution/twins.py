@@ -299,7 +299,9 @@ def _list_joints(scenario: Scenario) -> tuple[str, ...]:
 
 
 def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
-    """Returns a push of all joints in a random direction.
+    """Returns a small displacement of all joints in a random direction.
+
+    It is applied to a copy of the run, to see whether the difference grows.
 
     Args:
         scenario: Description of the experiment.
@@ -406,7 +408,7 @@ def _run_twins(
 
 
 class _SiteVelocities(NamedTuple):
-    """Joint velocities of one site in a window of a run, divided into intervals of 50 ms.
+    """Joint velocities of one arm in a part of a run, by intervals of 50 ms.
 
     Attributes:
         cells: Index by which an array with a row per interval and a column per joint of all
@@ -445,7 +447,10 @@ class _TwinRuns:
         inputs: RunInputs | None = None,
         log: Log | None = None,
     ) -> None:
-        """Creates the run and its twins before their first tick, and empty results."""
+        """Creates a run and slightly displaced copies of it (twins), and empty results.
+
+        No control period has been executed yet.
+        """
         self._log = log
         self._pushes = pushes
         self._joints = _list_joints(scenario)
@@ -482,7 +487,7 @@ class _TwinRuns:
         inputs: RunInputs | None,
         record_count: int,
     ) -> list[Any]:
-        """Returns the run and its twins, before their first tick (control period).
+        """Creates a run and copies of it (twins), before their first control period.
 
         Args:
             scenario: The scenario.
@@ -497,7 +502,10 @@ class _TwinRuns:
         return runs
 
     def run(self) -> Twins:
-        """Simulates a run and its repetitions with a push, and returns the differences."""
+        """Simulates a run and slightly displaced copies of it, and returns their differences.
+
+        Differences that grow show that the system is unstable.
+        """
         for twin_index, push in enumerate(self._pushes):
             if push.at_s == 0.0:
                 self._push(twin_index, 0.0)
@@ -522,10 +530,10 @@ class _TwinRuns:
         return Twins(paths, self._joints, self._speed, self._same)
 
     def _execute_window(self, end_s: float) -> None:
-        """Executes the run and its twins to the end of a window, and measures the differences.
+        """Continues a run and its displaced copies (twins), and measures their differences.
 
-        A twin that has not been pushed yet equals the run. Therefore it is not executed, but
-        copied from the run when its push is due.
+        A twin that has not been displaced yet equals the run. Therefore it is not executed, but
+        copied from the run when its displacement is due.
 
         Args:
             end_s: End of the window, in s.
@@ -552,7 +560,9 @@ class _TwinRuns:
                 self._push(twin_index, end_s)
 
     def _push(self, twin_index: int, at_s: float) -> None:
-        """Displaces the state of a twin by its push, and notes the time.
+        """Displaces the state of a copy of the run (twin) a little, and notes the time.
+
+        The further course of the difference shows whether the system is stable.
 
         Args:
             twin_index: Index of the twin.
@@ -601,7 +611,7 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> Iterator[_SiteVelocities]:
-        """Yields the joint velocities of each site in a window, by intervals of 50 ms.
+        """Yields the joint velocities of each arm in a part of a run, by intervals of 50 ms.
 
         Args:
             records: Times and records (results of control periods) of each site (arm
@@ -690,9 +700,10 @@ class _TwinRuns:
             self._scale[n] -= math.log(factor)
 
     def _find_recent_peak(self, n: int, end_s: float) -> float:
-        """Returns the logarithm of a twin's largest velocity difference in the last second.
+        """Returns how far apart a run and its displaced copy were in the last second.
 
-        Positions do not show a decay, because a twin may come to rest at another position.
+        It is the logarithm of the largest difference of velocities. Positions do not show a
+        decay, because the copy (twin) may come to rest at another position.
 
         Args:
             n: Index of the twin, a displaced copy of the run.
@@ -705,7 +716,9 @@ class _TwinRuns:
         return float(last_second.max(initial=-np.inf) - self._scale[n])
 
     def _end_path(self, n: int) -> None:
-        """Notes that a twin's difference from the run has decayed to rounding errors.
+        """Notes that the difference between a displaced copy (twin) and the run has decayed.
+
+        What is left of the difference are rounding errors.
 
         Args:
             n: Index of the twin, a displaced copy of the run.
@@ -745,7 +758,7 @@ class _LaneTwinRuns(_TwinRuns):
         return [LaneTwin(self._lanes, lane) for lane in range(count)]
 
     def _execute_window(self, end_s: float) -> None:
-        """Executes the run and its twins to the end of a window, and measures the differences.
+        """Continues a run and its displaced copies (twins), and measures their differences.
 
         Args:
             end_s: End of the window, in s.
@@ -774,7 +787,7 @@ class _LaneTwinRuns(_TwinRuns):
                 self._push(n, end_s)
 
     def _measure_window(self, measured: Sequence[int]) -> None:
-        """Adds the course of the run and of the differences in one window to the paths.
+        """Stores the course of the run and of the differences in one interval of time.
 
         Args:
             measured: Indices of the twins that are measured.
@@ -806,9 +819,9 @@ class _LaneTwinRuns(_TwinRuns):
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
-    """Returns the ends of the windows of a run, in s, in ascending order.
+    """Returns the times at which the differences between runs are measured, in s, ascending.
 
-    Windows end at multiples of 50 ms, and at the times of the pushes.
+    They are the multiples of 50 ms, and the times at which copies of the run are displaced.
 
     Args:
         end_s: Duration of the run, in s.

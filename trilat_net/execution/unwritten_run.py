@@ -65,7 +65,7 @@ def simulate_columns(scenario: Scenario) -> Log:
 
 
 def _is_described_by_columns(scenario: Scenario) -> bool:
-    """Returns True if the columns of the simulation describe the whole run.
+    """Returns True if arrays from the simulation describe a run completely, without a log.
 
     Only a written log contains changes of settings, the actions of live operators, the motions
     of objects in an environment, and the modes of a site that reacts to missing samples.
@@ -83,7 +83,7 @@ def _is_described_by_columns(scenario: Scenario) -> bool:
 
 
 def _find_used(scenario: Scenario, site: str, peer: str) -> IntArray:
-    """Returns which sample of a peer a site used in each of its ticks.
+    """Returns which received state of a peer a site used in each control period (tick).
 
     Args:
         scenario: Description of the experiment.

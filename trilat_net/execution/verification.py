@@ -87,7 +87,7 @@ class RecordDifference(NamedTuple):
     computed: Any
 
     def __str__(self) -> str:
-        """Returns a text about the difference."""
+        """Returns a sentence about the difference, for the report to the user."""
         logged = _format_value(self.logged)
         computed = _format_value(self.computed)
         location = f"{self.site}, tick {self.tick}, {self.field}"
@@ -100,7 +100,7 @@ def _format_value(value: object) -> str:
 
 
 def equal_bits(a: float, b: float) -> bool:
-    """True if two numbers have the same bits.
+    """True if two floating-point numbers are identical bit by bit.
 
     Unlike `==`, this distinguishes -0.0 from 0.0, and counts two NaNs as equal.
     """
@@ -173,7 +173,7 @@ def find_first_difference(
     equal: NumberEquality,
     channel: LawChannel = LawChannel(),  # noqa: B008
 ) -> RecordDifference | None:
-    """Finds the first field in which a record differs from executing its tick again.
+    """Finds the first field of a record that a repeated control period computes otherwise.
 
     Args:
         logged: Record of a tick (control period), as the log contains it.
@@ -208,7 +208,9 @@ def _compare_fields(
     equal: NumberEquality,
     channel: LawChannel,
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Compares every field of a record with the execution, see `find_first_difference`.
+    """Compares a recorded control period with its repeated execution, field by field.
+
+    See `find_first_difference`.
 
     Yields:
         Name of the field, logged value, computed value, and whether they are equal.
@@ -289,7 +291,7 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no record differs from the repeated execution.
+        """True if no record of the log differs from a repeated execution of its control period.
 
         It is also true if only few records, or none, could be compared.
         """
@@ -297,10 +299,10 @@ class VerifyResult:
 
     @property
     def passed(self) -> bool:
-        """True if the log can be trusted.
+        """True if the log can be trusted to contain what the controllers computed.
 
         No record differs from the repeated execution, the log is unchanged since it was
-        written, and enough of the ticks of every site were compared.
+        written, and enough of the control periods of every site were compared.
         """
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
@@ -336,7 +338,7 @@ class VerifyResult:
             self.integrity = other.integrity  # one failed log suffices to fail the whole check
 
     def add_difference(self, difference: RecordDifference) -> None:
-        """Counts one more record that differs from the repeated execution.
+        """Counts one more record that differs from the repetition of its control period.
 
         Args:
             difference: The difference. It is stored as `first` if it is the earliest one.
@@ -472,10 +474,10 @@ class _SiteVerifier:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _repeat_plain(self, row: int, next_tick: int) -> int:
-        """Executes the ticks of some ordinary records by the compiled loop, which is faster.
+        """Executes the control periods of some records again by compiled code, which is fast.
 
-        A record is ordinary (plain) if the state before it is known, and the log contains all
-        of its inputs. The compiled loop ends before the first record that differs.
+        This is possible for a record if the state before it is known, and the log contains all
+        of its inputs (a plain record). The execution ends before the first record that differs.
 
         Args:
             row: Index of the first record.
@@ -516,9 +518,9 @@ class _SiteVerifier:
         return repeated_count
 
     def _examine_record(self, row: int, next_tick: int) -> int:
-        """Examines one record: whether it has the expected tick, and equals a new execution.
+        """Checks one record: whether it has the expected tick, and repeats with equal results.
 
-        Gaps and differences are added to the result.
+        A tick is a control period. Gaps and differences are added to the result.
 
         Args:
             row: Index of the record.
@@ -691,7 +693,7 @@ class _SiteVerifier:
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Reports a record that does not come from the process that is executed again.
+        """Reports a record that was written by another process than the one that is repeated.
 
         Returns:
             The difference, if the record (result of a control period) states another start of
@@ -706,7 +708,7 @@ class _SiteVerifier:
         return None
 
     def _verify_record(self, row: int, state: State) -> None:
-        """Executes the tick of a record, and compares the record with the execution.
+        """Executes the control period of a record again, and compares the results.
 
         Args:
             row: Row of the record.
@@ -924,7 +926,7 @@ def _execute_sites(
 
 
 def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
-    """Returns the records of a site.
+    """Returns the records of a site (arm controller), decoded now or on first access.
 
     Args:
         site_log: Records of the site.
@@ -938,7 +940,8 @@ def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
     """Returns the records of all sites (arm controllers) of a log, by site and tick.
 
-    A site that is executed again looks up the samples of the other sites in it.
+    A tick is a control period. A site that is executed again looks up in them what it received
+    from other sites.
 
     Args:
         log: The log.
@@ -984,7 +987,9 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def _open_rerun_source(log: Log) -> Log | None:
-    """Opens the log from which a rerun was made, if it is in the same folder as the rerun.
+    """Opens the log of which another log is a repetition with changed settings (rerun).
+
+    It must be in the same folder as the rerun.
 
     Args:
         log: Log of the rerun. It states the hashes of the files of its source.

@@ -76,7 +76,7 @@ from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message of a site (arm controller) that is to be written to a log.
+    """One message of an arm controller (site), ready to be written to a log.
 
     Attributes:
         site: Name of the site that sends the message.
@@ -120,7 +120,7 @@ class SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
-        """Starts with no written message on any channel."""
+        """Prepares the numbering of a site's messages. No message has been written yet."""
         settings = scenario.sites[site]
         self.peers = scenario.peers(site)
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
@@ -137,7 +137,9 @@ class SiteChannels:
     def make_tick_entries(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the messages of a tick that follow its record: statistics and events.
+        """Returns the messages that follow the record of a control period in a log.
+
+        They are statistics and events.
 
         Args:
             output: Record of the tick (control period): the stored result.
@@ -187,7 +189,7 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the event that tells that a site has ended, as a message for the log.
+        """Returns the message that tells readers of the log that a site has ended.
 
         Args:
             t_ns: Time of the event, in ns after the epoch (the common start time). By default,
@@ -198,9 +200,9 @@ class SiteChannels:
         return self.make_new_event_entry("end", text, end_ns)
 
     def make_new_event_entry(self, kind: str, text: str, t_ns: int) -> SiteEntry:
-        """Returns a new event of the site as a message for the log.
+        """Returns a notable occurrence at a site (event) as a message for the log.
 
-        The event gets the next event number of the site.
+        The event gets the next event number of the site (arm controller).
 
         Args:
             kind: Kind of the event, for programs.
@@ -283,7 +285,7 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Converts an event of a site, such as a change of its mode, to a log entry.
+        """Converts an event of a site, such as a change of its mode, to a message for a log.
 
         A site is a process that runs one arm. It published the event in an earlier run.
 
@@ -306,7 +308,7 @@ class SiteChannels:
         )
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
-        """Writes a message of the site to the log, and counts it in the account of its channel.
+        """Writes a message of the site to the log, and counts it for the completeness check.
 
         Args:
             entry: The message, as one of the `make_…` methods returned it.
@@ -516,10 +518,10 @@ def _find_ready(
 
 
 def compute_boot(scenario: Scenario, site: str) -> int:
-    """Returns the number that identifies the start of a site in virtual time.
+    """Returns the number by which logs of simulations identify the start of a site.
 
-    In a live session, every start of a process gets a random number. In virtual time, the
-    number is a function of the scenario, so that repeated runs write the same log.
+    In a live session, every start of a process gets a random number. In a simulation (virtual
+    time), the number is a function of the scenario, so that repeated runs write the same log.
 
     Args:
         scenario: Description of the experiment.
@@ -569,7 +571,7 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes the reports of an operator's connection to the log, and empties their list.
+        """Writes to the log what an operator's connection has reported, and empties the list.
 
         Args:
             news: The reports, as pairs of a tick (number of a period of the control loop) and a
@@ -684,7 +686,7 @@ def record_virtual(
     hands: HandTracks = {},  # noqa: B006
     policies: Collection[str] = (),
 ) -> bool:
-    """Simulates a scenario in virtual time, and writes the log of the run to a file.
+    """Simulates a scenario faster than real time, and writes the log of the run to a file.
 
     Args:
         scenario: Description of the experiment, with its sites and links.

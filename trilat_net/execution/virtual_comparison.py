@@ -41,7 +41,7 @@ from .virtual_network import Network, RecordedNetwork, complete_deliveries, read
 
 
 class RecordComparison(NamedTuple):
-    """Result of comparing the records of a log with another execution of the same ticks.
+    """Result of comparing the records of a log with another execution of the same run.
 
     Attributes:
         records: Number of records that were compared. A record is the stored result of one
@@ -78,7 +78,7 @@ class _LateSample(NamedTuple):
     arrived_tick: int | None
 
     def __str__(self) -> str:
-        """Returns a sentence about the sample."""
+        """Returns a sentence about the late message, for the report to the user."""
         outcome = "never came"
         if self.arrived_tick is not None:
             outcome = f"came at tick {self.arrived_tick}"
@@ -89,7 +89,7 @@ class _LateSample(NamedTuple):
 def _compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
 ) -> RecordComparison:
-    """Compares every record of a log with another execution, bit for bit.
+    """Compares every record of a log with another execution of the run, bit for bit.
 
     Args:
         log: Log whose records are compared.
@@ -213,7 +213,7 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
 
 
 def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if a receiver still used an older sample when a given sample was due.
+    """True if a site still used an older state of its peer when a given one was due.
 
     Args:
         site_log: Records of the receiver.
@@ -251,9 +251,9 @@ class _VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[_LateSample]:
-        """List of the samples that arrived later than the scenario describes.
+        """Messages that arrived later than the delay model of the scenario describes.
 
-        A sample is the state that a site (process that runs one arm) sends.
+        A message (sample) contains the state that a site (process that runs one arm) sends.
         """
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
@@ -341,7 +341,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the arrivals at a site, by tick.
+    """Returns the messages that arrived at a site, by the control period (tick) that used them.
 
     Arrivals in gaps of the log are assumed, unless too many records are missing.
     """

@@ -38,10 +38,9 @@ class Network(Protocol):
     """
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Accepts the state that a site sends, and delivers it to the other sites later.
+        """Accepts the state that an arm controller (site) sends, to deliver it to others later.
 
-        A site is a simulated process that runs one arm. It sends its state after each tick
-        (period of its control loop).
+        A site sends its state after each tick (period of its control loop).
 
         Args:
             sender: Name of the site.
@@ -51,8 +50,8 @@ class Network(Protocol):
     def is_ready(self, receiver: str, k: int) -> bool:
         """True if everything that a site receives in its next tick has been sent already.
 
-        A site is a simulated process that runs one arm, and a tick is a period of its control
-        loop. The next tick can only be executed then.
+        The next tick can only be executed then. A site is a simulated process that runs one
+        arm, and a tick is a period of its control loop.
 
         Args:
             receiver: Name of the site.
@@ -60,7 +59,7 @@ class Network(Protocol):
         """
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples that arrive at a site in one tick, in the order of their arrival.
+        """Returns the messages that arrive at a site in one control period, in their order.
 
         Args:
             receiver: Name of the site.
@@ -69,10 +68,10 @@ class Network(Protocol):
 
 
 class PromptNetwork:
-    """Network without any delay of its own.
+    """Simulated network that delivers every message without delay.
 
-    Each sample arrives in the receiver's first tick (control period) after it was sent. The
-    delays that a scenario states are applied later, by the receiver.
+    Each message (sample) arrives in the receiver's first tick (control period) after it was
+    sent. The delays that a scenario states are applied later, by the receiver.
 
     Args:
         rates: Tick rate of each site, in Hz, by name.
@@ -86,20 +85,20 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the sample of a tick until each other site has received it."""
+        """Stores the state that a site sends in a control period until all others have it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
 
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """Returns True, because the samples for the next tick are always complete.
+        """Returns True: a site can always execute its next control period without waiting.
 
-        The sites run in the order of time, so all earlier samples have been sent.
+        The sites are simulated in the order of time, so that all earlier states have been sent.
         """
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples sent before tick `k` that the site has not received yet."""
+        """Returns the states sent before control period `k` that a site has not received."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
         for index, queue in enumerate(self._in_transit[receiver].values()):
@@ -134,7 +133,10 @@ class RecordedNetwork:
         self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the sample of a tick under its sender and tick, until it is delivered."""
+        """Stores a sent state (sample) under its sender and tick, until it is delivered.
+
+        The delivery repeats the delays of the recorded run.
+        """
         self._sent[sender, output.tick] = output
 
     def is_ready(self, receiver: str, k: int) -> bool:
@@ -198,9 +200,10 @@ class Deliveries(NamedTuple):
 
 
 def read_deliveries(site_log: SiteLog) -> Deliveries:
-    """Reads from the records of a site (arm controller) which samples arrived in each tick.
+    """Reads from a site's records which states of other sites arrived in each tick.
 
-    Ticks (control periods) without a record are left out; `complete_deliveries` fills them in.
+    A site is an arm controller, and a tick one of its control periods. Ticks without a record
+    are left out; `complete_deliveries` fills them in.
 
     Args:
         site_log: Records of the site, each of which lists the samples that arrived in its tick.
@@ -276,7 +279,7 @@ def complete_deliveries(
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns when each sample (sent state) of a peer arrived for the first time.
+    """Returns when each state (sample) that a peer sent arrived for the first time.
 
     Args:
         deliveries: Arrivals at the receiver.
@@ -302,7 +305,9 @@ def _assume_arrivals(
     peer_hz: int,
     end: int,
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields the assumed arrivals of those samples of one peer that no record lists.
+    """Yields assumed arrivals of those messages of one peer that no record lists.
+
+    Records are missing from the log, so that the true arrivals are not known.
 
     Args:
         recorded: Arrivals that the records list.

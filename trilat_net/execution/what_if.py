@@ -66,7 +66,7 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """A measured number, such as an error, in a log and after executing the log again.
+    """A number, such as an error, of a recorded run and of its repetition with changes.
 
     Attributes:
         before: Value in the log.
@@ -78,11 +78,11 @@ class LogAndRerun(NamedTuple):
 
 
 class SiteEffect(NamedTuple):
-    """Difference that a rerun makes to one site (arm controller), compared with the log.
+    """How one arm moves otherwise in a repeated run with changed settings than in the log.
 
-    A rerun executes sites of a log again, usually with changed settings. The figures are taken
-    over those ticks of which both the log and the rerun have a record (result of a control
-    period). They are None if there is no such tick.
+    The run is that of a site (arm controller). The figures are taken over those ticks of which
+    both the log and the repetition (rerun) have a record (result of a control period). They are
+    None if there is no such tick.
 
     Attributes:
         site: Name of the site.
@@ -145,7 +145,7 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if the delays on the link differ between the log and the rerun.
+        """True if the delays on a network link differ between the recorded and the new run.
 
         The delay is measured as the age of the received data when they are used. Its mean and
         its largest value are compared.
@@ -190,7 +190,7 @@ class _CommonRecords(NamedTuple):
 def _compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Computes what a rerun changed at a site, and on the links over which the site receives.
+    """Computes how a repeated run differs at one arm, and on the links to this arm.
 
     Args:
         log: The log that was executed again.
@@ -269,7 +269,7 @@ def _pair_records(
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the largest root mean square of all columns of an array.
+    """Returns the root mean square of each column of an array, and of these the largest.
 
     Args:
         values: Values, shape (K, n), with a column for each joint.
@@ -290,7 +290,7 @@ def _find_largest(values: Array) -> float:
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[LinkEffect]:
-    """Returns the effect of a rerun on the links over which a site (arm controller) receives.
+    """Returns how the delays on the network links to an arm differ in the repeated run.
 
     Args:
         log: The log.
@@ -348,10 +348,10 @@ class Rerun(Result):
 
     @cached_property
     def after(self) -> Log:
-        """The rerun in the form of a log, so that it can be analysed like any other log.
+        """The repeated run in the form of a log, so that it can be analysed like any log.
 
-        Executed sites appear as they were computed now, and the other sites as they were
-        recorded.
+        Sites (arm controllers) that were executed appear as they were computed now, and other
+        sites as they were recorded.
         """
         stream = io.BytesIO()
         self.write(stream)
@@ -406,7 +406,7 @@ class Rerun(Result):
         writer.finish(render_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the rerun as a log to a file, with additional channels for viewers.
+        """Writes the repeated run as a log to a file, which viewers can also display.
 
         Args:
             path: File to which the log is written.
@@ -421,7 +421,7 @@ class Rerun(Result):
 
     @property
     def diverged(self) -> bool:
-        """True if the arm of a site left its limits in the rerun, but not in the log."""
+        """True if an arm left its limits in the repeated run, but not in the recorded run."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -429,7 +429,7 @@ class Rerun(Result):
 
     @property
     def identical(self) -> bool:
-        """True if the rerun reproduced every compared record with the same bits."""
+        """True if the repeated run gave the same bits in every record that was compared."""
         return all(effect.identical == effect.compared for effect in self.sites.values())
 
     @property
@@ -451,24 +451,24 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences that tell the user what limits the meaning of the result.
+        """Sentences that tell the user what the result of a repeated run cannot show.
 
         For example, records may have been copied because the log was incomplete. Empty if there
-        are no limits to mention.
+        is nothing to mention.
         """
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table with a row for each site that was executed again, for JSON.
+        """Returns a table of how the repeated run differs from the recorded run, for JSON.
 
-        A site is a process that runs one arm. A row tells how its records differ from the log.
+        It has one row for each site (process that runs one arm) that was executed again.
         """
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the whole result as plain values, ready for JSON.
+        """Returns the result of a repeated run as plain values, ready for JSON.
 
-        The keys are those of `trilat rerun --json`.
+        The keys are those that `trilat rerun --json` prints.
         """
         return {
             "log": self.before.source,
@@ -602,9 +602,10 @@ def _make_executed_entries(
 
 
 def _to_plain_value(value: Any) -> Any:
-    """Converts a value for JSON.
+    """Converts a value to types that JSON can represent.
 
-    A named tuple becomes a dictionary. Infinite numbers and NaN become None.
+    A named tuple becomes a dictionary. Infinite numbers and NaN become None, because JSON has
+    no such numbers.
     """
     if hasattr(value, "_asdict"):
         return {key: _to_plain_value(item) for key, item in value._asdict().items()}
@@ -612,7 +613,7 @@ def _to_plain_value(value: Any) -> Any:
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences that tell the user what limits the meaning of a rerun.
+    """Yields sentences about what a repeated run cannot show, for the user.
 
     Args:
         result: The log and its rerun.

@@ -74,9 +74,9 @@ class RangeSet:
         self._forget_lowest()
 
     def _forget_lowest(self) -> None:
-        """Removes the ranges with the lowest numbers if there are more than permitted.
+        """Removes the ranges with the lowest numbers, if there are more than permitted.
 
-        Thus the memory stays bounded, whatever a sender does (L6).
+        The memory thus stays bounded, whatever numbers a faulty or hostile sender uses (L6).
         """
         del self._ranges[: -self._max_ranges]
 
@@ -110,7 +110,7 @@ class RangeSet:
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
-        """Returns the range of consecutive numbers in the set that contains a number.
+        """Returns the range of consecutive numbers in which a number lies. None if in none.
 
         Args:
             number: The number to look for.
@@ -153,7 +153,7 @@ SHOWN_GAPS = 20
 
 
 class Account:
-    """Counts the messages of one channel, and knows which of their numbers are missing.
+    """Counts the messages of one channel by their numbers, and knows which are missing.
 
     Attributes:
         received: Number of messages that were received, without repetitions.
@@ -170,7 +170,7 @@ class Account:
     """
 
     def __init__(self) -> None:
-        """Starts without any message."""
+        """Starts an account of received messages with no message counted yet."""
         self.received = 0
         self.duplicate = 0
         self.reordered = 0
@@ -229,11 +229,10 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """States that the sender has published at least the messages 0 to `published` - 1.
+        """Notes that the sender has published at least the messages 0 to `published` - 1.
 
-        Those that have not arrived count as missing from now on. Without such a statement,
-        messages missing at the end would remain unnoticed, because no later number reveals the
-        gap.
+        Those that have not arrived count as missing from now on. Without this, messages missing
+        at the end would remain unnoticed, because no later number reveals the gap.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
@@ -308,20 +307,20 @@ class Account:
 
     @property
     def expected(self) -> int:
-        """Number of messages that are known to have been published.
+        """Number of messages that a process has published, as far as a receiver knows.
 
-        Numbers that never had a message (`unpublished`) are not counted.
+        Skipped numbers that never had a message (`unpublished`) are not counted.
         """
         return self.last + 1 - self.unpublished
 
     @property
     def missing(self) -> int:
-        """Number of messages that were published, but not received, not even on request."""
+        """Number of lost messages: published, but never received, not even on request."""
         return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
-        """Ranges of missing numbers in ascending order, as pairs [first, last].
+        """Numbers of the messages that are missing, as pairs [first, last] in ascending order.
 
         For example [[10, 12]] if the messages 10, 11 and 12 are missing. There are at most
         `MAX_GAPS` pairs: those with the highest numbers.
@@ -330,10 +329,9 @@ class Account:
 
     @property
     def largest_gap(self) -> int:
-        """Number of missing messages in the largest gap, 0 if no message is missing.
+        """Number of messages in the longest series of missing messages. 0 if none is missing.
 
-        A long gap means an interruption, while the same number of single losses may be
-        harmless.
+        A long series means an interruption, while as many single losses may be harmless.
         """
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
@@ -388,7 +386,9 @@ class Account:
         return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Marks a number as received: removes it from the gaps, or extends the known numbers.
+        """Marks the number of a message as received.
+
+        It is removed from the missing numbers, or extends the known numbers.
 
         Returns:
             False if the number had been marked as received before.
@@ -425,7 +425,10 @@ class StartGap:
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
-        """Starts with an unknown gap, because the site has not been started again yet."""
+        """Stores the account of a site's messages before the site was started again.
+
+        The number of messages that were lost between both starts is unknown at first.
+        """
         self._account = account
         self._under_way = under_way
         # Largest number of messages that the earlier start published, as other sites report.
@@ -539,10 +542,11 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Smallest fraction of recorded or checked ticks of any site, from 0 to 1.
+        """Smallest fraction of control periods of any site that were recorded, from 0 to 1.
 
-        A run is known only as well as its worst site. The fraction is 0 if no site has ticks,
-        and a single site without ticks does not lower it.
+        A run is known only as well as its worst site (arm controller). In the result of a
+        check, the fraction is that of checked periods. It is 0 if no site has any, and a single
+        site without any does not lower it.
         """
         if not any(self.expected.values()):
             return 0.0
@@ -568,7 +572,7 @@ class Coverage(NamedTuple):
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
 
     def describe(self, least: float) -> str:
-        """Describes in words how much of the run was recorded or checked.
+        """Tells in words how much of the run was recorded or checked.
 
         Args:
             least: Smallest fraction of ticks (control periods) that is sufficient, from 0 to 1.
@@ -581,7 +585,7 @@ class Coverage(NamedTuple):
         return f"judged {self}{shortage}"
 
     def to_json(self) -> dict[str, list[int]]:
-        """Converts the numbers of recorded or checked ticks to plain values for JSON.
+        """Returns how many control periods of each site were recorded or checked, for JSON.
 
         Returns:
             For each site the pair [recorded or checked ticks, all ticks]. A tick is one period

@@ -156,7 +156,7 @@ class ContentCheck:
     def __init__(
         self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool
     ) -> None:
-        """Starts without any accepted message."""
+        """Prepares the check of a channel's messages. No message has been accepted yet."""
         self._scenario = scenario
         self._about = about
         self._session = about.get("session", "")
@@ -202,6 +202,8 @@ class ContentCheck:
     def identify(self, payload: bytes) -> str:
         """Finds out from the content of a message to which topic it belongs.
 
+        A recovery needs this for messages whose channel is damaged.
+
         Args:
             payload: Bytes of the message.
 
@@ -221,10 +223,9 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Composes the metadata that a channel of the session has in a log.
+        """Returns the description of a channel that a correct log of the session contains.
 
-        They are the same that `LogWriter` writes, so that a lost definition of a channel can be
-        restored.
+        A recovery restores a lost description with it.
 
         Args:
             topic: Topic of the channel.
@@ -308,7 +309,9 @@ class ContentCheck:
     def _check_session_message(
         self, topic: str, sequence: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Checks that a message of a member is the next one of its channel.
+        """Checks that a message from a process of the session is the next one of its channel.
+
+        A damaged file may contain messages of other sessions, which must not be copied.
 
         Args:
             topic: Topic of the channel.
@@ -369,10 +372,11 @@ class ContentCheck:
             raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the number (boot) that identifies the present start of a member's process.
+        """Returns the number that identifies the present start of a process, or None.
 
-        All messages of one start contain it. In virtual time, it is computed from the scenario.
-        Otherwise it is read from the latest accepted message. None if there is no such message.
+        All messages of one start contain this number (boot). In virtual time, it is computed
+        from the scenario. Otherwise it is read from the latest accepted message. None if there
+        is no such message.
         """
         if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
@@ -386,7 +390,7 @@ class ContentCheck:
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Checks that a message has the next number of its channel.
+        """Checks that a message has the next number of its channel, so that none is repeated.
 
         Args:
             topic: Topic of the channel.

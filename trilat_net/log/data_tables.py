@@ -103,20 +103,21 @@ class Column(NamedTuple):
 
     @property
     def is_text(self) -> bool:
-        """True if the values are texts."""
+        """True if the values of the column are strings, and False if they are numbers."""
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a column of numbers, shape (K,), with NaN for missing values.
+        """Returns the values of a numeric column as an array, with NaN for missing values.
 
-        Exports to formats without missing values use it, such as NumPy files.
+        The shape is (K,). Exports to formats without missing values use it, such as NumPy
+        files.
         """
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of consecutive rows as plain Python values, for files such as CSV.
+        """Returns some consecutive values of the column as plain Python values, as for CSV.
 
         Args:
             first: Index of the first row.
@@ -136,7 +137,9 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table that is exported from a log. Its columns have equal lengths.
+    """A table that is exported from a log, such as the joint angles of an arm over time.
+
+    All its columns have the same length.
 
     Attributes:
         name: Name of the site (arm controller) whose messages the table contains, or "events".
@@ -155,7 +158,7 @@ class Table:
         return len(self.columns[0].values) if self.columns else 0
 
     def __getitem__(self, name: str) -> Column:
-        """Returns a column by its name.
+        """Returns a column of the table by its name, as in `table["q1_rad"]`.
 
         Raises:
             KeyError: The table has no column of that name.
@@ -167,13 +170,16 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table for file names, such as "m1_link", or "events" for all sites."""
+        """Name of the table for file names, such as "m1_link" for the links of the site "m1".
+
+        A table about all sites has a name without a site, such as "events".
+        """
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
     def to_data_frame(self) -> "polars.DataFrame":
         """Converts a table of a log to a polars data frame with the same columns.
 
-        A missing value is null.
+        A missing value becomes null.
 
         Raises:
             UsageError: polars is not installed.
@@ -211,7 +217,7 @@ _COMPLETE_TEXTS = {
 
 
 class _FieldDoc(NamedTuple):
-    """Documents one field of a message, for the head of an exported table.
+    """Name, unit and meaning of one field of a message, for the head of an exported table.
 
     Attributes:
         unit: Unit of the field. Empty if it has no unit.
@@ -356,7 +362,9 @@ def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Co
 def _make_task_columns(
     site: SiteLog, arm: ArmModel, field: str, units: tuple[str, str]
 ) -> Iterator[Column]:
-    """Yields the columns of a vector that has a number per coordinate of the end effector.
+    """Yields the columns of a vector with a number per coordinate of the end effector.
+
+    An example is the position x, y and z.
 
     Args:
         site: Records of the site (arm controller).
@@ -405,7 +413,7 @@ def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields the four columns of the orientation in a pose, as a unit quaternion.
+    """Yields four columns of a table with an orientation, as a unit quaternion.
 
     Args:
         site: Records of the site (arm controller).
@@ -433,7 +441,7 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
-    """Returns the column of one number of a vector, for example of joint 1 of the angles q.
+    """Returns a table column with one number of a vector, for example of joint 1 of "q".
 
     Args:
         site: Records of the site (arm controller).
@@ -455,7 +463,7 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that the site's control law sends to its peers.
+    """Yields the columns of the numbers that a site's control law sends to other sites.
 
     Their names begin with "ch_". For example "ch_force_m1_nm" is a torque that is sent to m1.
     """
@@ -481,7 +489,7 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
 
 
 def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
-    """Yields the columns of the operator, the person or program that moves the arm.
+    """Yields the columns about the operator, a person or program that moves the arm.
 
     Args:
         site: Records of the site.
@@ -574,7 +582,7 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Builds the table with the records of a site, one row per tick of its control loop.
+    """Builds a table of an arm's angles, torques and so on, one row per control period.
 
     Args:
         site: Records (results of control periods) of the site (arm controller).
@@ -648,10 +656,10 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
 
 
 def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Builds the table of the samples that arrived at a site from its peers.
+    """Builds a table of the messages that a site received, with their delays.
 
-    A sample is the state that a peer, another site, publishes in one tick. The table has one
-    row per sample, in the order of arrival.
+    A message (sample) is the state that a peer, another site (arm controller), publishes in one
+    tick (control period). The table has one row per message, in the order of arrival.
 
     Args:
         site: Records of the receiving site, which list the arrivals.
@@ -845,9 +853,9 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:
-    """Converts a field of an event to a string.
+    """Converts a field of an event (a notable occurrence in a session) to a table cell.
 
-    A map becomes JSON, and an empty map an empty text.
+    A dictionary becomes JSON, but an empty dictionary becomes the empty string.
     """
     if isinstance(value, str):
         return value

@@ -20,7 +20,7 @@ _MAX_LISTED_PROBLEMS = 1000
 
 
 class _ProblemPlace(NamedTuple):
-    """A problem in a file, and the place where it was found.
+    """A problem that a check has found in a file, with its place in this file.
 
     Attributes:
         file: Name of the file.
@@ -39,7 +39,9 @@ class _ProblemPlace(NamedTuple):
 
 @dataclass(slots=True)
 class Finding:
-    """Result of one check of a log or a run, with the problems that it found.
+    """Result of one check of a log or a run, such as that of missing records.
+
+    It has the problems that the check found.
 
     Attributes:
         check: Name of the check. Every file is checked for "whole", "checksums", "records" and
@@ -78,9 +80,10 @@ class Finding:
             self.places.append(_ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
-        """Summarises the problems of the check in one line.
+        """Summarises the problems that one check of a log has found, in one line.
 
-        There must be at least one problem.
+        The line has the first problem and the number of further problems. There must be at
+        least one.
 
         Returns:
             The first problem and the number of further problems.
@@ -103,7 +106,7 @@ class Finding:
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns the result of the check as one row of JSON: its name, text and outcome.
+        """Returns the result of one check of a log as plain values: its name, text and outcome.
 
         "judged" is False if the check could not be made. The single problems are left out,
         because their summary is in the text.
@@ -117,7 +120,7 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """The results of several checks, by name of the check, in the order of their first use.
+    """Results of several checks of a log, by name of the check, in the order of first use.
 
     A name that does not exist yet gets a result without problems when it is read. Thus a check
     can add a problem by `findings["records"]` at any place.
@@ -131,7 +134,8 @@ class Findings(dict[str, Finding]):
 class CheckReport(Result):
     """Base class of the results of commands that check a log in several respects.
 
-    It derives from the findings whether the log passed, and the exit code of the command.
+    It derives from the results of the single checks whether the log passed, and the exit code
+    of the command.
 
     Attributes:
         findings: The result of each check.
@@ -141,7 +145,7 @@ class CheckReport(Result):
 
     @property
     def passed(self) -> bool:
-        """True if every check passed."""
+        """True if every check of the log passed."""
         return all(finding.passed for finding in self.findings)
 
     @property
@@ -158,5 +162,8 @@ class CheckReport(Result):
         return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per check, with the keys "label", "text", "passed" and "judged"."""
+        """Returns one dictionary per check of the log, for a table or for JSON.
+
+        The keys are "label", "text", "passed" and "judged".
+        """
         return [finding.to_row() for finding in self.findings]

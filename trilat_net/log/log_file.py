@@ -80,9 +80,10 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Frees the reserved disk space, so that the end of the log fits on a full disk.
+        """Frees the reserved disk space, so that the last part of a log fits on a full disk.
 
-        Later calls of `grow` reserve nothing.
+        This happens when the disk refuses data, or when the file is closed. Later calls of
+        `grow` reserve nothing.
         """
         self._is_possible = False
         self.size = 0
@@ -92,9 +93,9 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Allocates the bytes of a file from the offset `begin` to before the offset `end`.
+    """Reserves disk space for a file from one offset up to another.
 
-    If the file system cannot allocate space, zeros are written.
+    If the file system cannot reserve space, zeros are written.
 
     Raises:
         OSError: The disk has no room.
@@ -164,7 +165,7 @@ class _FileSync:
             self._disk_error = error
 
     def wait(self) -> None:
-        """Waits until the thread that syncs the file has ended.
+        """Waits until a thread has forced the written data of the log onto the disk.
 
         The file must not be closed before, as the thread uses its descriptor.
         """
@@ -173,7 +174,7 @@ class _FileSync:
 
 
 def _datasync(descriptor: int) -> None:
-    """Syncs the data of a file to the disk.
+    """Forces the written data of a file onto the disk, so that a power failure loses nothing.
 
     Where the system has `fdatasync`, it is preferred to `fsync`, because it leaves out metadata
     that are not necessary to read the file.
@@ -198,10 +199,10 @@ _ADVICE = {
 
 
 def sync_folder(folder: Path) -> None:
-    """Writes the entries of a folder to the disk, so that its files survive a loss of power.
+    """Forces the names of new files in a folder onto the disk, so that they survive a crash.
 
-    Without this, a file may be stored completely, but its name may be lost. Nothing happens on
-    platforms that do not support this.
+    Without this, a file may be stored completely, but its name may be lost when the power
+    fails. Nothing happens on platforms that do not support this.
 
     Args:
         folder: The folder.
@@ -252,7 +253,7 @@ class LogFile:
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
-        """Creates the file under its working name."""
+        """Creates the log under a working name, which shows that it is not complete yet."""
         self.path = path
         self.working = working or active_path(path)
         self.size = 0
@@ -347,7 +348,7 @@ class LogFile:
             raise
 
     def _write_pending(self) -> None:
-        """Passes the stored data to the operating system, and remembers the end of the file.
+        """Passes the bytes in memory to the operating system, and notes where the file ends.
 
         After an error, the next call continues behind the bytes that were accepted.
 
@@ -367,7 +368,7 @@ class LogFile:
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes the data of an incomplete flush, so that the file ends at the previous flush.
+        """Removes partly written data, so that the file ends where a complete flush ended.
 
         A log that ends with half a chunk could only be read after a recovery.
         """
@@ -379,7 +380,7 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True if the file is complete: it ends with the end mark of the MCAP format.
+        """True if the log is complete: it ends with the end mark of the MCAP format.
 
         Only such a file gets its final name. Another one keeps the suffix ".active", and can be
         recovered.
@@ -417,7 +418,7 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes the file and removes it, because the log is not wanted.
+        """Closes and removes the file of a log that is not wanted.
 
         An error while closing is ignored, since no data need to be saved.
         """
@@ -427,7 +428,7 @@ class LogFile:
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the file, and explains an error of the disk to the user.
+        """Closes the log's file, and explains an error of the disk to the user.
 
         Args:
             error: Exception that interrupted the writing. None if nothing interrupted it.

@@ -64,7 +64,7 @@ def describe_unfinished(path: Path) -> str:
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Computes the file name of a part of a log, such as run-002.mcap for part 2 of run.mcap.
+    """Returns the file name of a part of a long log: run-002.mcap for part 2 of run.mcap.
 
     Args:
         path: Name of the log.
@@ -112,7 +112,7 @@ class ChannelFilter:
     exclude: tuple[str, ...] = ()
 
     def accepts(self, key: str) -> bool:
-        """Finds out whether a channel is recorded, by the patterns that the user gave.
+        """Returns True if the messages of a channel are recorded, by the user's patterns.
 
         Args:
             key: Key of the channel in the network, such as "trilat/paper/m1/state".

@@ -101,9 +101,10 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
 class Log(Result, Mapping[str, SiteLog]):
-    """A recorded session: a mapping from the names of the sites to their records.
+    """A recorded session: the records of each arm controller (site), by the site's name.
 
-    `open_log` creates this object from one file, or from several files of one session.
+    For example, `log["m1"].q` are the joint angles of the arm m1. `open_log` creates this
+    object from one file, or from several files of one session.
 
     Args:
         contents: Contents of the file, or of all files together.
@@ -130,7 +131,7 @@ class Log(Result, Mapping[str, SiteLog]):
     """
 
     def __init__(self, contents: LogContents) -> None:
-        """Reads the scenario and the events. Records are decoded when they are accessed."""
+        """Reads the scenario and the events of a log. Records are decoded on first access."""
         self.source = contents.source
         self.sources = contents.sources
         self.session = contents.session
@@ -174,12 +175,15 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def why_empty(self) -> str:
-        """A clause that no site has a record in this log. Empty if a site has a record."""
+        """Clause for an error text which says that no site has a record in this log.
+
+        Empty if at least one site has a record.
+        """
         has_records = any(len(self[name]) for name in self.sites)
         return "" if has_records else "no site has a record in this log"
 
     def require_records(self) -> None:
-        """Raises an error if no site has a record, so that there is nothing to judge.
+        """Raises an error if the log has no record, so that there is nothing to judge.
 
         Raises:
             LogError: No site has a record.
@@ -318,9 +322,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return sorted(event_topics & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
-        """Returns the messages of a topic.
+        """Returns all messages of one topic of the log, for example of one site's records.
 
-        They are empty if the log does not contain the topic.
+        The result is empty if the log does not contain the topic.
         """
         return self._contents.channels.get(topic) or ChannelMessages()
 
@@ -358,10 +362,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns the events of a member, sorted by its starts and by their numbers.
+        """Returns the events of one process of the session, such as "lost", in their order.
 
-        A member that is started again numbers its events from 0 again. The starts are in the
-        order in which they first appear in the file.
+        A process that is started again numbers its events from 0 again. The starts are in the
+        order in which they first appear in the file, and the events of a start by number.
         """
         events = self._decode(topic, Event)
         boots = list(dict.fromkeys(event.boot for event in events))
@@ -407,9 +411,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def failed_hands(self) -> list[str]:
-        """Sentences on the programs that failed while they moved an arm: which, when, and why.
+        """Sentences about programs that failed while they moved an arm, for reports on the log.
 
-        Empty if none failed.
+        Each sentence tells which program failed, when, and why. Empty if none failed.
         """
         return [
             event.text
@@ -418,9 +422,10 @@ class Log(Result, Mapping[str, SiteLog]):
         ]
 
     def warn_of_failures(self) -> None:
-        """Issues a Python warning if the run diverged or a program that moves an arm failed.
+        """Issues a Python warning if an arm left its limits, or if a user's program failed.
 
-        The warning names the line of code that called the caller of this method.
+        The program is one that moves an arm. The warning names the line of code that called the
+        caller of this method.
         """
         for failure in self.failed_hands:
             warnings.warn(failure, RuntimeWarning, stacklevel=3)
@@ -463,7 +468,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of this file, from 1, if the recorder split the log into several files.
+        """Number of this file, from 1 on, if a long log was split into several files.
 
         It is 0 for a log in a single file, for several files that were opened together, and for
         a file without a valid number.
@@ -549,10 +554,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of ticks that each site (arm controller) states in its "end" event, by site.
+        """Number of control periods (ticks) that each site states when it ends, by site.
 
-        A number above that of the scenario is reduced to it. Sites without such an event are
-        missing.
+        A site (arm controller) states it in its "end" event; sites without such an event are
+        missing. A number above that of the scenario is reduced to it.
         """
         ticks = {}
         for event in self.events:
@@ -661,7 +666,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return [*self.absences.get(site, ()), *self[site].skipped_ranges]
 
     def absent_ticks(self, site: str) -> int:
-        """Counts the ticks of `find_unexecuted_ticks`.
+        """Counts the control periods (ticks) that a site did not execute during the session.
+
+        The process may have started late or ended early, see `find_unexecuted_ticks`.
 
         Args:
             site: Name of the site.
@@ -685,9 +692,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return max(ticks, recorded) - self.absent_ticks(site)
 
     def _is_gone(self, site: str) -> bool:
-        """Returns True if the latest news about a site is that it was lost or left.
+        """Returns True if a site was lost or left, according to the latest event about it.
 
-        The other sites publish this news as events.
+        Other sites publish such events. The site may have come back after an earlier loss.
         """
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
@@ -751,10 +758,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._sites[site]
 
     def _read_site(self, site: str) -> SiteLog:
-        """Creates the view of one arm's records that `log[name]` returns.
+        """Creates the object with all records of one arm that `log[name]` returns.
 
         Raises:
-            LogError: A tick (control period) is beyond the length of the scenario.
+            LogError: A control period is beyond the length of the scenario.
         """
         channel = self._channel(self._topic(site, topics.STATE))
         site_log = SiteLog(
@@ -850,7 +857,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return shown_ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
-        """Decodes the statistics that a site published about its links, such as losses.
+        """Returns the statistics that a site published about its network links, such as losses.
 
         Args:
             site: Name of the site.
@@ -861,7 +868,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Decodes the statistics that a site published about its links, with their times.
+        """Returns the statistics that a site published about its network links, with times.
 
         Args:
             site: Name of the site, the process that runs one arm.
@@ -878,7 +885,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages([stats[n] for n in order], log_ns[order], publish_ns[order])
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Decodes the events of all members of the session, in the order of their arrival.
+        """Returns the events of all processes of the session, in the order of their arrival.
+
+        An event is a notable occurrence, such as a lost connection. Each has the time of
+        arrival at the recorder and the time of sending.
 
         Returns:
             The events, with the time of arrival at the recorder and the time of sending of
@@ -909,7 +919,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:
-        """Returns a table of the log: columns with names, units and meanings.
+        """Returns a table of the log, such as an arm's records: columns with names and units.
 
         Args:
             name: Name of a site (arm controller), or "events".
@@ -937,7 +947,7 @@ class Log(Result, Mapping[str, SiteLog]):
         )
 
     def tables(self) -> Iterator[Table]:
-        """Yields every table of the log, for example to export all of them.
+        """Yields every table of the log, such as the joint angles of one arm, for exports.
 
         The tables of each site come first, then the table of the events. Only one of them is in
         memory at a time.
@@ -999,7 +1009,7 @@ def open_log(
 
 
 def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
-    """Opens all logs in files and folders, see `open_log`.
+    """Opens all logs in the given files and folders, see `open_log`.
 
     Args:
         sources: Paths of logs, or of folders that contain logs.
@@ -1049,7 +1059,7 @@ def _read_parts(
 
 
 def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
-    """Opens one file of a log, unless the caller has opened the file already.
+    """Opens one file of a log. A file that the caller has opened already is used as it is.
 
     Args:
         source: Path, or binary file opened for reading.

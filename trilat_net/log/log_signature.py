@@ -48,7 +48,7 @@ _MAX_BYTES = 65_536
 
 
 class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a signature's file.
+    """Content of the file beside a log that contains its cryptographic signature.
 
     Attributes:
         format: Name and version of the format.
@@ -199,7 +199,7 @@ def check_signatures(
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
-    """Checks the signature of one log.
+    """Checks that a log has not been changed since it was signed.
 
     Args:
         path: The log.
@@ -244,7 +244,9 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
 
 
 def _signed_bytes(chain: Mapping[str, str]) -> bytes:
-    """Returns the bytes that are signed: the name of the format, and the digests.
+    """Returns the bytes of a log that are signed, in place of the whole file.
+
+    They are the name of the format, and the digests, which depend on every byte of the file.
 
     Args:
         chain: The digests, as the log states them.
@@ -284,7 +286,7 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
 
 def _load_key(path: Path, kind: Any, expected: str) -> Any:
-    """Reads a key from a file.
+    """Reads a cryptographic key from a file, and checks that it has the expected kind.
 
     Args:
         path: The file.

@@ -42,12 +42,17 @@ class _ViewChannels(Protocol):
     """Numbers of the channels for viewers in a file, by topic."""
 
     def __getitem__(self, topic: str) -> int:
-        """Returns the number of a topic's channel, and registers the channel if necessary."""
+        """Returns the number of a topic's channel in an MCAP file.
+
+        The channel is registered in the file at the first access, so that the file declares no
+        channel without messages.
+        """
 
 
 class _LogViews(Protocol):
-    """Derives messages for general viewers from the messages of a session.
+    """Interface: derives messages for general viewers from the messages of a session.
 
+    Viewers such as Foxglove cannot read the program's own format.
     `ros2.viz_channels.VizChannels` derives standard messages of ROS 2.
 
     Attributes:
@@ -59,21 +64,23 @@ class _LogViews(Protocol):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes.
+        """Upper limit for the size of messages for viewers that are not written yet, in bytes.
 
         A writer adds this size when it decides whether the next message still fits into the
         file.
         """
 
     def open_channels(self, file: McapWriter) -> _ViewChannels:
-        """Returns the channels for viewers of a file, which are registered when needed.
+        """Returns the channels of a file that viewers such as Foxglove display.
+
+        A channel is registered in the file only when its first message is written.
 
         Args:
             file: The file.
         """
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages for viewers, at the end of the log.
+        """Writes the remaining messages for viewers such as Foxglove, at the end of the log.
 
         Args:
             log_ns: Arrival time of the last message of the session, in Unix time, in ns.
@@ -170,7 +177,7 @@ class LogWriter:
     def _register_channels(
         self, scenario: SessionScenario, session: str, choice: log_layout.ChannelFilter
     ) -> dict[str, int | None]:
-        """Registers the schemas and channels of the session.
+        """Registers all topics of a session and their message formats in the log file.
 
         Args:
             scenario: Scenario of the session.
@@ -213,12 +220,12 @@ class LogWriter:
 
     @property
     def messages(self) -> int:
-        """Number of messages that were added to the file, even if not yet on the disk."""
+        """Number of messages in the log, including those that are not yet on the disk."""
         return self._file.messages
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes written so far."""
+        """Number of bytes of the log file that have been written so far."""
         return self._file.position
 
     @property
@@ -240,7 +247,7 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message of the session to the log, unless the filter excludes its channel.
+        """Adds one network message to the log, unless the user has excluded its channel.
 
         Args:
             key: Key of the channel.
@@ -275,7 +282,7 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Adds a message for viewers.
+        """Adds a message to the log that viewers such as Foxglove display.
 
         Args:
             topic: Topic of the message.
@@ -354,7 +361,7 @@ It is used for the accounts, and for the messages for viewers that follow from o
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Where a log is stored, and when a new file (part) of it begins.
+    """Where a log is stored, and at which size or duration a new file of it begins.
 
     Attributes:
         path: Name of the log. The name of a part also contains its number.
@@ -378,9 +385,9 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if a limit of size or duration divides the log into several files (parts).
+        """True if a limit of size or duration divides a log into several files.
 
-        Without a limit, a log has several parts only if an existing log was continued.
+        Without a limit, a log has several files only if an existing log was continued.
         """
         return self.split_bytes is not None or self.split_ns is not None
 
@@ -444,7 +451,10 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
-        """Opens the first file of the log, after a check that its name is free."""
+        """Creates the first of the files into which a long log is divided.
+
+        An error is raised before that if a file of the same name exists.
+        """
         self._open_file = opened or (
             lambda path: LogFile(path, force=storage.force, durable=storage.durable)
         )
@@ -492,7 +502,7 @@ class LogParts:
         self._previous = path.name
 
     def _begin_next_part(self) -> None:
-        """Finishes the current part, and begins the next one.
+        """Finishes the file that is being written, and begins the next file of the same log.
 
         Raises:
             LogRefused: The file cannot be created, or the disk refused the data.
@@ -509,7 +519,9 @@ class LogParts:
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
     def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
-        """Returns True if the next message would exceed a limit of the current part.
+        """Returns True if the next message would exceed a limit of the current file.
+
+        The limits are those of size and duration at which a log is divided into files.
 
         Args:
             payload_bytes: Size of the next message, in bytes.
@@ -535,7 +547,7 @@ class LogParts:
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes that were written to all files of the log so far."""
+        """Number of bytes that have been written to all files of a divided log so far."""
         return self._previous_bytes + self._writer.written_bytes
 
     def add(
@@ -583,7 +595,7 @@ class LogParts:
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last part, so that the log is finished and gets its final name.
+        """Completes the last file of the log, which then gets its final name.
 
         Args:
             accounts: Numbers of received and missing messages as a string, by topic, and other

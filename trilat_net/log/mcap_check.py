@@ -49,7 +49,7 @@ class FileCheck:
     def __init__(
         self, file: str, scanner: mcap_records.RecordScanner, findings: Findings
     ) -> None:
-        """Starts without any checked record."""
+        """Prepares the check of one MCAP file. No record has been checked yet."""
         self.counts = Counter(bytes=scanner.size)
         self._file = file
         self._scanner = scanner
@@ -99,7 +99,7 @@ class FileCheck:
         self._findings[check].add(self._file, offset, text)
 
     def _check_content(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks a record of the file with the method for records of its kind.
+        """Checks one record of the MCAP file with the method for records of its kind.
 
         Raises:
             UnreadableRecord: The record cannot be decoded, or its checksum differs.
@@ -296,10 +296,10 @@ class FileCheck:
             self._add("index", frame.offset, text)
 
     def finish(self) -> None:
-        """Reports the damaged parts, and compares the end of the file with the data.
+        """Reports the damaged parts of the file, and compares its end with the data.
 
-        The end is compared only if the file was finished and has no damaged part, because
-        everything would differ otherwise.
+        The end has an index and statistics. It is compared only if the file was finished and
+        has no damaged part, because everything would differ otherwise.
         """
         scanner = self._scanner
         if not scanner.begins:
@@ -343,7 +343,7 @@ class FileCheck:
                 self._add("checksums", offset, "the CRC of the index differs")
 
     def _compare_index(self) -> None:
-        """Compares the index with the records of the file.
+        """Compares the index at the end of the file with the records in the file.
 
         The index need not contain all kinds of records. But if it contains one record of a
         kind, it must contain all of them.
@@ -384,7 +384,7 @@ class FileCheck:
 
 
 def _sort_by_offset(entries: "bytes | array[int]") -> NDArray[np.uint64]:
-    """Returns the pairs (log time, offset) of a message index, sorted by offset.
+    """Returns the pairs (log time, offset) of an MCAP message index, sorted by offset.
 
     Args:
         entries: Log times and offsets, alternately.

@@ -133,7 +133,7 @@ class McapMessage(NamedTuple):
 
 
 class _MessageBlock(NamedTuple):
-    """The messages of one topic in a part of a chunk, still in their places in the chunk.
+    """Several messages of one topic, still in their places in a chunk of an MCAP file.
 
     A chunk is a block of messages of all topics, which is compressed as a whole. Messages are
     found and copied in blocks, because compiled code does this much faster than a loop over
@@ -155,12 +155,15 @@ class _MessageBlock(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """Number of messages in the block."""
+        """Number of messages in this block of consecutive messages of one topic."""
         return int(self.run.counts[self.slot])
 
     @property
     def most_bytes(self) -> int:
-        """Upper limit of the length of all payloads, in bytes."""
+        """Upper limit of the total length of the messages in this block, in bytes.
+
+        A reader reserves this much memory before it copies the messages.
+        """
         return int(self.run.lengths[self.slot])
 
     def copy_payloads(self, target: NDArray[np.uint8], offset: int) -> tuple[Ints, Ints]:
@@ -247,7 +250,7 @@ class McapReader:
         *,
         kept: bool = True,
     ) -> None:
-        """Prepares the reading. Only the beginning and the end of the file are read here."""
+        """Opens an MCAP file for reading. Only its beginning and its end are read here."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.channels: dict[str, ChannelInfo] = {}
@@ -287,7 +290,7 @@ class McapReader:
     def damaged(self) -> list[mcap_records.Damage]:
         """Parts of the file that could not be read, among the parts examined so far.
 
-        A channel is also listed if only some of its messages were read, which limits the
+        A channel of which only some messages were read is listed, too. This limit bounds the
         memory.
         """
         return self.scanner.damaged + self._more_damage
@@ -321,7 +324,9 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[_MessageBlock]:
-        """Yields the messages of some topics in blocks, as `messages` finds them.
+        """Yields the messages of some topics in blocks of many messages, which is faster.
+
+        `messages` finds the same messages one by one.
 
         Args:
             topic_is_kept: Function that decides whether the messages of a topic are yielded.
@@ -340,10 +345,10 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def _check_begin(self) -> None:
-        """Checks that the file begins with the mark of MCAP files.
+        """Checks that the file begins with the eight bytes with which every MCAP file begins.
 
         Raises:
-            LogError: The file does not begin with the mark.
+            LogError: The file begins with other bytes, so that it is no MCAP file.
         """
         if not self.scanner.begins:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
@@ -362,8 +367,8 @@ class McapReader:
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, and reports the progress.
 
-        The progress is reported after the caller has handled a record, which is when the
-        generator continues.
+        The progress is reported when the generator continues, that is, after the caller has
+        handled a record.
         """
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
@@ -398,7 +403,7 @@ class McapReader:
             self._note_damage(record.frame, error)
 
     def _note_damage(self, frame: mcap_records.RecordFrame, error: Exception) -> None:
-        """Adds a record that cannot be read to the damaged parts.
+        """Adds a record that cannot be decoded to the list of damaged parts of the file.
 
         Args:
             frame: Place of the record.
@@ -411,7 +416,7 @@ class McapReader:
 
     @property
     def _gave_up(self) -> bool:
-        """True if the file has so many damaged parts that the reader has stopped.
+        """True if the reader has stopped because the file has too many damaged parts.
 
         The limit bounds the time and the memory that a file of random bytes can cost.
         """
@@ -468,7 +473,9 @@ class McapReader:
         return b""
 
     def _read_messages(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
-        """Yields the messages of a record, and stores its schemas and channels.
+        """Yields the messages in a record of the file, and stores definitions in it.
+
+        The definitions are schemas (formats of messages) and channels (topics).
 
         Args:
             record: The record, of a kind in `_READ`.
@@ -633,8 +640,8 @@ class McapReader:
     def _clear_run(self) -> chunk_walk.MessageRun:
         """Returns the arrays that receive the next messages of a chunk, with counts of zero.
 
-        The large arrays are used again and again. There is a count for each slot, a small
-        number that stands for a channel.
+        A chunk is a compressed block of messages. The large arrays are used again and again.
+        There is a count for each slot, a small number that stands for a channel.
         """
         sums = np.zeros((4, len(self._slots)), np.int64)
         self._run = self._run._replace(
@@ -702,7 +709,7 @@ class McapReader:
                 yield _MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
-        """Compares the file with its digests, to find out whether it was changed.
+        """Finds out by digests in the file whether the file was changed after it was written.
 
         The file must have been read to its end.
 
@@ -768,8 +775,8 @@ class McapReader:
     def _drop_slot(self, topic: str) -> None:
         """Makes `blocks` read the messages of a topic one by one instead of in blocks.
 
-        This keeps their order if the topic has several channels. A channel without a slot is
-        unknown to the compiled code, which then stops at its messages.
+        This keeps their order if the topic has several channels. The compiled code then has no
+        number (slot) for the channel, and stops at its messages.
 
         Args:
             topic: The topic.
@@ -825,7 +832,7 @@ class McapReader:
 
 @dataclass
 class _PartlyReadRecord:
-    """A record with messages and definitions, and how far it has been read.
+    """A record of an MCAP file that contains messages, and how far it has been read.
 
     Attributes:
         frame: Kind and place of the record in the file.
@@ -853,7 +860,7 @@ _FIRST_BYTES = 1 << 12
 
 
 class ChannelMessages:
-    """The messages of one topic in a log, still encoded, in the order of the file.
+    """All messages of one topic in a log, still encoded, in the order of the file.
 
     Attributes:
         log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
@@ -872,14 +879,17 @@ class ChannelMessages:
 
     @property
     def payloads(self) -> PackedMessages:
-        """The K messages, as published. Messages that are added later are not included."""
+        """The contents of all K messages of the topic, as they were published.
+
+        Messages that are added to the topic later are not included.
+        """
         data = self._reserve(PADDING)
         ends = np.array(self._ends, np.int64)
         starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(ends)]
         return PackedMessages(data[: self._size + PADDING], starts, ends)
 
     def payload(self, number: int) -> bytes:
-        """Returns one message.
+        """Returns the content of one message of the topic, as it was published.
 
         Args:
             number: Number of the message, from 0.
@@ -888,7 +898,7 @@ class ChannelMessages:
         return self._data[start : self._ends[number]].tobytes()
 
     def _reserve(self, size: int) -> NDArray[np.uint8]:
-        """Returns the array of all payloads, with space for further bytes at its end.
+        """Returns the array with the contents of all messages, with room for more at its end.
 
         The array grows at least twofold, so that many small additions stay cheap.
 
@@ -903,7 +913,7 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Adds the next message of the topic, in the order of the file.
+        """Appends a message to those of the topic, in the order of the file.
 
         Args:
             payload: The message, encoded as published.
@@ -919,7 +929,7 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def add_block(self, block: _MessageBlock) -> None:
-        """Adds the next messages of the topic, in the order of the file."""
+        """Appends a block of messages to those of the topic, in the order of the file."""
         data = self._reserve(block.most_bytes)
         ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
         self._size = int(ends[-1])
@@ -929,7 +939,7 @@ class ChannelMessages:
         self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the times of all K messages as arrays.
+        """Returns when each of the topic's K messages was sent and recorded, as arrays.
 
         Returns:
             The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of
@@ -946,7 +956,7 @@ def _clip_times(times: "array[int]") -> NDArray[np.int64]:
 
 @dataclass
 class LogContents:
-    """Everything in a log, from one file or several parts, before its messages are decoded.
+    """Everything in a log, from one file or several, before its messages are decoded.
 
     Attributes:
         sources: Names of the files.
@@ -973,7 +983,7 @@ class LogContents:
 
     @property
     def source(self) -> str:
-        """Name of the log for error messages."""
+        """Name of the log for error messages, so that users know which file is meant."""
         more = len(self.sources) - 1
         if not more:
             return self.sources[0]
@@ -983,7 +993,7 @@ class LogContents:
 def read_contents(
     stream: BinaryIO, name: str, progress: Progress | None = None, *, trusted: bool = False
 ) -> LogContents:
-    """Reads the contents of a log from one file.
+    """Reads everything in one file of a log into memory, without decoding the messages.
 
     Args:
         stream: The file, opened for reading.

@@ -74,7 +74,7 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """Error that a part of a file makes no sense. Its text states the reason.
+    """Error: a part of an MCAP file makes no sense. The text of the error states the reason.
 
     It is used only within the package `log`: a scan catches it and continues at the next
     readable part, and a check reports it.
@@ -102,7 +102,7 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Decodes the head of a chunk, and checks that it agrees with the length of the chunk.
+    """Decodes the head of a chunk (compressed block of messages), and checks its lengths.
 
     Args:
         content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
@@ -172,10 +172,10 @@ def unpack_chunk(content: bytes) -> bytes:
 
 
 def _unpack(head: ChunkHead, data: memoryview) -> bytes:
-    """Unpacks the compressed records of a chunk.
+    """Decompresses the records of a chunk, a compressed block of messages.
 
-    The memory is bounded by the size that the head states, even if the data would unpack to
-    more.
+    The memory is bounded by the size that the head of the chunk states, even if damaged data
+    would decompress to more.
 
     Raises:
         UnreadableRecord: The data are damaged, or the compression is not supported.
@@ -250,12 +250,12 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of the whole record in the file, in bytes: its kind, length and content."""
+        """Size of a whole MCAP record in bytes: opcode, length field and content."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
     def end(self) -> int:
-        """Offset of the first byte after the record, at which the next record begins."""
+        """Offset in the file of the first byte after this record, where the next one begins."""
         return self.offset + self.size
 
 
@@ -279,7 +279,7 @@ class Damage(NamedTuple):
 
 
 class ScannedRecord:
-    """A record that was found in a file, whose content is read only when it is needed.
+    """A record that was found in an MCAP file, whose content is read only when needed.
 
     Args:
         scanner: Scanner that has found the record.
@@ -300,7 +300,7 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record, without the fields for its kind and its length.
+        """Content of the record as bytes, without the fields for its kind and its length.
 
         It is read from the file at first use, so that a scan of a large file is fast.
         """
@@ -319,7 +319,9 @@ class ScannedRecord:
         return self._scanner.head(self.frame)
 
     def unpack(self) -> bytes:
-        """Returns the records in a chunk. It is unpacked once, however often this is called.
+        """Returns the decompressed records of a chunk, a compressed block of messages.
+
+        It is decompressed once, however often this is called.
 
         Raises:
             UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
@@ -336,7 +338,7 @@ class ScannedRecord:
 
 
 class RecordScanner:
-    """Finds the records of a file one after another, and skips damaged parts.
+    """Finds the records of an MCAP file one after another, and skips damaged parts.
 
     Every program that reads a file, whether it checks, recovers or verifies it, reads the
     records that this scanner yields.
@@ -368,7 +370,7 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads bytes of the file, but never beyond its end.
+        """Reads some bytes of the file; fewer are returned at the end of the file.
 
         Args:
             offset: Offset of the first byte in the file.
@@ -381,9 +383,9 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every record that `scan` finds.
+        """Yields the kind and the position of every readable record of an MCAP file.
 
-        Unreadable parts of the file are left out.
+        Parts of the file that cannot be read are left out.
         """
         for item in self.scan():
             if isinstance(item, ScannedRecord):
@@ -438,7 +440,9 @@ class RecordScanner:
         )
 
     def _end_at(self, footer_end: int) -> None:
-        """Checks that the end mark follows the footer, and sets the attributes about the end.
+        """Checks that an MCAP file has its end mark after the footer, its last record.
+
+        The attributes about the end of the file are set.
 
         Args:
             footer_end: Offset of the first byte after the footer.
@@ -477,7 +481,7 @@ class RecordScanner:
         return chunk_offset
 
     def _frame_at(self, offset: int) -> RecordFrame:
-        """Returns the place of the record that begins at an offset.
+        """Returns kind, position and length of the MCAP record that begins at an offset.
 
         Raises:
             UnreadableRecord: There is no record, or it reaches beyond the end of the file.
@@ -551,7 +555,7 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 checksum of a part of the file, to compare it with a stored one.
+        """Computes the CRC-32 checksum of a part of the file, to detect changed bytes.
 
         Args:
             begin: Offset of the first byte of the part.
@@ -563,7 +567,7 @@ class RecordScanner:
         return crc
 
     def footer(self) -> records.Footer | None:
-        """Reads the footer of the file, which states where the index is.
+        """Reads the footer of the file, its last record, which states where the index is.
 
         Returns:
             The footer. None if the file is not finished and therefore has no footer.
@@ -572,7 +576,7 @@ class RecordScanner:
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
-        """Checks the summary at the end of the file, which contains its index, by its checksum.
+        """Checks the summary at the end of an MCAP file, which has its index, by its checksum.
 
         Args:
             footer: Footer of the file, which states the checksum.
@@ -594,7 +598,7 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Checks an attachment, such as the scenario of a log, by the checksum at its end.
+    """Returns True if an attachment of a log, such as its scenario, has its stored checksum.
 
     Args:
         attachment: Content of the attachment's record.

@@ -59,7 +59,7 @@ class Sink(Protocol):
     """
 
     def write(self, data: bytes, /) -> int:
-        """Accepts bytes. A file writes them at once, and a buffer stores them until `flush`.
+        """Accepts bytes for the file. Some implementations store them until `flush`.
 
         Args:
             data: The bytes.
@@ -69,7 +69,7 @@ class Sink(Protocol):
         """
 
     def flush(self) -> None:
-        """Passes all bytes that are stored in the buffer on to the file."""
+        """Passes buffered bytes on to the file, so that other programs can read them."""
 
 
 def _pack_text(text: str) -> bytes:
@@ -80,7 +80,7 @@ def _pack_text(text: str) -> bytes:
 
 
 def _pack_text_map(texts: Mapping[str, str]) -> bytes:
-    """Encodes a map of texts as MCAP files require.
+    """Encodes a dictionary of strings as MCAP files require.
 
     The length of the encoded map in bytes comes first, then each key and each value.
 
@@ -132,7 +132,7 @@ class McapWriter:
     def __init__(
         self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = _CHUNK_BYTES
     ) -> None:
-        """Begins the file: writes the mark of MCAP files and the header."""
+        """Begins an MCAP file with the eight bytes that identify the format, and a header."""
         self.position = 0
         self.messages = 0
         self._stream = stream
@@ -171,7 +171,7 @@ class McapWriter:
 
     @property
     def end_bytes(self) -> int:
-        """Largest number of bytes that the end of the file (summary and end mark) may need.
+        """Upper limit of the bytes that the end of the file (index and end mark) may need.
 
         This much disk space must be reserved so that the file can be finished. The messages of
         the chunk that is still open are not included, see `open_chunk_bytes`.
@@ -183,8 +183,8 @@ class McapWriter:
     def open_chunk_bytes(self) -> int:
         """Largest size of the messages that were added but not written yet, in bytes.
 
-        These messages form the open chunk. The size includes the index of the messages. It is 0
-        if there are no such messages.
+        These messages form a block that is written at once (the open chunk). The size includes
+        the index of the messages. It is 0 if there are no such messages.
         """
         if not self._open_chunk:
             return 0
@@ -281,9 +281,9 @@ class McapWriter:
             self.flush()
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Writes a metadata record, a named map of texts, such as the facts about a session.
+        """Writes a named dictionary of strings into the file, such as facts about a session.
 
-        It precedes the messages of the open chunk in the file.
+        It precedes the messages of the open chunk (block that is not written yet) in the file.
 
         Args:
             name: Name of the metadata.
@@ -432,7 +432,7 @@ class McapWriter:
         self._stream.flush()
 
     def _pack_statistics(self) -> bytes:
-        """Encodes the statistics record, from which readers learn the size of the log.
+        """Encodes the MCAP record from which readers learn the size of the log.
 
         It contains the numbers of all kinds of records, and the first and last arrival time.
         """

@@ -27,10 +27,10 @@ from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
 
 
 def merge_parts(parts: Sequence[LogContents]) -> LogContents:
-    """Merges the contents of the parts of a session.
+    """Joins the contents of several files into which the log of a session was divided.
 
-    The recorder states at the end of each part how many messages it received. The counts of a
-    channel do not apply to the merged log and are left out. The other counts, such as dropped
+    The recorder states at the end of each file how many messages it received. The counts of a
+    channel do not apply to the joined log and are left out. The other counts, such as dropped
     messages, are added.
 
     Args:
@@ -74,7 +74,7 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
 
 
 def _check_same_session(first: LogContents, other: LogContents) -> None:
-    """Checks that two files are parts of the log of the same session.
+    """Checks that two files belong to the log of the same session, before they are joined.
 
     Raises:
         LogError: The files belong to different sessions. The text lists the differences.
@@ -149,9 +149,9 @@ def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
 
 
 def _recorder_boot(part: LogContents) -> int:
-    """Returns the number that identifies the start of the recorder that wrote a part.
+    """Returns the random number that identifies the process that recorded a file.
 
-    The number is 0 if the part has no readable message of the recorder.
+    The number is 0 if the file has no readable message of the recorder.
     """
     kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
     for channel, kind in kinds.items():
@@ -186,10 +186,10 @@ def identify_session(part: LogContents) -> dict[str, str]:
 
 
 def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
-    """Merges the messages of a topic, in the order of the parts.
+    """Joins the messages of a topic from several files of the same log, in file order.
 
     Messages are recognised by a key, such as the tick of a record. A message that an earlier
-    part contains already is left out.
+    file contains already is left out.
 
     Args:
         topic: The topic. At least one part contains it.
@@ -265,10 +265,10 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
 
 
 def _describe_message(topic: str, key: Hashable) -> str:
-    """Returns a noun phrase for the message with a key, see `_list_keys`.
+    """Returns a noun phrase for a message, for a sentence about differing files.
 
     For example, the key 12 on the topic of the records (results of control periods) of "m1" is
-    "the record of tick 12 of m1".
+    "the record of tick 12 of m1". For the keys see `_list_keys`.
     """
     member, kind = topic.split("/")[-2:]
     match key:

@@ -27,7 +27,9 @@ AnyMessage = State | LinkStats | Event | RecorderStats
 
 
 class MessageIdentity(NamedTuple):
-    """States who sent a message, in which channel, with which number, and when.
+    """Who sent a network message, in which channel, with which number, and when.
+
+    Lost and repeated messages are recognised by this.
 
     Attributes:
         sender: Name of the member of the session, a site (arm controller) or the recorder, that

@@ -21,7 +21,7 @@ _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
 
 
 def _run_git(*arguments: str) -> str | None:
-    """Runs git in the source tree of this program.
+    """Runs git in the source tree of this program, to find out which version it is.
 
     Args:
         *arguments: Arguments of git, such as "rev-parse", "HEAD".

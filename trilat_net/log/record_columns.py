@@ -40,7 +40,7 @@ _DEFAULTS = {"sent_ns": 0}
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Decodes the tick of every record, the number of its period of the control loop.
+    """Decodes from every record the number of its control period (tick).
 
     Records of every version of the format that can be read are accepted.
 
@@ -60,7 +60,7 @@ def decode_ticks(payloads: Sequence[bytes]) -> Ints:
 
 
 def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Decodes some integer fields of every record, without decoding the rest of the records.
+    """Decodes some integer fields of every record, and skips all other fields.
 
     Args:
         payloads: K encoded records (results of control periods).
@@ -79,7 +79,7 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Decodes some vector fields of every record, without decoding the rest of the records.
+    """Decodes some vectors, such as joint angles, of every record, and skips other fields.
 
     Args:
         payloads: K encoded records.
@@ -179,7 +179,7 @@ def decode_per_peer(
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Decodes which samples of the peers arrived at the site (arm controller) in each tick.
+    """Decodes from records which states of other arms arrived in each control period.
 
     Args:
         payloads: K encoded records of the site.
@@ -222,7 +222,9 @@ def _decode_fields(
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder that decodes only some fields of a record, and skips the others.
+    """Returns a decoder for some fields of an encoded record, which skips all other fields.
+
+    This is faster than decoding the whole record.
 
     Args:
         fields: Names of the fields.
@@ -238,7 +240,7 @@ def _find_decoder(
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder of structs with some fields. Other fields of a payload are skipped.
+    """Creates a decoder for some fields of encoded records. Other fields are skipped.
 
     Args:
         types: Types of the fields, by name.

@@ -75,7 +75,7 @@ _REGENERATED = frozenset(
 
 @dataclass(repr=False)
 class Recovery(Result):
-    """Result of a recovery: what was copied to the new file, and what was lost.
+    """Result of the recovery of a damaged log: what was copied and what was lost.
 
     Attributes:
         path: The source file.
@@ -109,17 +109,17 @@ class Recovery(Result):
 
     @property
     def lossless(self) -> bool:
-        """True if the new file contains everything that the source file contains.
+        """True if the recovered file contains everything that the damaged file contains.
 
         False if some bytes could not be read or assigned. `lost` then describes them.
         """
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of the recovery, with the keys of `trilat log recover --json`.
+        """Returns the result of the recovery of a damaged log as plain values, for JSON.
 
-        The entries say what was saved ("messages", "coverage"), and what was lost
-        ("lost_bytes", "missing").
+        `trilat log recover --json` prints them. The entries say what was saved ("messages",
+        "coverage"), and what was lost ("lost_bytes", "missing").
         """
         return {
             "file": self.path.as_posix(),
@@ -141,7 +141,7 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Adds a part of the source file that was lost to the result.
+        """Notes that a part of the damaged file was lost, for the report to the user.
 
         Args:
             text: Sentence that describes the loss to the user.
@@ -151,10 +151,10 @@ class Recovery(Result):
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Converts the result to texts by name, which the metadata of the new file contain.
+        """Returns what was recovered and lost as strings by name, for the recovered file.
 
-        The texts state the source file, the losses and the missing records. A reader of the new
-        file can thus recognise it as a recovered log.
+        They are stored as metadata of this file: the source file, the losses and the missing
+        records. A reader can thus recognise it as a recovered log.
         """
         losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
@@ -279,7 +279,7 @@ def _recover(
 
 
 def _check_output(working: Path, result: Recovery) -> None:
-    """Opens the new file as a test, and adds a loss to the result if this fails.
+    """Opens the recovered file as a test, and adds a loss to the result if this fails.
 
     Args:
         working: The new file, under its temporary name.
@@ -387,7 +387,7 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies everything that can be read from the damaged file, and finishes the new file.
+        """Copies everything that can be read from a damaged log into a new file.
 
         Args:
             restored: Text of the scenario (the description of the experiment), from a file
@@ -441,15 +441,16 @@ class _FileCopy:
             )
 
     def _report_damage(self, damage: Damage) -> None:
-        """Adds a damaged part to the losses.
+        """Adds a damaged part of the file to the losses that the report on the recovery states.
 
-        Parts after the end of the data contain only the index, and are no loss.
+        A part after the end of the data contains only the index, which is rebuilt, and is no
+        loss.
         """
         if damage.offset <= self._data_end:
             self._result.add_loss(str(damage), damage.length)
 
     def _copy_record(self, record: ScannedRecord) -> None:
-        """Copies one record of the damaged file, with the method for records of its kind.
+        """Copies one record of the damaged file into the new one, by a method for its kind.
 
         A record is the unit of which an MCAP file consists: a chunk of messages, metadata, an
         attachment, or a part of an index.
@@ -476,7 +477,7 @@ class _FileCopy:
             raise UnreadableRecord(f"this record has the unknown kind {opcode}")
 
     def _copy_metadata(self, content: bytes) -> None:
-        """Copies a metadata record, unless the recovery writes this record itself.
+        """Copies a named dictionary from the damaged file, unless it is written anew anyway.
 
         Raises:
             UnreadableRecord: The metadata are those of another session.
@@ -516,7 +517,7 @@ class _FileCopy:
         self._is_empty = False
 
     def _check_regenerated(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        """Checks that a record that is not copied is really part of an index.
+        """Checks that a record that is not copied really belongs to an index of the file.
 
         The index of the new file is computed again. If the opcode (the number of the kind) of a
         record with data is damaged, the record may look like a part of an index, and its loss
@@ -743,7 +744,7 @@ class _FileCopy:
         self._define(opcode, content)
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Stores the definition of a schema or channel for the messages that need it.
+        """Stores a definition of a message format (schema) or topic (channel) until needed.
 
         If the file defines the same number twice, the first definition counts.
 
@@ -756,9 +757,10 @@ class _FileCopy:
             self._contradicted.add(entry.id)
 
     def _is_plausible(self, topic: str) -> bool:
-        """Returns True if a topic can occur in the source.
+        """Returns True if a topic can occur in the log that is recovered.
 
-        The log of a session contains no topics of members of other sessions.
+        Damaged bytes can look like a valid topic. The log of a session, for example, contains
+        no topics of other sessions.
         """
         if self._content is None or not topic.startswith(f"/{topics.ROOT}/"):
             return True
@@ -839,7 +841,7 @@ class _FileCopy:
         return self._register_copy(number, new_number, definition.topic)
 
     def _open_session_channel(self, topic: str) -> tuple[int, str]:
-        """Registers a channel of the session in the new file, as `LogWriter` would define it.
+        """Defines a channel of the session in the recovered file, as `LogWriter` would do it.
 
         Args:
             topic: Topic of the channel.
@@ -947,7 +949,7 @@ class _FileCopy:
         return ""
 
     def _report_final_losses(self) -> None:
-        """Adds the losses that are known only after all records were read.
+        """Adds the losses that are known only after the whole damaged file was read.
 
         For example, messages of a channel that no record defines, because a definition may
         follow its messages.
@@ -1095,7 +1097,9 @@ _LAST_NS = (1 << 64) - 1
 
 
 def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
-    """Returns the channel number, sequence number, arrival time and sending time of a message.
+    """Decodes the first fields of an MCAP message: its channel, its number and both times.
+
+    The result has the channel number, sequence number, arrival time and sending time.
 
     Raises:
         UnreadableRecord: The message is too short.
@@ -1109,7 +1113,9 @@ def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
 def _create_content_check(
     survey: RecoverySurvey, accounts: SessionAccounts | None
 ) -> ContentCheck | None:
-    """Creates the check that recognises intact messages by their content, without a checksum.
+    """Creates a check that recognises intact messages by their content.
+
+    It is used where a damaged file has no checksum.
 
     Args:
         survey: Survey of the source file.

@@ -71,7 +71,7 @@ class RecoverySurvey:
     """
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
-        """Reads the whole file once, and selects the parts that belong together."""
+        """Reads a damaged file once, and selects those parts of it that belong to one log."""
         self.profile = ""
         self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -109,7 +109,7 @@ class RecoverySurvey:
             self.why_empty = self._explain_empty()
 
     def _read_records(self) -> bool:
-        """Reads all records of the file except the messages.
+        """Reads all records of the damaged file except messages, such as schemas and channels.
 
         Returns:
             True if the file contains messages or chunks.
@@ -310,7 +310,7 @@ class RecoverySurvey:
         self.definitions = list(filter(is_genuine, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
-        """Finds the chunks that are not in their original places.
+        """Finds chunks (blocks of messages) of a damaged file that are at a wrong position.
 
         Returns:
             A description of the problem for each of these chunks, by the offset of the chunk.
@@ -362,7 +362,7 @@ class RecoverySurvey:
 
 
 def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
-    """Returns the offset of the summary at the end of a file, if its checksum is valid.
+    """Returns the offset of the summary at the end of an MCAP file, if its checksum is valid.
 
     If the summary is missing or damaged, the size of the file is returned.
     """

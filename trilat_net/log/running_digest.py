@@ -90,7 +90,7 @@ class RunningDigest:
         self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Adds messages to the digest of the messages, in the order of the file.
+        """Updates the hash of all messages of a file by further ones, in the order of the file.
 
         Args:
             data: The messages with their headers, as in an unpacked chunk of the MCAP file.
@@ -100,7 +100,7 @@ class RunningDigest:
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Adds a record that describes the messages, such as a schema, to the second checksum.
+        """Updates the hash of everything that describes the messages, such as schemas.
 
         The order of these records does not matter, and repeated records count once.
 
@@ -112,7 +112,9 @@ class RunningDigest:
         self._descriptions.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
     def facts(self) -> dict[str, str]:
-        """Computes the checksums of everything added so far, as metadata for the file.
+        """Returns the hashes of everything in the file so far, as metadata for the file.
+
+        A reader computes them again, to find out whether the file was changed.
 
         Returns:
             Texts by name. "algorithm" is the method, "messages" the number of messages,
@@ -126,7 +128,7 @@ class RunningDigest:
     def judge(
         self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
     ) -> Integrity:
-        """Compares the digests of a file that was read with those that the file contains.
+        """Decides whether a file was changed, by the hashes that the file itself contains.
 
         Args:
             metadata: All metadata of the file, by name. They contain its digests.
@@ -171,7 +173,7 @@ class RunningDigest:
 
 
 def _judge_without_chain(*, is_announced: bool, finished: bool) -> Integrity:
-    """Judges a file that contains no digests.
+    """Returns the result of checking a file that contains no hashes.
 
     Args:
         is_announced: True if the beginning of the file announces digests.

@@ -58,7 +58,7 @@ class SessionAccounts:
         continued: bool = False,
         events: bool = True,
     ) -> None:
-        """Starts with no counted message and no opened channel."""
+        """Starts the accounts of a session's messages. No message has been counted yet."""
         self._session = session
         self._continued = continued
         self._rates_hz: dict[str, int] = {}
@@ -217,7 +217,9 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Counts the ticks that a site skipped as unpublished, as its event lists them.
+        """Notes that a site skipped ticks (control periods), so that no record is missing.
+
+        The site reports this in an event, because its computer was too slow.
 
         Args:
             event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks
@@ -419,7 +421,7 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Describes the missing records for the user, one line for each site that lacks some.
+        """Tells the user how many records are missing, one line for each site that lacks some.
 
         Yields:
             A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks
@@ -469,7 +471,7 @@ class SessionAccounts:
 def open_session_accounts(
     metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
 ) -> SessionAccounts | None:
-    """Creates the counters of a session's messages, before the messages of a file are read.
+    """Prepares the counting of a session's messages, before a file of it is read.
 
     Args:
         metadata: Metadata of the file, by name. They state the session.

@@ -66,7 +66,9 @@ _ACCOUNTS_SINCE = 3
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """Result of checking the files of one log, as `trilat log check` prints it.
+    """Result of checking the files of one log for damage and missing messages.
+
+    `trilat log check` prints it.
 
     Attributes:
         files: Names of the files.
@@ -178,7 +180,7 @@ class _ChannelCheck:
         findings: Findings,
         accounts: SessionAccounts,
     ) -> None:
-        """Starts without any checked message."""
+        """Prepares the check of one channel of a log. No message has been checked yet."""
         self.member = key.member
         self.kind = key.channel
         self._topic = "/" + topics.key(key.session, key.member, key.channel)
@@ -206,7 +208,10 @@ class _ChannelCheck:
 
     @property
     def name(self) -> str:
-        """Short name of the channel for texts, such as "m1/state": the member and the kind."""
+        """Short name of the channel for texts, such as "m1/state".
+
+        It consists of the publishing member ("m1") and the kind of message ("state").
+        """
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
@@ -379,7 +384,7 @@ class _ChannelCheck:
 
 
 def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMessage]:
-    """Yields the messages of a file. Each record is checked before its messages are yielded.
+    """Yields the messages of a file, after a check of the record that contains them.
 
     Args:
         reader: Reader of the file.
@@ -409,7 +414,7 @@ class _SessionCheck:
     """
 
     def __init__(self) -> None:
-        """Starts without any checked file."""
+        """Prepares the check of all files of a session. No file has been checked yet."""
         self.ours = False
         self.channels: dict[str, _ChannelCheck] = {}
         self._findings = Findings()
@@ -456,7 +461,7 @@ class _SessionCheck:
         self._counts += structure.counts
 
     def _read_messages(self, file: str, reader: McapReader, structure: FileCheck) -> None:
-        """Checks the records and the messages of a file, and compares it with its digests.
+        """Checks all messages of a file, and compares them with the hashes in the file.
 
         Args:
             file: Name of the file.
@@ -741,10 +746,10 @@ class _SessionCheck:
 
     @property
     def _needs_end_events(self) -> bool:
-        """True if the files must contain the event "end" of every site (arm controller).
+        """True if the checked files must contain the last event of every arm controller (site).
 
-        A site publishes this event at its end. It may be missing if only one of several parts
-        of a log is checked, or if the recorder was told not to record events.
+        A site publishes the event "end" at its end. It may be missing if only one of several
+        parts of a log is checked, or if the recorder was told not to record events.
         """
         session = self._about["session"]
         channel_filter = parse_filter_facts(self._about)

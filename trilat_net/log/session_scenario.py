@@ -17,11 +17,14 @@ class _SiteRate(Protocol):
 
     @property
     def rate_hz(self) -> int:
-        """Rate of the site's control loop, in Hz, which relates ticks to times."""
+        """Rate of the control loop of a site (arm controller), in Hz.
+
+        It relates numbers of control periods to times: period 500 at 1000 Hz is at 0.5 s.
+        """
 
 
 class SessionScenario(Protocol):
-    """The facts about a scenario from which the messages of its session follow.
+    """Interface: the settings of a session on which the messages in its log depend.
 
     `scenario.Scenario` has these attributes. The recorder depends only on this protocol, so
     that it need not import the program that reads scenarios.
@@ -29,31 +32,37 @@ class SessionScenario(Protocol):
 
     @property
     def name(self) -> str:
-        """Name of the scenario."""
+        """Name of the scenario (the settings that define a run), such as "paper"."""
 
     @property
     def seed(self) -> int:
-        """Seed of the scenario's random numbers."""
+        """Seed of the random numbers of a run. The same seed gives the same network delays."""
 
     @property
     def duration_s(self) -> float:
-        """Duration of the run, in s."""
+        """Planned duration of the run, in s. It ends earlier if an arm leaves its limits."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file."""
+        """Names of the sites (arm controllers), in the order of the scenario file.
+
+        Example: ("m1", "m2", "s"), two masters and a slave.
+        """
 
     @property
     def sites(self) -> Mapping[str, _SiteRate]:
-        """The sites by name."""
+        """The sites (arm controllers) by name, each with the rate of its control loop."""
 
     @property
     def text(self) -> str:
-        """The scenario as a TOML text in its canonical form, which the log contains."""
+        """The scenario as TOML in canonical form, in which equal settings give equal text.
+
+        A log contains this text, so that the run can be repeated from the log.
+        """
 
     @property
     def sha256(self) -> str:
-        """SHA-256 hash of `text`."""
+        """SHA-256 hash of `text`, with which processes check that they have equal scenarios."""
 
     @property
     def sites_may_return(self) -> bool:
@@ -63,7 +72,9 @@ class SessionScenario(Protocol):
         """
 
     def ticks(self, site: str) -> int:
-        """Returns how many ticks a site executes in the whole run, from duration and tick rate.
+        """Returns how many control periods (ticks) a site executes in the whole run.
+
+        It is the duration times the rate of the control loop.
 
         Args:
             site: Name of the site.
@@ -71,6 +82,8 @@ class SessionScenario(Protocol):
 
     def layout(self, site: str) -> Layout:
         """Returns the lengths of the vectors in a site's records, such as its number of joints.
+
+        A reader of the log needs them to decode the records.
 
         Args:
             site: Name of the site.

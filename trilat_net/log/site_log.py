@@ -151,7 +151,7 @@ class LazyRecords(Sequence[State]):
     def __init__(
         self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
     ) -> None:
-        """Prepares the cache of decoded blocks. No record is decoded yet."""
+        """Stores encoded records, which are decoded in blocks when they are accessed."""
         block_size = _HEAVY_BLOCK if heavy else BLOCK_RECORDS
         block_count = _HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // block_size
         self._payloads = payloads
@@ -159,7 +159,7 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=block_count)
         def get_block(number: int) -> list[State]:
-            """Returns a block of consecutive records, decoded unless it is in memory.
+            """Returns a block of consecutive records. It is decoded if it is not in memory.
 
             Args:
                 number: Number of the block, counted from 0.
@@ -370,7 +370,7 @@ class SiteLog:
         channel: LawChannel = LawChannel(),  # noqa: B008
         axes: tuple[float, ...] = (),
     ) -> None:
-        """Finds the tick of each record, and sorts the records by tick."""
+        """Finds the control period (tick) of each encoded record, and sorts the records."""
         self.channel = channel
         self.name = name
         self.peers = peers
@@ -419,7 +419,7 @@ class SiteLog:
         return str(find_hook("render a site's records as HTML")(self))
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
-        """Decodes columns of all records, and makes the arrays read-only.
+        """Decodes some quantities of all records into arrays that cannot be changed.
 
         Args:
             decode_column: Function that decodes the payloads.
@@ -451,9 +451,10 @@ class SiteLog:
             ) from None
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vector fields of all records together, before they are accessed.
+        """Decodes several fields of all records together, before they are accessed.
 
-        This is three times as fast as to decode them one by one.
+        The fields are vectors such as joint angles. This is three times as fast as to decode
+        them one by one.
 
         Args:
             fields: Names of the vectors, such as "q" and "tau".
@@ -507,7 +508,7 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record, without decoding the others, which is fast for a long log.
+        """Decodes a single record of an arm without all others, which is fast for a long log.
 
         Args:
             n: Index of the record in the order of ticks. -1 is the last record.
@@ -543,9 +544,10 @@ class SiteLog:
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """The records by tick, to compare two logs whose records may have gaps.
+        """All records by the number of their control period (tick).
 
-        If several records have the same tick, the last one counts.
+        Two logs are compared this way, because either may lack records. If several records have
+        the same tick, the last one counts.
         """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
@@ -553,7 +555,10 @@ class SiteLog:
 
     @property
     def last_tick(self) -> int:
-        """Tick of the last record, counted from the start of the run. -1 without records."""
+        """Number of the control period (tick) of the last record; -1 if there are no records.
+
+        Ticks are counted from 0 at the start of the run.
+        """
         return int(self.tick[-1]) if len(self) else -1
 
     @property
@@ -752,11 +757,11 @@ class SiteLog:
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Number of the tick of each peer whose sample the control law used, in each record.
+        """Which received state of each peer the control law used, in each of the K records.
 
-        A peer is another site, and a sample is the state that it sends in each tick (period of
-        its control loop). The key is the name of the peer. The value has the shape (K,), where
-        K is the number of records of this site. It is -1 before the first sample of the peer.
+        A peer is another site (arm controller), and a sample is the state that it sends in each
+        tick (period of its control loop). The key is the name of the peer. The value has the
+        shape (K,), with the number of the tick, or -1 before the first sample of the peer.
         """
         if self.indexed is not None:
             ticks = self.indexed.used
@@ -765,11 +770,11 @@ class SiteLog:
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Samples of the peers that arrived at the site.
+        """Messages from other arms that had arrived at this one, with their delays.
 
-        The first array contains the number of arrivals in each record, shape (K,). The second
-        array contains all arrivals in order, shape (N, 3), with the columns of `rx`: index of
-        the peer, tick of the sample, and delay in us.
+        The first array contains the number of messages (samples) in each record, shape (K,).
+        The second array contains all arrivals in order, shape (N, 3), with the columns of `rx`:
+        index of the peer, tick of the sample, and delay in us.
         """
         if self.indexed is not None:
             return freeze(self.indexed.arrivals)
@@ -789,7 +794,7 @@ class SiteLog:
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
-        """Lists the changes of parameters that the site applied during the run.
+        """Lists the changes of settings that the arm controller (site) applied during the run.
 
         Returns:
             For each tick with changes, the changes as JSON texts in the order of application.

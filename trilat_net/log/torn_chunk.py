@@ -178,7 +178,7 @@ def _find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
 
 
 def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
-    """Returns the complete records at the beginning of unpacked bytes, and their total size.
+    """Splits decompressed bytes into the complete records at their beginning.
 
     Args:
         data: The unpacked bytes. They begin with a record.
@@ -201,7 +201,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Splits bytes at the boundaries of the pages of their file.
+    """Splits bytes where the pages of their file begin, as disks lose whole pages at once.
 
     Args:
         packed: The bytes.

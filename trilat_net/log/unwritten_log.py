@@ -28,7 +28,9 @@ _NAME = "run"
 
 
 class _UnwrittenSiteLog(SiteLog):
-    """Records of one site as arrays, with one row per tick.
+    """Results of one arm in a simulation without a log file, with one row per tick.
+
+    A tick is a control period. The class has the arrays of `SiteLog`.
 
     Args:
         scenario: Scenario of the run.
@@ -58,7 +60,7 @@ class _UnwrittenSiteLog(SiteLog):
 
     @property
     def diverged_s(self) -> float | None:
-        """None, because every tick of the scenario was executed."""
+        """None, because no arm left its limits: every planned control period was executed."""
         return None
 
     def _read_from(self, *_: Any) -> Any:

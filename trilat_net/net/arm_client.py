@@ -98,7 +98,7 @@ class SiteSender:
         channel: str,
         boot: int,
     ) -> None:
-        """Opens the channel to the site. No message is sent yet."""
+        """Opens a channel for messages to a site (arm controller). No message is sent yet."""
         self.boot = boot
         self.number = -1
         self._clock = clock
@@ -106,7 +106,7 @@ class SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a new message with the next number to the site (arm controller).
+        """Sends a message to an arm controller (site), under the next number.
 
         Args:
             kind: Class of the message.
@@ -187,7 +187,7 @@ class SiteClient:
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the records, the events and the presence of the site."""
+        """Subscribes to the records, the events and the presence of a site (arm controller)."""
         self._bus = bus
         self._clock = clock
         self._site = site
@@ -210,10 +210,10 @@ class SiteClient:
 
     @property
     def record(self) -> State | None:
-        """Newest record of the site that has arrived. None before the first tick of the site.
+        """Newest record of the arm controller (site) that has arrived, with angles and torque.
 
-        A record is the result of one tick, a period of the control loop. It contains the joint
-        angles and the torque.
+        A record is the result of one period of the control loop. None before the first one has
+        arrived.
         """
         self._read_messages()
         return self._record
@@ -233,10 +233,9 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once no more records of the site will arrive.
+        """True once no more records of the site (arm controller) will arrive.
 
-        This is the case if the run of the site has ended, or if the process of the site is
-        gone.
+        This is the case if the run of the site has ended, or if its process is gone.
         """
         self._read_messages()
         return self._is_over
@@ -324,7 +323,7 @@ class _OutsideClient(SiteClient):
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the messages of the site, and opens the channel to the site."""
+        """Subscribes to the messages of a site (arm controller), and opens a channel to it."""
         super().__init__(bus, clock, session, site)
         self._sender = SiteSender(
             bus=bus,
@@ -343,7 +342,7 @@ class _OutsideClient(SiteClient):
         connect: Sequence[str],
         keys: str | Path | None = None,
     ) -> Self:
-        """Connects to a site over the network.
+        """Connects a program to an arm controller (site) over the network.
 
         Args:
             session: Name of the session, by default the name of the scenario.
@@ -416,7 +415,7 @@ class ArmClient(_OutsideClient):
         tau_x: Sequence[float] = (),
         stamp_ns: int | None = None,
     ) -> None:
-        """Sends a measurement of the arm to its site.
+        """Sends a measurement of a real arm, such as its joint angles, to its controller.
 
         Args:
             q: Joint angles in rad.
@@ -510,7 +509,7 @@ class Hand(SiteClient):
         *,
         repeats: bool = True,
     ) -> None:
-        """Connects to the site. The arm is moved only after the first call of a method."""
+        """Connects to a site (arm controller). The arm moves only after a further call."""
         super().__init__(bus, clock, session, site)
         self._operator = operator
         self._compute_pose = compute_pose
@@ -540,7 +539,7 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Moves the target position, towards which the operator pulls the end effector.
+        """Pulls the end effector of the arm towards a target position, like a spring.
 
         Args:
             *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
@@ -556,7 +555,7 @@ class Hand(SiteClient):
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Sets target angles of the joints, towards which the operator turns them.
+        """Pulls the joints of the arm towards target angles, like springs.
 
         Args:
             *angles_rad: Target angle of each joint, in rad.
@@ -571,7 +570,7 @@ class Hand(SiteClient):
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Sets the force with which the operator pushes the end effector.
+        """Pushes the end effector of the arm with a force, as a person would with a hand.
 
         Args:
             *force_n: Coordinates of the force that acts ON the end effector, in N.
@@ -586,7 +585,7 @@ class Hand(SiteClient):
         return self._send("push", force_n)
 
     def release(self) -> None:
-        """Ends the operator's influence on the arm. The force fades within 100 ms.
+        """Stops moving the arm. The force on it fades within 100 ms, so that it does not jump.
 
         Afterwards, `move`, `turn` or `push` may take hold of the arm again.
         """
@@ -608,10 +607,10 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of the message that the site followed in the newest record.
+        """Number of the message of this program that the arm followed in its newest record.
 
-        It is the number that `move`, `turn` or `push` returned. It is -1 if this program does
-        not move the arm at present.
+        It is the number that `move`, `turn` or `push` returned, or -1 if this program does not
+        move the arm at present.
         """
         hand = self.in_force
         if hand is None or hand.source != self._sender.boot:
@@ -633,7 +632,7 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """Pose of the arm in the newest record.
+        """Pose of the arm in the newest received record.
 
         It is the position of the end effector in m, or for `turn` the joint angles in rad.
         """
@@ -696,7 +695,7 @@ class Hand(SiteClient):
         return [(later - earlier) / (2.0 * step_s) for later, earlier in pairs]
 
     def _wait_for_record(self) -> State:
-        """Returns the newest record of the site, and waits if none has arrived yet.
+        """Returns the newest record of the site (arm controller), and waits for the first one.
 
         Raises:
             UsageError: The run has ended before the first record.
@@ -708,7 +707,7 @@ class Hand(SiteClient):
         return record
 
     def _send(self, action: str, numbers: Sequence[float]) -> int:
-        """Sends a target or a force of the operator, and returns the number of the message.
+        """Sends a target or force to the arm controller, and returns the message's number.
 
         Args:
             action: Name of the method that the program called: "move", "turn" or "push".

@@ -36,10 +36,10 @@ class PolledRing(Protocol[Polled]):
     """
 
     def poll(self) -> Polled | None:
-        """Removes the oldest entry from the queue and returns it, without waiting.
+        """Removes the oldest received message from the queue and returns it, without waiting.
 
         Returns:
-            The entry. None if the queue is empty.
+            The message. None if the queue is empty.
         """
 
 
@@ -60,10 +60,10 @@ class Query(Protocol):
 
     @property
     def payload(self) -> bytes:
-        """Content of the query, as the sender encoded it. Empty if the query has no content."""
+        """Content of a request, as its sender encoded it. Empty if it has no content."""
 
     def reply(self, payload: bytes) -> None:
-        """Sends the answer to the member that sent the query. A query can be answered once.
+        """Sends the answer to the member that asked. A query can be answered once.
 
         Args:
             payload: The encoded reply.
@@ -94,7 +94,7 @@ class Bus(Protocol):
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a queue of the messages that other members publish under a key.
+        """Returns a queue of the messages that other processes publish under a key.
 
         Args:
             key: The key, which may contain wildcards.
@@ -133,7 +133,7 @@ class Bus(Protocol):
         """
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a queue of the queries that other members send under a key.
+        """Returns a queue of the requests that other processes send under a key.
 
         The caller removes the queries from the queue, and replies to them when it has time. In
         contrast, `respond` replies at once.
@@ -143,7 +143,9 @@ class Bus(Protocol):
         """
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to the queries under a key at once, in a network thread.
+        """Replies to requests under a key at once, in a network thread.
+
+        The calculation of the reply must therefore be short.
 
         Args:
             key: The key, which may contain wildcards.
@@ -153,7 +155,7 @@ class Bus(Protocol):
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Sends a query to all members that serve a matching key.
+        """Sends a request to all processes that serve a matching key, and collects the replies.
 
         Args:
             key: The key, which may contain wildcards.
@@ -165,7 +167,7 @@ class Bus(Protocol):
         """
 
     def announce(self, key: str) -> None:
-        """Declares a liveliness token, which shows other members that this member is present.
+        """Shows other processes that this one is present, by a liveliness token of Zenoh.
 
         The token disappears when the connection is closed or lost.
 
@@ -185,9 +187,9 @@ class Bus(Protocol):
         """
 
     def close(self) -> None:
-        """Closes the network connection. Calling it again has no effect.
+        """Closes the network connection, so that other processes see that this one is gone.
 
-        Other members see that this member is gone, because its liveliness tokens disappear.
+        Calling it again has no effect.
         """
 
 
@@ -225,9 +227,10 @@ def matches_key(expression: str, key: str) -> bool:
 
 
 class BoundedRing(Generic[T]):
-    """A queue of limited length, which drops its oldest entry if it is full.
+    """A queue of limited length between two threads, which drops its oldest entry if full.
 
-    One thread may call `put` while another thread calls `poll`.
+    A control loop, for example, needs the newest messages rather than all. One thread may call
+    `put` while another thread calls `poll`.
 
     Args:
         capacity: Number of entries that the queue holds.
@@ -237,7 +240,7 @@ class BoundedRing(Generic[T]):
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds an entry to the queue. If the queue is full, its oldest entry is dropped."""
+        """Adds an entry to the queue without waiting; a full queue drops its oldest entry."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:

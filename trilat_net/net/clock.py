@@ -25,9 +25,9 @@ class Clock(Protocol):
     """
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of a clock that never steps, in ns.
+        """Returns the reading of a clock that never steps, in ns, to measure durations.
 
-        The zero of this clock is arbitrary. Therefore only differences of readings have a
+        The zero of this clock is arbitrary, so that only differences of readings have a
         meaning.
         """
 
@@ -39,7 +39,7 @@ class Clock(Protocol):
         """
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock has reached a time.
+        """Sleeps until the monotonic clock has reached a time, such as the next control period.
 
         Args:
             deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
@@ -47,22 +47,24 @@ class Clock(Protocol):
         """
 
     def identity(self) -> str:
-        """Returns a string that identifies the monotonic clock.
+        """Returns a string that is equal in two processes if they share a monotonic clock.
 
-        Readings of two processes can be compared only if their clocks have the same identity.
-        This is the case for processes on one machine.
+        This is the case on one machine. Only then can readings of both processes be compared.
         """
 
 
 class SystemClock:
-    """The clocks of the operating system of this machine."""
+    """The monotonic clock and the time of day of the operating system.
+
+    Live processes use this class. Tests put other clocks in its place.
+    """
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
     """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock has reached a time.
+        """Sleeps until the monotonic clock has reached a time, such as the next control period.
 
         Args:
             deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
@@ -113,7 +115,7 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the monotonic time as this wrong clock shows it, in ns.
+        """Returns the time of a clock that is wrong on purpose, in ns, to test synchronisation.
 
         true time + offset + drift * (time since the clock was created)
         """
@@ -122,9 +124,9 @@ class SkewedClock:
         return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
-        """Returns the time of day of the base clock, unchanged, in ns since 1970.
+        """Returns the correct time of day in ns since 1970, without offset and drift.
 
-        Only the monotonic time has an offset and a drift.
+        Only the monotonic time of this class is wrong on purpose.
         """
         return self._clock.unix_ns()
 
@@ -154,10 +156,10 @@ class SkewedClock:
         self._clock.sleep_until(self._start_ns + base_duration_ns)
 
     def identity(self) -> str:
-        """Returns a string that identifies this clock, with its offset, drift and start.
+        """Returns a string that identifies this wrong clock by its offset, drift and start.
 
-        From these numbers, readers of a log can convert readings of this clock to readings of
-        the base clock.
+        From these numbers, a reader of a log can convert its readings to those of the correct
+        clock.
         """
         return (
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "

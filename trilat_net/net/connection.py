@@ -72,7 +72,7 @@ def default_endpoint(session: str, index: int) -> str:
 def default_endpoints(
     session: str, sites: Sequence[str], *, encrypted: bool = False
 ) -> dict[str, str]:
-    """Returns the default endpoint of each site of a session, by the name of the site.
+    """Returns the network address that each site of a session has by default, by site.
 
     Args:
         session: Name of the session.
@@ -117,7 +117,9 @@ def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[li
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns endpoints on this machine whose ports no program uses at this moment.
+    """Returns network addresses on this machine whose ports no program uses at this moment.
+
+    Another program may take a port before the caller does.
 
     Args:
         count: Number of endpoints to find.
@@ -490,7 +492,7 @@ def _check_encrypted_endpoint(address: str) -> None:
 
 
 def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
-    """Refuses Zenoh settings of a user's file that the keys determine as well.
+    """Refuses a user's Zenoh settings that would contradict the encryption keys of a session.
 
     Args:
         settings: Settings of the file.
@@ -589,7 +591,7 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Derives the connection of a peer or a router from the command line and a Zenoh file.
+    """Derives the network connection of a process from its options and its Zenoh file.
 
     `listen_else` and `connect_else` are the defaults, see `Connection.of_member`.
 

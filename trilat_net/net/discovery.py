@@ -275,7 +275,7 @@ def _query_once(
     key: str,
     request: Request,
 ) -> bytes | None:
-    """Sends a request once, and waits for the first reply.
+    """Sends a request to other processes once, and waits for the first reply.
 
     Args:
         bus: Network connection that reaches the receiver.
@@ -378,7 +378,7 @@ def refuse_running_session(
     session: str,
     stopped: Callable[[], bool],
 ) -> None:
-    """Checks that no site of a session is present, before its name is used for a playback.
+    """Checks that no process of a session is present, before its name is used for a playback.
 
     Args:
         bus: Network connection that would reach the session.

@@ -18,9 +18,9 @@ _ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
 
 
 class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
-    """Error about an endpoint whose host name cannot be resolved to an address.
+    """Error: the host name of a network address cannot be resolved.
 
-    The name may be misspelt, or the name service may be away.
+    The name may be misspelt, or the name service may be out of reach.
     """
 
 
@@ -47,7 +47,7 @@ def check_hosts(endpoints: Iterable[str]) -> None:
 def _is_address(host: str) -> bool:
     """Returns True if a host is a numeric address, for example 127.0.0.1 or fe80::1%eth0.
 
-    No name service needs to be asked for an address.
+    A numeric address needs no request to a name service, which could take seconds.
     """
     try:
         ipaddress.ip_address(host.partition("%")[0])
@@ -57,7 +57,7 @@ def _is_address(host: str) -> bool:
 
 
 def _resolve(host: str, endpoint: str) -> None:
-    """Checks that the name service can resolve a host name to an address.
+    """Checks that a host name in a network address can be resolved, before it is used.
 
     Args:
         host: The host name.

@@ -76,9 +76,10 @@ class _KnownSite(msgspec.Struct, frozen=True):
 
 
 def _find_folder() -> Path:
-    """Returns the folder for the files of this user's running sites.
+    """Returns the folder in which the sites of this user that run on this machine have a file.
 
-    It is ~/.local/state/trilat-net/running, unless XDG_STATE_HOME names another place.
+    Other commands find a running session by these files. The folder is
+    ~/.local/state/trilat-net/running, unless XDG_STATE_HOME names another place.
     """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "trilat-net" / "running"
@@ -181,7 +182,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
-    """Returns the network endpoints at which some sites can be reached, each endpoint once.
+    """Returns the network addresses at which some sites can be reached, each once.
 
     Args:
         known_sites: The sites (arm controllers), as `find_known_sites` returns them.
@@ -298,9 +299,9 @@ def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str
 
 
 def _print(text: object) -> None:
-    """Prints a text immediately. Characters that cannot be printed are replaced.
+    """Prints a text immediately, with a replacement for characters that cannot be printed.
 
-    Texts from the network might otherwise control the terminal.
+    Texts from the network could otherwise send control sequences to the terminal.
     """
     letters = (letter if letter.isprintable() else "\ufffd" for letter in str(text))
     print("".join(letters), flush=True)

@@ -79,7 +79,7 @@ MOST_LETTERS = 64
 
 
 class MemberKeys(NamedTuple):
-    """The keys of one member of a session, ready for a network connection.
+    """Cryptographic keys by which one process of a session proves its identity.
 
     Attributes:
         member: Name of the member, a process that takes part in the session.
@@ -249,7 +249,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 
 
 def _read_authority(folder: Path) -> tuple[x509.Certificate, Any]:
-    """Reads the certificate and the private key of the authority.
+    """Reads the certificate and the private key that sign the keys of all processes.
 
     Args:
         folder: Folder that `create_keys` created.
@@ -463,7 +463,7 @@ def _renew_member(
     authority_key: Any,
     ends: datetime.datetime,
 ) -> tuple[x509.Certificate, str]:
-    """Signs a new certificate for the existing private key of a member.
+    """Signs a new certificate for the existing private key of one process.
 
     Args:
         folder: Folder of the member.
@@ -560,7 +560,9 @@ def _write_member_keys(
 
 
 def _format_member_list(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
-    """Returns the content of the file `MEMBERS` in the folder of a member, in JSON.
+    """Returns the names of all members and the expiry of their keys as JSON.
+
+    Each member (process of a session) has this text in the file `MEMBERS` beside its keys.
 
     Args:
         member: Name of the member.
@@ -713,8 +715,10 @@ def _write_folder(
 def _write_new_file(path: Path, content: bytes) -> None:
     """Writes a file that only its owner can read, such as a private key.
 
+    An existing file is never overwritten, because a lost key could not be restored.
+
     Raises:
-        FileExistsError: The file exists. Keys are never overwritten.
+        FileExistsError: The file exists.
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
@@ -722,7 +726,9 @@ def _write_new_file(path: Path, content: bytes) -> None:
 
 
 def _read_trusted(path: Path) -> bytes:
-    """Reads a key file, after a check that no other user can change it.
+    """Reads a key file, after a check that no other user of the machine can change it.
+
+    A changed file would let a stranger into the session.
 
     Raises:
         UsageError: Another user can change the file.
@@ -849,7 +855,7 @@ def _find_key_fault(
     key: Any,
     ends: datetime.datetime,
 ) -> str:
-    """Returns the first fault of the keys of a member. Empty if the keys are valid.
+    """Returns the first fault in the keys of a process. Empty if the keys are valid.
 
     Args:
         folder: Folder of the member.
@@ -899,7 +905,7 @@ def _find_key_fault(
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings of a member that uses the keys in a folder.
+    """Returns the Zenoh settings with which a process uses its keys for encryption.
 
     Args:
         folder: Folder of the member (process of a session).

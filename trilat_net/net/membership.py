@@ -41,10 +41,10 @@ from .wire import M, decode, encode, split_states
 
 
 def new_boot() -> int:
-    """Returns a random 64-bit number that identifies one start of one process (a "boot").
+    """Returns a random 64-bit number that identifies one start of one process.
 
-    If a process is restarted under the same name, the other processes recognise it by the new
-    number.
+    If a process is restarted under the same name, the other processes recognise the new one by
+    the new number.
     """
     return secrets.randbits(64)
 
@@ -164,7 +164,7 @@ class EventPublisher:
         info: Info,
         keep: Callable[[bytes], None] = lambda _: None,
     ) -> None:
-        """Opens the channel of the events, and begins to receive queries for the identity."""
+        """Opens the channel for this process's events, and answers queries for its identity."""
         self.info = info
         self.published = 0
         self._keep = keep
@@ -172,7 +172,7 @@ class EventPublisher:
         self._queries = bus.query_inbox(topics.key(session, info.member, topics.INFO))
 
     def publish(self, kind: str, text: str, **fields: object) -> Event:
-        """Publishes an event under the next number.
+        """Publishes a notable occurrence (event) to all other processes, under the next number.
 
         Args:
             kind: Kind of the event, which programs read.
@@ -198,7 +198,7 @@ class EventPublisher:
         return event
 
     def update(self, **fields: object) -> None:
-        """Changes fields of the identity. Later queries receive the changed identity.
+        """Changes fields of this process's identity, which other processes can query.
 
         Args:
             **fields: New values of fields of `Info`. All other fields stay unchanged.
@@ -206,9 +206,9 @@ class EventPublisher:
         self.info = msgspec.structs.replace(self.info, **fields)
 
     def answer_queries(self) -> None:
-        """Replies with the current identity of the member to all queries that are waiting.
+        """Replies to all waiting queries of other processes with the identity of this process.
 
-        The method does not wait. Therefore a control loop may call it.
+        The method does not wait, so that a control loop may call it.
         """
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
@@ -263,7 +263,7 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Settings of one site: whether it may join a running session, and whom a start awaits.
+    """Whether a site may join a running session, and which sites a start waits for.
 
     Attributes:
         may_join_late: True if this site (arm controller) may join a running session. The caller
@@ -310,7 +310,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
-        """Subscribes to the presence of the members. No other member is known yet."""
+        """Subscribes to the presence of the processes of a session. None is known yet."""
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
@@ -328,14 +328,15 @@ class Membership:
 
     @property
     def local_info(self) -> Info:
-        """Identity of this member, as it replies to queries of other members."""
+        """Identity of this process, which other processes of the session can query."""
         return self._publisher.info
 
     @property
     def is_leader(self) -> bool:
-        """True if this member is the leader: the first site of the scenario.
+        """True if this process is the leader of the session: the first site of the scenario.
 
-        The leader decides when the session starts, and all other sites follow its schedule.
+        The leader decides when the session starts, and all other sites (arm controllers) follow
+        its schedule.
         """
         return self._sites[:1] == (self.local_info.member,)
 
@@ -397,7 +398,7 @@ class Membership:
         return [name for name in awaited_members if name not in known_members]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """Returns True if a process of a member is gone, and another process has replaced it.
+        """Returns True if a process is gone, and another one has taken its name.
 
         Args:
             name: Name of the member.
@@ -474,7 +475,7 @@ class Membership:
             del self.others[member]
 
     def receive_identity(self, info: Info, *, may_have_started: bool) -> None:
-        """Adds a member to the list, or refuses it, when its identity arrives.
+        """Adds a process to the list of the session, or refuses it, when its identity arrives.
 
         Args:
             info: Identity of the member.

@@ -78,7 +78,7 @@ class OffsetLimit(NamedTuple):
 
 
 class OffsetEstimate(NamedTuple):
-    """Estimate of the offset and the drift of another clock relative to the local clock.
+    """Estimate of how far another clock is ahead of the local clock, and of its drift.
 
     Attributes:
         local_ns: Time on the local clock for which the estimate holds, in ns.
@@ -97,9 +97,10 @@ class OffsetEstimate(NamedTuple):
     drift_high: float
 
     def extrapolate_ns(self, local_ns: int) -> int:
-        """Returns the estimated offset at another time of the local clock, in ns.
+        """Returns the estimated offset between two clocks at another time, in ns.
 
-        The offset is assumed to grow with the estimated drift.
+        One clock may run slightly faster (drift), so that the offset is assumed to grow at the
+        estimated rate.
 
         Args:
             local_ns: The time on the local clock, in ns.
@@ -163,7 +164,7 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Formats an offset between two clocks, and its error bound, for the user.
+    """Writes an offset between two clocks and its error bound as text for the user.
 
     Args:
         offset_ns: The offset, in ns.
@@ -262,7 +263,11 @@ class _AdmissibleLines:
     def __init__(
         self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int
     ) -> None:
-        """Computes the steepest and the flattest line that the limits permit."""
+        """Computes the steepest and the flattest line that the limits of a clock offset permit.
+
+        A line is a possible course of the offset over time; its slope is the drift of the
+        clock.
+        """
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
         self._ceiling_times_s, self._ceilings = self._read_columns(ceilings)
@@ -407,7 +412,10 @@ class _SlewSegment:
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
-        """Computes both lines, and the largest error on the first one."""
+        """Computes how the clock offset in use gradually approaches an estimate.
+
+        It also computes the largest error of the offset meanwhile.
+        """
         self.start_ns = start_ns
         self.estimate = estimate
         # Time at which the smoothed offset has reached (joined) the line of the estimate.
@@ -421,7 +429,9 @@ class _SlewSegment:
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the smoothed offset, the other clock minus the local clock, at a time, in ns.
+        """Returns the offset in use at a time: the other clock minus the local clock, in ns.
+
+        It approaches its estimate gradually, because a jump would disturb the control loop.
 
         Args:
             local_ns: The time on the local clock, in ns.
@@ -469,9 +479,10 @@ class SlewedOffset:
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """Latest estimate of the offset.
+        """Latest estimate of the offset between two clocks.
 
-        The smoothed offset moves towards it, or has reached it.
+        The offset in use approaches the estimate gradually, because a jump would disturb the
+        control loop.
         """
         return self._segment.estimate
 
@@ -498,7 +509,7 @@ class SlewedOffset:
         self._segment = segment
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the smoothed offset between the two clocks at a time.
+        """Returns the clock offset in use at a time, which changes only gradually, in ns.
 
         Args:
             local_ns: The time on the local clock, in ns. It must not be earlier than the time
@@ -510,7 +521,7 @@ class SlewedOffset:
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns how far the smoothed offset can be from the true offset at a time, in ns.
+        """Returns how far the clock offset in use can be from the true offset at a time, in ns.
 
         Args:
             local_ns: The time on the local clock, in ns. It must be a time that `evaluate_ns`

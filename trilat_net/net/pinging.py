@@ -47,7 +47,9 @@ class RepeatedQuery:
         self._pending: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def repeat(self, period_ns: int = QUERY_PERIOD_NS) -> bool:
-        """Sends the query if enough time has passed since its last copy.
+        """Sends the query again if enough time has passed since it was sent last.
+
+        A query may be lost, or its receiver may have started later.
 
         Args:
             period_ns: Shortest time between two copies, in ns.
@@ -64,7 +66,7 @@ class RepeatedQuery:
         return True
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns the next reply that has arrived. The method does not wait.
+        """Returns the next reply to the query that has arrived, without waiting.
 
         Returns:
             The time at which the query was sent in ns, the key and the payload of the reply.
@@ -117,9 +119,9 @@ def answer_pings(
     """
 
     def answer(_: bytes) -> bytes:
-        """Returns the reply to a ping: the clock's readings at its arrival and at the reply.
+        """Returns the reply to a ping: the clock's readings on its arrival and at the reply.
 
-        The sender subtracts the time between the two readings from the round trip.
+        The sender subtracts the time between both readings from the measured round trip.
         """
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
@@ -141,7 +143,7 @@ def answer_backfill(
     boot: int,
     find: Callable[[BackfillRequest], tuple[int, list[bytes], int]],
 ) -> int:
-    """Replies to a recorder's query for messages that were lost on the way.
+    """Sends messages again that were lost on the way to a recorder, at its request.
 
     Args:
         query: The query as it has arrived from the recorder.
@@ -202,7 +204,10 @@ class RoundTrips:
 
     @property
     def is_known(self) -> bool:
-        """True once the clock offset is known, as enough round trips agree with each other."""
+        """True once the offset between two clocks is known.
+
+        It is known when enough measured round trips of messages agree with each other.
+        """
         return self._agreeing >= self._required
 
     def receive(self, pinged_ns: int, pong: Pong, now_ns: int) -> None:
@@ -241,7 +246,10 @@ class RoundTrips:
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
-            """Returns a limit of the clock offset, moved along the drift to the present, ns."""
+            """Returns a limit of the clock offset at the present time, in ns.
+
+            The limit was measured earlier, and moves with the drift of the clocks.
+            """
             return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
@@ -281,7 +289,7 @@ class Pinger:
         session: str,
         required: int = PINGS,
     ) -> None:
-        """Starts without any measured round trip."""
+        """Prepares the measurement of round trips to other processes. None is measured yet."""
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required
@@ -322,7 +330,7 @@ class Pinger:
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """Returns True if the clock offset of each of some members is known.
+        """Returns True if the clock offsets to all of the given processes are known.
 
         Args:
             boots: Boots of these members, the numbers that identify the starts of their

@@ -30,9 +30,9 @@ BACKFILL_BYTES = 40_000
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base class of the messages of this module: requests, replies to them, and measurements.
+    """Base class of requests between processes, of replies to them, and of measurements.
 
-    Every message contains the version of the schema, so that a member with another version of
+    Every message contains the version of the schema, so that a process with another version of
     the program recognises that it cannot read the message.
     """
 
@@ -40,7 +40,9 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Pong(Request, frozen=True, kw_only=True):
-    """Reply of a member to a ping, with two of the four time stamps of a round trip.
+    """Reply of a process to a ping, with two of the four time stamps of a round trip.
+
+    The offset between two clocks is measured by them.
 
     Attributes:
         member: Name of the member.
@@ -63,10 +65,10 @@ OrderName = Literal["", "stop", "enable", "reset"]
 
 
 class ChangeRequest(Request, frozen=True, kw_only=True):
-    """Request to a site to change something from its next tick on.
+    """Request to an arm controller (site) to change a setting from its next tick on.
 
-    The changes are those that a scenario can contain in its timeline. A request sets exactly
-    one of `link`, `dominance`, `stop_s`, `mark` and `order`.
+    A tick is a control period. The changes are those that a scenario can contain in its
+    timeline. A request sets exactly one of `link`, `dominance`, `stop_s`, `mark` and `order`.
 
     Attributes:
         link: Link whose settings change, as in "m1->s".
@@ -93,7 +95,7 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
 
 
 class ChangeReply(Request, frozen=True, kw_only=True):
-    """Reply of a site to a `ChangeRequest`.
+    """Reply of an arm controller (site) to a request for a change (`ChangeRequest`).
 
     Attributes:
         member: Name of the site.
@@ -127,7 +129,9 @@ class BackfillRequest(Request, frozen=True, kw_only=True):
 
 
 class Backfill(Request, frozen=True, kw_only=True):
-    """Reply to a `BackfillRequest`: consecutive messages, exactly as the site published them.
+    """Reply to a request for lost messages, with the messages as they were published.
+
+    They are consecutive. The request is a `BackfillRequest`.
 
     Attributes:
         member: Name of the site.
@@ -149,7 +153,7 @@ class Backfill(Request, frozen=True, kw_only=True):
 
 
 class ArmMeasurement(Request, frozen=True, kw_only=True):
-    """One measurement of an external arm, from its driver to its site.
+    """One measurement of a real arm, which its driver sends to the controller (site).
 
     Attributes:
         site: Name of the site.
@@ -233,9 +237,9 @@ class HandMessage(Request, frozen=True, kw_only=True):
 
 
 class PeerSeen(Request, frozen=True, kw_only=True):
-    """State of one peer in a `HandViewMessage`, as the site of the operator sees it.
+    """State of one arm at another site, as the site that an operator's program moves sees it.
 
-    A peer is another site whose states the site receives. The fields are those of `PeerView`.
+    The state is delayed by the network. The fields are those of `PeerView`.
     """
 
     alpha: float

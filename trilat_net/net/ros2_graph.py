@@ -139,12 +139,12 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def encode(self) -> bytes:
-        """Returns the attachment as the 33 bytes that ROS 2 programs expect."""
+        """Encodes the number, time and sender of a message as 33 bytes, as ROS 2 expects."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
 
 def parse_attachment(content: Any) -> Attachment | None:
-    """Parses the attachment of a message.
+    """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
 
     Args:
         content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
@@ -222,9 +222,10 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the liveliness token of the node.
+        """Returns the text by which ROS 2 programs see that a node exists.
 
-        While this program declares the token, other ROS 2 programs see that the node exists.
+        The node exists for them as long as this program declares the text to Zenoh as a
+        liveliness token.
         """
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
@@ -261,7 +262,7 @@ class Ros2Member(NamedTuple):
 
 
 def _mangle(name: str) -> str:
-    """Returns a name as it stands in a token, "/arm/joint_states" as "%arm%joint_states".
+    """Returns a name as ROS 2 writes it in a token: "/arm/joints" as "%arm%joints".
 
     A token is itself a path whose parts are divided by slashes.
     """
@@ -290,7 +291,7 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
 
 
 def make_gid(token: str) -> bytes:
-    """Returns 16 bytes that identify an endpoint, computed from its token.
+    """Returns 16 bytes that identify a ROS 2 publisher or subscriber, made from its token.
 
     Args:
         token: Liveliness token of the endpoint, which no other endpoint has.
@@ -336,9 +337,9 @@ class Refusals:
         self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
-        """Counts a message that was refused. The method may be called in any thread.
+        """Counts a refused message, and tells the user when a reason occurs for the first time.
 
-        The user is told when the reason occurs for the first time.
+        The method may be called in any thread.
 
         Args:
             reason: Why the message was refused.
@@ -365,9 +366,9 @@ class Refusals:
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
-            """Passes a message to `act`. An error of `act` counts as a refusal.
+            """Passes a message to `act`, and counts it as refused if `act` raises an error.
 
-            It would otherwise end in a thread of Zenoh, where nobody sees it.
+            Without this, the error would end in a thread of Zenoh, where nobody sees it.
             """
             try:
                 act(*args, **named)
@@ -397,7 +398,7 @@ class TopicPublisher:
         *,
         latched: bool,
     ) -> None:
-        """Stores the publisher. The first message will have the number 1."""
+        """Stores a publisher of a ROS 2 topic, whose messages are numbered from 1."""
         self._declared = declared
         self._gid = gid
         self._clock = clock
@@ -406,9 +407,9 @@ class TopicPublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True while there is a subscriber, or if the topic is latched.
+        """True if somebody would receive a message, so that composing one is worth the time.
 
-        If it is False, the caller need not compose a message.
+        It is always true for a latched topic, whose last message later subscribers receive.
         """
         return self._latched or bool(self._declared.matching_status.matching)
 
@@ -460,7 +461,7 @@ class Ros2Graph:
         domain: int = 0,
         distro: str = "jazzy",
     ) -> None:
-        """Connects to the router of ROS, and announces the node to ROS programs."""
+        """Connects to a Zenoh router of ROS 2, and announces a node to ROS 2 programs."""
         check_hosts(find_endpoint_addresses(routers))
         self._session = open_zenoh(
             listen=[],
@@ -504,11 +505,10 @@ class Ros2Graph:
 
     @property
     def connected(self) -> bool:
-        """True while the router is connected.
+        """True while this program is connected to the Zenoh router of ROS 2.
 
-        The session reconnects when the router is back.
-
-        It may be False for some time if the router is restarted.
+        It may be False for some time if the router is restarted, until the connection is there
+        again.
         """
         return bool(self._session.info.routers_zid())
 
@@ -626,7 +626,7 @@ class Ros2Graph:
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
-            """Passes a message of a ROS program to `receive`. Refuses any other message."""
+            """Passes a message of a ROS 2 program to `receive`, and refuses any other."""
             attachment = parse_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
@@ -651,7 +651,7 @@ class Ros2Graph:
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
-            """Computes the response to a request of a ROS program, and sends the response."""
+            """Computes and sends the response to a request (service call) of a ROS program."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 request = parse_attachment(query.attachment)

@@ -88,7 +88,7 @@ class SessionJoin:
         sites: Sequence[str],
         late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
-        """Announces this process to the other members, and begins to look for them."""
+        """Announces this process to the other processes of a session, and looks for them."""
         self._clock = clock
         self._session = session
         self._publisher = publisher
@@ -143,9 +143,9 @@ class SessionJoin:
 
     @property
     def announced_first_tick(self) -> int:
-        """First tick that this site announced when it requested to join a running session.
+        """First control period (tick) of this site, as it requested to join a running session.
 
-        The site executes its control loop from this tick on. The value is 0 if the site has not
+        The site executes its control loop from this tick on. It is 0 if the site has not
         requested to join.
         """
         if self._coming is None:
@@ -284,9 +284,10 @@ class SessionJoin:
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
-            """Returns the sort key: sites on this machine first, then the scenario's order.
+            """Returns a sort key: sites on this machine first, then the order of the scenario.
 
-            A site on this machine has the same clock, so its epoch needs no conversion.
+            A site on this machine has the same clock, so that its start time needs no
+            conversion.
             """
             return info.clock != local_clock, indices.get(info.member, -1)
 
@@ -345,7 +346,7 @@ class SessionJoin:
         return None
 
     def _make_late_epoch(self, coming: Event, epoch: Epoch, running: Sequence[Info]) -> Epoch:
-        """Returns the description of a running session, with this site among the members.
+        """Returns the start time and the members of a running session that this site joins.
 
         Args:
             coming: Request of this site (event `coming`) that all running sites (arm
@@ -606,7 +607,7 @@ class SessionJoin:
         return self._make_epoch(start)
 
     def _announce(self, now_ns: int) -> None:
-        """Proposes an epoch to the members that are present, as the leader.
+        """Proposes a common start time (epoch) to all processes, as the leader of the session.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -629,7 +630,7 @@ class SessionJoin:
         )
 
     def _make_epoch(self, start: Event) -> Epoch:
-        """Returns the epoch that the leader has confirmed.
+        """Returns the common start time (epoch) of the session, which its leader has confirmed.
 
         Args:
             start: The leader's event `start`, which states the members (processes of a session)

@@ -84,7 +84,7 @@ class TickSchedule:
         self._slew_per_ns = 0.0
 
     def due_ns(self, k: int) -> int:
-        """Returns the time at which a tick is due, on the site's clock, in ns.
+        """Returns the time at which a control period (tick) is due, on the site's clock, in ns.
 
         Args:
             k: Number of the tick (period of the control loop).
@@ -136,7 +136,9 @@ class SentStamps:
         self._entries = array("q", [-1, 0]) * capacity  # tick and sending time, alternately
 
     def record(self, tick: int, sent_ns: int) -> None:
-        """Stores when the sample of a tick was sent. The oldest stored time is overwritten.
+        """Stores when a site sent its state of one control period (tick).
+
+        The oldest stored time is overwritten.
 
         Args:
             tick: Number of the tick (period of the control loop).
@@ -180,7 +182,7 @@ class PeerClock(NamedTuple):
 
     @property
     def is_own(self) -> bool:
-        """True if the peer runs on this machine, and therefore on the same clock."""
+        """True if the other site runs on this machine, so that both have the same clock."""
         return self.estimator is None
 
 
@@ -220,7 +222,7 @@ class LinkTimingMonitor:
         self.admit(peer)
 
     def admit(self, peer: PeerClock) -> None:
-        """Restarts the measurements, after the peer (the site that sends) was restarted.
+        """Restarts the measurement of delays on a network link, after its sender was restarted.
 
         The new process may run on another machine, and therefore on another clock.
 
@@ -246,10 +248,10 @@ class LinkTimingMonitor:
         self._open_window()
 
     def _open_window(self) -> None:
-        """Starts a window of time stamps without any measurement.
+        """Begins a new interval of time, in which the smallest delay per direction is sought.
 
-        Only the smallest delay in each direction is kept, because it gives the tightest limit
-        of the offset.
+        Only the smallest delay is kept, because it gives the tightest limit of the offset
+        between the clocks.
         """
         self._smallest_outward_ns = _NO_DELAY_NS
         self._smallest_return_ns = _NO_DELAY_NS
@@ -308,9 +310,9 @@ class LinkTimingMonitor:
         return delay_ns
 
     def is_receiving(self, now_ns: int) -> bool:
-        """Returns True if a sample of the peer has arrived within the last _UNHEARD_NS.
+        """Returns True if a message of the peer has arrived recently, within _UNHEARD_NS.
 
-        A sample is the state that the peer publishes in each period of its control loop.
+        A peer (another site) publishes its state in each period of its control loop.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -475,7 +477,7 @@ class SiteTiming:
         leader: str,
         turn_ns: int = 0,
     ) -> None:
-        """Starts the schedule at the epoch, with the first estimates of the peers' clocks."""
+        """Starts the schedule of control periods with first estimates of the other clocks."""
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
         self._epoch_ns = epoch_ns
@@ -490,9 +492,9 @@ class SiteTiming:
         self._fault_notice_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def deadline_ns(self, k: int) -> int:
-        """Returns the time at which the site wakes up for a tick, on its own clock, in ns.
+        """Returns the time at which the process wakes up for a tick, on its own clock, in ns.
 
-        This is the time at which the tick is due, plus the delay `turn_ns`.
+        This is the time at which the tick (control period) is due, plus the delay `turn_ns`.
 
         Args:
             k: Number of the tick (period of the control loop).
@@ -500,7 +502,7 @@ class SiteTiming:
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
-        """Lists the events that state the offsets of the peers' clocks at tick 0.
+        """Returns how far the clocks of other sites differ at the start, as events for the log.
 
         Peers (other sites) on this machine have no offset and are left out.
 
@@ -563,7 +565,7 @@ class SiteTiming:
         return [_describe_estimate(monitor, k, due_ns)]
 
     def record_sent(self, tick: int, now_ns: int) -> int:
-        """Stores when the sample of a tick was sent, so that its delay can be measured later.
+        """Stores when the state of a tick was sent, so that its delay can be measured later.
 
         Args:
             tick: Number of the tick (period of the control loop).
@@ -685,7 +687,7 @@ class SiteTiming:
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns the timing statistics of the site, and discards the measured delays.
+        """Returns timing statistics of the site, and begins new ones for measured delays.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -788,7 +790,7 @@ _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded"
 
 
 class LoopStats:
-    """Statistics of a site's control loop and its links, published ten times a second.
+    """Statistics of a control loop and its network links, published ten times a second.
 
     Args:
         site: The site (arm controller) in the simulation kernel, which counts the samples (sent
@@ -816,7 +818,7 @@ class LoopStats:
 
     @property
     def late_ticks(self) -> int:
-        """Number of ticks that were executed, but began after the next tick was due."""
+        """Number of control periods (ticks) that began after the next one was already due."""
         return self.overruns - self.skipped
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:

@@ -197,10 +197,10 @@ def encode_sample(
     sent_ns: int,
     echo: Sequence[Sequence[int]],
 ) -> bytes:
-    """Encodes the sample of one tick, the state that a site sends its peers.
+    """Encodes the message with which a site tells other sites its state in one tick.
 
-    A tick is one period of the control loop. A sample is a shorter message than the record of
-    the same tick, because it contains only what the peers need.
+    A tick is one period of the control loop. This message (sample) is shorter than the record
+    of the same tick, because it contains only what the peers (other sites) need.
 
     Args:
         site: Name of the site.
@@ -266,7 +266,9 @@ def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
 
 
 def split_states(block: bytes) -> Iterator[bytes]:
-    """Splits a block into the payloads of its records, without decoding them.
+    """Splits a network message with several records into one payload per record.
+
+    The records are not decoded.
 
     Args:
         block: One or more encoded records (results of control periods), as `join_states` joins
@@ -447,7 +449,7 @@ def make_reader(
     decoder = make_decoder(kind, layout=layout)
 
     def read(payload: bytes) -> Any | WireError:
-        """Returns the decoded message. If the payload is not valid, returns the `WireError`."""
+        """Returns the decoded network message, or a `WireError` if its bytes are not valid."""
         try:
             return decoder(payload)
         except WireError as error:

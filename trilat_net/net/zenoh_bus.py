@@ -70,7 +70,7 @@ def share_threads() -> None:
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
-    """Error of a process that connects to a router which does not answer, or not yet.
+    """Error: the Zenoh router to which a process connects does not answer.
 
     The caller may try again, because the router may be started later.
     """
@@ -95,8 +95,9 @@ class _ZenohRing(Generic[T]):
     def poll(self) -> T | None:
         """Removes the oldest usable entry from the queue and returns it. None if there is none.
 
-        Entries for which `read` returns None, such as error replies, are skipped. The queue of
-        a query also counts as empty once all replies have arrived.
+        An entry is a message or a reply. Entries for which `read` returns None, such as error
+        replies, are skipped. The queue of a query also counts as empty once all replies have
+        arrived.
         """
         try:
             while (received := self._try_recv()) is not None:
@@ -144,9 +145,9 @@ def _read_sample(sample: Any) -> tuple[str, bytes]:
 
 
 class _ZenohQuery(NamedTuple):
-    """A query of another member that waits for a reply, with the key of the reply.
+    """A request of another process that waits for a reply, received through Zenoh.
 
-    It implements `Query` of the interface `bus`.
+    It implements `Query` of the interface `bus`. The key is the address of the reply.
     """
 
     query: zenoh.Query
@@ -154,11 +155,11 @@ class _ZenohQuery(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """Content of the query, for example a request. Empty if the query has no content."""
+        """Content of the request, as its sender encoded it. Empty if it has no content."""
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def reply(self, payload: bytes) -> None:
-        """Replies to the query, which then ends for its sender. A query can be answered once.
+        """Replies to the request, which then ends for its sender. Only one reply is possible.
 
         Args:
             payload: The encoded reply.
@@ -175,7 +176,7 @@ def open_zenoh(
     settings: Mapping[str, Any] | None,
     silent: str,
 ) -> Any:
-    """Opens a Zenoh session with the settings of `make_zenoh_config`.
+    """Connects to the Zenoh network, with the settings of `make_zenoh_config`.
 
     Args:
         listen: Endpoints at which the session listens.
@@ -238,7 +239,7 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        """Opens the Zenoh session of this connection."""
+        """Connects this process to the other processes of its network through Zenoh."""
         other_reason = ", or no router accepts this member" if settings else ""
         self._session = open_zenoh(
             listen=listen,
@@ -271,7 +272,7 @@ class ZenohBus:
         return put
 
     def _subscribe(self, key: str, handler: Any) -> Any:
-        """Creates a Zenoh subscriber that ignores what this connection publishes itself.
+        """Subscribes to messages through Zenoh, except those that this connection publishes.
 
         Args:
             key: Key of the messages; it may contain wildcards.
@@ -280,7 +281,7 @@ class ZenohBus:
         return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
 
     def _serve(self, key: str, handler: Any) -> Any:
-        """Creates a Zenoh object that receives queries, except those of this connection itself.
+        """Begins to receive queries through Zenoh, except those of this connection itself.
 
         Args:
             key: Key of the queries.
@@ -289,7 +290,7 @@ class ZenohBus:
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a queue of the messages that other members publish under a key.
+        """Returns a queue of the messages that other processes publish under a key.
 
         Args:
             key: The key, which may contain wildcards.
@@ -305,7 +306,7 @@ class ZenohBus:
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a queue of decoded messages, each with its time of arrival.
+        """Returns a queue of decoded network messages, each with its time of arrival.
 
         Args:
             key: Key under which the messages are published. It may contain wildcards.
@@ -322,7 +323,7 @@ class ZenohBus:
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls a function for each message under a key, in threads of Zenoh.
+        """Calls a function for each message under a key, at once and in a thread of Zenoh.
 
         Args:
             key: The key, which may contain wildcards.
@@ -348,7 +349,7 @@ class ZenohBus:
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to the queries under a key at once, in a thread of Zenoh.
+        """Replies to requests under a key at once, in a thread of Zenoh.
 
         Args:
             key: Key of the queries, which may contain wildcards.
@@ -357,9 +358,9 @@ class ZenohBus:
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
-            """Replies to a query in the thread of Zenoh.
+            """Replies to a query in the thread of Zenoh in which the query arrived.
 
-            If `answer` returns None, there is no reply.
+            There is no reply if `answer` returns None.
             """
             # A query ends for its sender only when the query object is dropped.
             with query:
@@ -372,7 +373,7 @@ class ZenohBus:
         )
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Sends a query, and returns a queue for the replies.
+        """Sends a request to other processes, and returns a queue for their replies.
 
         Args:
             key: Key of the query. Every member (process of a session) that serves a matching
@@ -397,7 +398,7 @@ class ZenohBus:
         )
 
     def announce(self, key: str) -> None:
-        """Announces that this member is present, until the connection is closed or lost.
+        """Shows other processes that this one is present, until its connection ends.
 
         Args:
             key: Key of the liveliness token by which other members see this member.
@@ -418,7 +419,7 @@ class ZenohBus:
         """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
-            """Reads whether a liveliness token has appeared or disappeared.
+            """Reads from a Zenoh sample which process has appeared or disappeared.
 
             Returns:
                 The key of the token, and True if it has appeared. None for a token of this
@@ -436,7 +437,7 @@ class ZenohBus:
         return _ZenohRing(tokens, read)
 
     def close(self) -> None:
-        """Closes the Zenoh session of this connection. Calling it again has no effect."""
+        """Closes the network connection of Zenoh. Calling it again has no effect."""
         if not self._session.is_closed():
             self._session.close()
         self._declarations.clear()
@@ -508,7 +509,7 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns the reason why Zenoh refuses a configuration. Empty if Zenoh accepts it.
+    """Returns the reason why Zenoh refuses a configuration, or "" if Zenoh accepts it.
 
     Args:
         settings: The configuration, or a part of it.

@@ -122,7 +122,7 @@ def make_zenoh_config(
     mode: ZenohMode = "peer",
     user_settings: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the complete Zenoh configuration of a member.
+    """Returns the complete Zenoh configuration for one process of a session.
 
     Args:
         listen: Endpoints at which the member listens.
@@ -187,7 +187,9 @@ _Requirement = tuple[Callable[[Any], bool], str]
 
 
 def _require_value(required: object, text: str) -> _Requirement:
-    """Returns the requirement that a setting has a certain value and type.
+    """Returns a check that a Zenoh setting of a user has a certain value and type.
+
+    A session works only with these settings.
 
     Args:
         required: The required value.
@@ -195,7 +197,7 @@ def _require_value(required: object, text: str) -> _Requirement:
     """
 
     def is_required_value(value: Any) -> bool:
-        """Returns True if a setting has the required value and the type of this value.
+        """Returns True if a setting of Zenoh has the required value, and the same type.
 
         The type matters, because 0 == False in Python.
         """
@@ -227,9 +229,10 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     """
 
     def equals_session_value(mode: str, value: Any) -> bool:
-        """Returns True if the session uses the same value in a mode, with the same type.
+        """Returns True if a user's value for one mode of Zenoh is the one that a session uses.
 
-        The result is False for a mode in which the session sets no value.
+        The type must be the same, too. The result is False for a mode in which a session sets
+        no value.
         """
         if mode not in session_values:
             return False
@@ -238,7 +241,7 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
         return is_equal and type(value) is type(session_value)
 
     def are_session_values(values: Any) -> bool:
-        """Returns True if a dictionary of values by mode agrees with the values of the session.
+        """Returns True if a setting that depends on Zenoh's mode agrees with the session.
 
         A mode is "peer", "client" or "router".
         """
@@ -323,7 +326,7 @@ class ZenohFile:
     def endpoints(
         self, side: Literal["listen", "connect"], mode: ZenohMode
     ) -> list[Endpoint] | None:
-        """Returns the endpoints that the file names.
+        """Returns the network addresses that a user's Zenoh file names for one direction.
 
         Args:
             side: "listen" for the endpoints at which the member (process of a session) listens,
@@ -345,7 +348,7 @@ class ZenohFile:
 def check_zenoh_file(
     source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
 ) -> ZenohFile:
-    """Checks the content of a user's Zenoh file.
+    """Checks a user's file of Zenoh settings, because a session needs some fixed values.
 
     Args:
         source: Name of the file, for error messages.
@@ -388,7 +391,7 @@ def check_zenoh_file(
 
 
 def _list_problems(source: str, problems: Sequence[str]) -> str:
-    """Returns an error message that lists the problems of a user's file, in one line.
+    """Returns an error message with all problems of a user's Zenoh file, in one line.
 
     Args:
         source: Name of the file.
@@ -401,7 +404,7 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Checks each setting of a user's file against the requirements of a session.
+    """Finds the settings of a user's Zenoh file with which a session would not work.
 
     Args:
         settings: Content of the file.
@@ -449,7 +452,7 @@ def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
 
 
 def _drop_key(settings: dict[str, Any], path: str) -> None:
-    """Removes a key from nested settings if it is present.
+    """Removes a key such as "transport/unicast" from nested settings, if it is present.
 
     Args:
         settings: The settings. They are changed in place.
@@ -498,7 +501,7 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Finds the settings that Zenoh refuses, by checking each setting alone.
+    """Finds out which settings Zenoh refuses, by trying each setting alone.
 
     Args:
         settings: Settings below `path`.
@@ -524,7 +527,7 @@ def _find_refused_keys(
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
-    """Returns the reason why a key is refused, with a suggestion for an unknown key.
+    """Returns why a Zenoh setting is refused, with a similar name for an unknown one.
 
     Args:
         path: Path of the key.

@@ -94,7 +94,7 @@ class DeviceHand:
         self.release()
 
     def release(self) -> None:
-        """Releases the arm, so that the motion of the device no longer moves it.
+        """Stops moving the arm, so that motion of the input device has no effect on it.
 
         The arm stays released until the person presses the clutch, a button of the device.
         """

@@ -118,10 +118,10 @@ class HandImpedance(Result):
     responses: tuple[_SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the identified hand to plain values for a JSON file.
+        """Converts the identified model of a person's hand to plain values for a JSON file.
 
-        The values are the matrices, their intervals and the measured responses. The command
-        `trilat linear --operators` reads the file.
+        The values are the matrices of mass, damping and stiffness, their confidence intervals
+        and the measured responses. The command `trilat linear --operators` reads the file.
         """
         return {
             "site": self.site,
@@ -138,7 +138,7 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the measured responses, one row per frequency of the sines.
+        """Returns a table of how the hand responded to forces, one row per frequency.
 
         A row has the amplitudes of motion and force, their coherence, and the part of the force
         that mass, damping and stiffness do not explain.
@@ -181,10 +181,10 @@ class HandImpedance(Result):
         yield f"in a scenario, without the mass of the hand: hands = [{{ {table_text} }}]"
 
     def _tabulate_matrices(self) -> TextTable:
-        """Returns a table with a row for each of M, B and K, and a column for each entry.
+        """Returns a table of the identified mass M, damping B and stiffness K of a hand.
 
-        The columns are named by their axes, as in "xy". Each cell has the value and half the
-        width of its interval.
+        There is a row for each matrix, and a column for each entry, named by its axes, as in
+        "xy". Each cell has the value and half the width of its confidence interval.
         """
         axes = "xyz"[: len(self.K)]
         entries = list(product(range(len(axes)), repeat=2))
@@ -330,7 +330,7 @@ def _list_responses(
 
 
 class _Sines(NamedTuple):
-    """Sines of force that shake the arm, so that the hand can be identified from its response.
+    """Sinusoidal forces that shake an arm, to identify a person's hand by its response.
 
     Attributes:
         hz: Frequencies of all sines in rising order, in Hz.
@@ -550,7 +550,10 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
 
 
 def _fit_all_axes(forces: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
-    """Returns the rows of M, B and K for each axis, shape (n, 3 n), by `_fit_impedance`.
+    """Fits the mass M, damping B and stiffness K of a hand to its motion, axis by axis.
+
+    For n axes, the result has the rows of all three matrices, shape (n, 3 n), see
+    `_fit_impedance`.
 
     Args:
         forces: Phasors of the force along each axis, shape (n, segments, F).
@@ -585,7 +588,7 @@ def _can_distinguish(motions: Complex) -> bool:
 
 
 def _stack_real_and_imaginary(phasors: Complex) -> Array:
-    """Returns the real parts followed by the imaginary parts, along the first axis.
+    """Returns the real parts of complex numbers followed by their imaginary parts.
 
     This turns K complex equations into 2 K real ones, whose unknowns stay real.
 

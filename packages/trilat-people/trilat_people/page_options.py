@@ -13,7 +13,7 @@ from trilat_net.app import flag, value
 
 
 class PageServing(NamedTuple):
-    """The options of a command that serves a page to browsers: address, encryption, browser.
+    """Options of a command that serves a web page: address, encryption, opening a browser.
 
     `trilat live`, `trilat watch` and experiments with people share them.
     """

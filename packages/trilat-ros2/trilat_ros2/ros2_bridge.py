@@ -226,9 +226,9 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Releases the arm if the topic commands it at present.
+        """Stops moving the arm to the targets of a ROS 2 topic, if they move it at present.
 
-        The next target then takes hold of the arm anew.
+        The next target then takes control of the arm again.
         """
         if self._received_ns is not None:
             self._received_ns = None
@@ -294,8 +294,8 @@ class DominanceTopic:
     def send_request(self) -> None:
         """Asks the site to use the newest weights with which its arm follows the other arms.
 
-        The method waits for the reply of the site. If no new weights have arrived since the
-        last call, it does nothing.
+        The method waits for the reply of the site (arm controller). If no new weights have
+        arrived since the last call, it does nothing.
 
         Raises:
             TrilatError: The site refuses the weights.
@@ -326,7 +326,7 @@ class SilenceNotice:
         self._other_joints: Sequence[str] = ()
 
     def note_message(self, other_joints: Sequence[str] = ()) -> None:
-        """Notes that a message has arrived, which need not be a measurement.
+        """Notes that a message of the robot has arrived, which need not be a measurement.
 
         Args:
             other_joints: Names of the joints in the message if none of them belongs to the arm.
@@ -336,7 +336,10 @@ class SilenceNotice:
             self._other_joints = other_joints
 
     def note_measurement(self) -> None:
-        """Notes that a message was sent to the site as a measurement."""
+        """Notes that a measurement of the robot was sent to the site (arm controller).
+
+        No notice of a silent robot is due then.
+        """
         self._has_measurement = True
         self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
 
@@ -477,17 +480,14 @@ class RobotArm:
             self._commands.put(self._pack(*ordered_torque))
 
     def _may_apply(self, torque: Sequence[float]) -> bool:
-        """Returns True if the robot may receive a torque.
+        """Returns True if a torque may be passed on to the robot.
 
-        It must be armed, and the torque must have one number for each joint.
+        The robot must be armed, and the torque must have one number for each joint.
         """
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
-        """Sends the robot its safe command, which makes it brake or hold still.
-
-        The settings of the robot contain this command.
-        """
+        """Sends the robot a command from its settings that makes it brake or hold still."""
         self._safe_ns = self._clock.monotonic_ns()
         self._commands.put(self._pack(*self._safe_command))
 
@@ -595,7 +595,9 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
-    """Checks that all numbers of a message are finite, and returns them as a list.
+    """Returns the numbers of a ROS 2 message as a list, after a check that all are finite.
+
+    NaN or an infinite number could make a robot move without control.
 
     Raises:
         ValueError: A number is not finite.
@@ -756,7 +758,7 @@ class _Bridge:
     def run(
         self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
     ) -> bool:
-        """Publishes the messages of the session on ROS topics until the session ends.
+        """Forwards messages of the session to ROS 2 topics until the session ends.
 
         Args:
             rate_hz: Rate at which the newest records are published, in 1/s.
@@ -897,7 +899,7 @@ def _describe_target(
 
 
 def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Lists the names by which ROS messages may call each joint of an arm.
+    """Lists the names by which ROS 2 messages may call each joint of an arm.
 
     Args:
         scenario: Scenario of the session.
@@ -927,7 +929,7 @@ def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
-        """Offers a ROS service that sends an order to one site or to all sites.
+        """Offers a ROS 2 service that sends an order, such as "stop", to one arm or to all.
 
         Args:
             order: Method of `RunningSession` that sends the order. The service has its name.
@@ -1118,7 +1120,7 @@ def publish_session(
 
 
 def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> None:
-    """Writes the configuration of RViz that shows a session.
+    """Writes a file of settings with which the viewer RViz shows the arms of a session.
 
     Args:
         ends: Connections to ROS and to the session.
@@ -1190,7 +1192,7 @@ def _open_robot(
     ends.graph.subscribe(states_topic, cdr.JOINT_STATE, arm.receive)
 
     def report_silence() -> None:
-        """Tells the user that the robot does not measure, if a notice is due."""
+        """Tells the user that the robot sends no measurements, if such a notice is due."""
         notice = arm.silence.pop(f"/{states_topic}", site)
         if notice:
             say(notice)

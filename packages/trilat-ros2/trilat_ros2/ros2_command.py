@@ -67,7 +67,7 @@ def ros2_command(
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:
-        """Joins the network of ROS as a node that is called trilat, in the session's namespace.
+        """Joins the network of ROS 2 as a node called trilat, in the session's namespace.
 
         Args:
             refusals: Counts the messages of ROS programs that the bridge refuses.

@@ -34,7 +34,7 @@ LATCHED = QualityOfService(latched=True, depth=1)
 
 
 class BridgeEnds(NamedTuple):
-    """The two networks that the bridge connects: the one of ROS and the one of the session.
+    """The two networks that a bridge connects: that of ROS 2 and that of the session.
 
     Attributes:
         graph: Connection to the ROS programs.
@@ -51,7 +51,7 @@ class BridgeEnds(NamedTuple):
     table: TopicTable
 
     def topic(self, site: str, name: str) -> str:
-        """Returns the full name of a topic of a site, in the naming scheme that the user chose.
+        """Returns the full ROS 2 topic name of a quantity of an arm, in the user's scheme.
 
         Args:
             site: Name of the site.
@@ -61,7 +61,7 @@ class BridgeEnds(NamedTuple):
 
 
 class SiteTopics:
-    """Publishes the state of one arm as ROS topics, each only while a program subscribes to it.
+    """Publishes the state of one arm on ROS 2 topics, if a program subscribes to them.
 
     Args:
         ends: Connections to ROS and to the session.
@@ -130,7 +130,7 @@ class SiteTopics:
                 self._frames.put(data)
 
     def publish_statistics(self, stats: LinkStats) -> None:
-        """Publishes the statistics of the site on all topics that have subscribers.
+        """Publishes link statistics of an arm on all ROS 2 topics that have subscribers.
 
         Args:
             stats: Statistics of the site's control loop and of its links.

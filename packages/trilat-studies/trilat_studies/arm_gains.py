@@ -159,7 +159,10 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per joint of the arm, with its inertia and gains, for a CSV file."""
+        """Returns a table with a row per joint of the arm: its inertia and its control gains.
+
+        The table is written as a CSV file.
+        """
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
@@ -229,9 +232,9 @@ class ArmGains(Result):
 
 
 def _format_cell(value: Any) -> str:
-    """Returns the text of a table cell.
+    """Returns the text of a table cell, in which a number has four digits.
 
-    A number has four digits. Any other value is its own text, and an empty one is "-".
+    A text stays as it is, and an empty value becomes "-".
     """
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -239,9 +242,9 @@ def _format_cell(value: Any) -> str:
 
 
 def _describe_run(run: Mapping[str, Any]) -> str:
-    """Returns a sentence on a simulated run that checks the edge of stability or the gains.
+    """Returns a sentence on a simulation that confirms the limit of stability or the gains.
 
-    Example: "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
+    An example is "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
 
     Args:
         run: The run, as in `ArmGains.runs`.
@@ -643,7 +646,11 @@ class _GainSearch:
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
-                """Returns the rate at which small motions grow with the gain k, in 1/s."""
+                """Returns the rate at which small motions about a pose grow, in 1/s.
+
+                It depends on the gain k. A negative rate means that the motions decay, so that
+                the control loop is stable.
+                """
                 law = self.build_law(math.exp(log_k))
                 root = self.find_root(law, pose, loop, sampled=sampled)
                 return root.s.real
@@ -928,10 +935,10 @@ def tune_arm(
 def _tabulate_joints(
     scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
 ) -> list[dict[str, Any]]:
-    """Returns the rows of `ArmGains.joints`: inertia and gains of each joint, with units.
+    """Returns the inertia and the control gains of each joint of an arm, with units.
 
     A row also has the position error at which the spring reaches the torque limit of the joint.
-    It is None for a joint without a limit.
+    It is None for a joint without a limit. See `ArmGains.joints`.
 
     Args:
         scenario: Scenario with the arm.

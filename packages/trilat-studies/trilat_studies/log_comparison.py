@@ -63,7 +63,7 @@ _SUBJECTS = {
 
 
 class _ComparisonRow(NamedTuple):
-    """One quantity in several runs, as a row of a table.
+    """One measured quantity, such as a mean error, in several runs, as a row of a table.
 
     Attributes:
         quantity: The quantity.
@@ -75,12 +75,12 @@ class _ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The value of the quantity in each of the compared runs. None where a run has none."""
+        """Value of one quantity in each of the compared logs. None if a log lacks it."""
         return tuple(entry.value for entry in self.entries)
 
 
 class _MetricComparison(NamedTuple):
-    """Metrics of several runs, side by side, as a table.
+    """Measured quantities of several runs side by side, as a table.
 
     Attributes:
         columns: Names of the runs.
@@ -92,7 +92,7 @@ class _MetricComparison(NamedTuple):
     rows: tuple[_ComparisonRow, ...]
 
     def row(self, key: str) -> _ComparisonRow:
-        """Returns the row of this comparison that shows a quantity in all logs.
+        """Returns one quantity, such as a mean error, in all compared logs.
 
         Args:
             key: Key of the quantity, such as "sharing_off".
@@ -105,7 +105,7 @@ class _MetricComparison(NamedTuple):
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricComparison:
-    """Computes the metrics of several logs, so that they can be shown in one table.
+    """Computes the same quantities from several logs, to show them in one table.
 
     Args:
         logs: The logs, which may be torn, short or empty.
@@ -129,7 +129,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricCo
 def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
     """Returns a comparison of runs as plain values, ready for JSON.
 
-    A missing number is None, and the reason is given next to it.
+    A missing number is None, with the reason next to it.
 
     Args:
         comparison: The comparison.
@@ -151,7 +151,7 @@ def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """Comparison of the metrics and the scenarios of several logs, created by `compare`.
+    """How several logs differ, in measured quantities and in settings. `compare` creates it.
 
     Attributes:
         logs: The logs.
@@ -170,11 +170,11 @@ class LogComparison(Result):
 
     @property
     def links_differ(self) -> bool:
-        """True if the scenarios differ in the settings of a link, such as its delay."""
+        """True if the compared runs had different network links, for example other delays."""
         return any(difference.concerns_link for difference in self.differences)
 
     def headline(self) -> str:
-        """Returns a sentence that names the compared logs and the number of quantities.
+        """Returns the names of the compared logs and the number of quantities.
 
         Example: "a, b: 14 quantities".
         """
@@ -254,10 +254,10 @@ class LogComparison(Result):
             yield "the same experiment"
 
     def _describe_undelayed_errors(self) -> str:
-        """Returns a phrase with the largest distance from where the peers are, for each run.
+        """Returns a phrase with each arm's largest distance from where its peers really were.
 
-        The ordinary errors compare a site with what it has received of its peers, so that a
-        longer delay hardly shows in them.
+        The ordinary errors compare an arm with what it has received of its peers (the other
+        arms), so that a longer delay hardly shows in them.
         """
         texts = []
         for row in self.metrics.rows:
@@ -274,7 +274,7 @@ class LogComparison(Result):
         )
 
     def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
-        """Returns a sentence with the judgement of each run and the metric that differs most.
+        """Returns a sentence with the judgement of each run and the quantity that differs most.
 
         Args:
             rows: The metrics that differ most.
@@ -312,7 +312,7 @@ class LogComparison(Result):
                     yield f"{name}: no {row.quantity.name}: {entry.why}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the comparison to plain values, as `trilat compare --json` prints it."""
+        """Converts the comparison of logs to plain values for `trilat compare --json`."""
         logs = []
         for name, log in zip(self.metrics.columns, self.logs, strict=True):
             entry = {
@@ -436,7 +436,7 @@ def _select_most_different(
             differences[index] = _measure_difference(row)
 
     def rank(index: int) -> tuple[bool, float, int]:
-        """Returns the place of a row: those of `shown_keys` first, then by difference."""
+        """Returns the sort key of a table row: `shown_keys` first, then by difference."""
         return rows[index].quantity.key not in shown_keys, -differences[index], index
 
     ranked_rows = sorted(differences, key=rank)

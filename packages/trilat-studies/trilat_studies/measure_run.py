@@ -93,7 +93,7 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records later than a given time.
+        """Returns the records of control periods that are later than a given time.
 
         Args:
             t_ns: The time, in ns. A record at exactly this time is not returned.
@@ -102,7 +102,7 @@ class RecordBatch(NamedTuple):
         return self.slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records from one time up to another.
+        """Returns the records of control periods from one time up to another.
 
         Args:
             from_ns: Start of the interval, in ns, which belongs to the interval.
@@ -146,7 +146,7 @@ class RecordBatch(NamedTuple):
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Joins consecutive batches of records of one site to a single batch.
+    """Joins consecutive batches of records of one arm into a single batch.
 
     Args:
         batches: Batches in the order of time, at least one.
@@ -206,7 +206,7 @@ def run_in_batches(
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        """Passes the collected records of a site to its receiver as arrays, and clears them.
+        """Passes the collected records of an arm on as arrays, and begins a new collection.
 
         Statistics over arrays are much faster than record by record. Nothing happens if no
         records were collected.
@@ -277,7 +277,7 @@ def run_compiled_in_batches(
 
 
 class _CompiledRun:
-    """Run in the compiled loop whose records are passed on batch by batch.
+    """A simulation by compiled code that passes the results on in batches of records.
 
     Args:
         scenario: Scenario to run.
@@ -301,18 +301,21 @@ class _CompiledRun:
 
     @property
     def is_finished(self) -> bool:
-        """True if the run has its whole duration, or an arm has left its limits."""
+        """True if the simulation has its whole duration, or if an arm has left its limits."""
         run = self.run
         return run.ran_s >= self._scenario.duration_s or run.diverged_s is not None
 
     def find_next_end(self) -> float:
-        """Returns the time up to which the next batch is simulated, in s."""
+        """Returns the time up to which the simulation continues next, in s.
+
+        A long run is simulated in batches, so that its records need little memory.
+        """
         return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
 
     def pass_records(self) -> None:
-        """Passes the records since the last call to the receiver of each site.
+        """Passes the records since the last call on to the function that evaluates an arm.
 
-        The batches do not contain which samples of the peers were in use.
+        They do not state which states (samples) of other arms were in use.
         """
         no_columns = slice(0, 0)  # for vectors that the site does not have
         records_of_sites = self.run.pop_records()
@@ -347,7 +350,7 @@ class WholeRun(NamedTuple):
 
 
 def run_whole(scenario: Scenario) -> WholeRun:
-    """Runs a scenario in the compiled loop, and keeps all records in memory.
+    """Simulates a scenario by compiled code, and keeps all records in memory.
 
     Measures of the whole run, such as an impedance, need all records at once.
 
@@ -484,7 +487,7 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the statistics of an interval of time with the next records of the arm.
+        """Updates the statistics of an interval of time by the next records of an arm.
 
         Records outside of the interval are ignored.
 
@@ -514,7 +517,7 @@ class WindowStats:
             self._add_wall_force(total_force)
 
     def _raise_peak(self, key: str, values: Array) -> None:
-        """Updates a peak value of the window with the absolute values of new records.
+        """Raises the largest absolute value of a quantity, if new records exceed it.
 
         Args:
             key: Name of the peak.
@@ -525,7 +528,7 @@ class WindowStats:
         self._peaks[key] = max(previous, largest)
 
     def _add_wall_force(self, force: Array) -> None:
-        """Updates the statistics of the force that the walls of the site exert on its arm.
+        """Updates the statistics of the force that walls exert on an arm, within the interval.
 
         A hit is a record with contact that follows a record without contact.
 
@@ -647,7 +650,7 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the largest errors, torques, sample ages and all other statistics of the arm.
+        """Updates the errors, torques, sample ages and other statistics by further records.
 
         Args:
             rows: The next records of the arm. They must follow the records of the previous
@@ -749,6 +752,8 @@ class SiteStats:
     def end(self, end_ns: int) -> RecordBatch:
         """Returns the records of the last second of the run, for the metrics `end_...`.
 
+        A metric such as the error at rest is evaluated there.
+
         Args:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
                 than others, fewer records are returned.
@@ -759,7 +764,7 @@ class SiteStats:
 
     @property
     def buckets(self) -> Array:
-        """Summary of the arm's motion, from which the end of the run is judged.
+        """Summary of the motion of an arm, by which the end of the run is judged.
 
         A row has the extreme values of a short interval of time, see `RecordBatch.reduce`.
         """
@@ -768,10 +773,10 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """Torque of operator and environment in the last record, in N m, shape (n,).
+        """External torque of operator and environment in the last record, in N m, shape (n,).
 
-        By it, the judgement of the end tells whether an operator still acts on the arm. Before
-        the first record it is a single zero.
+        It shows whether an operator still acts on the arm when the run ends. Before the first
+        record it is a single zero.
         """
         if not self._tail:
             return np.zeros(1)
@@ -841,7 +846,7 @@ def _compute_run_metrics(
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Computes the metrics of a run from the statistics of its sites.
+    """Computes quantities about a whole run from the statistics of its arms.
 
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
@@ -896,7 +901,7 @@ def _compute_run_metrics(
     sites_by_window = zip(*windows_by_site, strict=True)
 
     def find_largest(name: str) -> float | None:
-        """Returns the largest value of a statistic over all sites.
+        """Returns the largest value of a statistic, such as the peak torque, over all arms.
 
         Args:
             name: Name of the statistic, an attribute of `SiteStats`.
@@ -1171,7 +1176,7 @@ class _MeasuredRun:
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Computes the metrics of a recorded run from its log.
+    """Computes errors, torques and other quantities of a recorded run from its log.
 
     Args:
         log: Log of the run.
@@ -1365,7 +1370,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Compares the pose of each site in its last record with the expected pose.
+    """Compares the final pose of each arm with the pose that the scenario expects.
 
     Yields:
         An outcome for each site with an expected pose. The joint with the largest error counts.

@@ -23,7 +23,7 @@ def format_command(*arguments: str) -> str:
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns the command-line options --set that apply overrides of a scenario.
+    """Returns command-line options --set that change settings of a scenario.
 
     Args:
         overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
@@ -70,7 +70,7 @@ def format_toml_value(value: Any) -> str:
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the overrides of a nested mapping as texts KEY=VALUE, as on the command line.
+    """Yields changed settings in nested tables as texts KEY=VALUE for the command line.
 
     Args:
         overrides: Values by key, also as nested tables.

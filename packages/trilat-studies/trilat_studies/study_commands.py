@@ -101,7 +101,7 @@ def test_command(
 
 
 def parse_seeds(text: str | None) -> list[int]:
-    """Parses seeds such as 1..20 or 1,5,9 or 1..3,8.
+    """Parses a list of random seeds, written as 1..20 or 1,5,9 or 1..3,8.
 
     Args:
         text: The text. None if the user gave no seeds.

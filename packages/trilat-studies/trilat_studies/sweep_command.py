@@ -258,7 +258,7 @@ def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> N
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
-    """Prints the commands that write logs of a cell of a finished sweep.
+    """Prints the shell commands that record logs of one combination of a finished sweep.
 
     Args:
         path: Folder of the sweep, or its table of results.
@@ -501,9 +501,10 @@ def parse_seed_count(text: str | None) -> int | list[int]:
 
 
 def _is_results(source: str) -> bool:
-    """Returns True if an argument of the command names the results of a sweep.
+    """Returns True if an argument of the command is the folder or table of a sweep.
 
-    The names of shipped scenarios never do, even if there is a folder of the same name.
+    The name of a shipped scenario is never taken for one, even if there is a folder of the same
+    name.
 
     Args:
         source: The argument: a scenario, the folder of a sweep, or its table of results.

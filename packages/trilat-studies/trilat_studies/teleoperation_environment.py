@@ -110,7 +110,7 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Result of a step of an episode: its reward, and whether the task is done or has failed.
+    """How a task judges one step: the reward, and whether the task is done or has failed.
 
     Attributes:
         reward: Reward of the step.
@@ -126,8 +126,8 @@ class Judgement(NamedTuple):
 class EpisodeTask(Protocol):
     """Interface of the task of an episode: it draws a goal and computes the rewards.
 
-    A user can implement it. The environment calls `begin` at the start of each episode, and
-    `judge` after each step.
+    A user can write a class of this form for a reinforcement-learning environment, which calls
+    `begin` at the start of each episode, and `judge` after each step.
     """
 
     goal: Array
@@ -474,7 +474,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             load_scenario(self._base, {key: values[end] for key, values in self._vary.items()})
 
     def build_hand_site(self, scenario: Scenario) -> HandSite:
-        """Returns the site and the settings of the operator that applies the actions.
+        """Returns the arm that the agent moves, with the limits of its force or position.
 
         Args:
             scenario: The experiment of one episode, in which the user's site has such an
@@ -585,9 +585,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
-        """Returns True if the end effector of a site can reach a position.
+        """Returns True if the end effector of an arm can reach a position.
 
-        Tasks that draw random goals use it.
+        Tasks that draw random goals use it, so that every goal can be reached.
 
         Args:
             q: Joint angles of each site, from which the search for a pose starts, in rad.
@@ -603,7 +603,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
-        """Returns observations as the policy gets them: a dictionary, or one array with `flat`.
+        """Returns observations as the agent receives them: a dictionary, or one array (`flat`).
 
         Args:
             parts: The parts of an observation by name, or those of several observations, which
@@ -622,10 +622,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Collects what the user can observe of a state, as arrays by name.
+        """Collects what an agent can observe of a state, as arrays by name.
 
         Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer (other
-        site).
+        arm).
         """
         view = scene.view
         peers = view.peers
@@ -696,7 +696,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, and draws everything that is random in it.
+        """Begins a new episode, and draws its random goal and settings.
 
         Args:
             seed: Seed of the random numbers. None continues the sequence of earlier episodes.
@@ -732,7 +732,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, info
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Applies an action and advances the episode by one step.
+        """Moves the arm by an action, and simulates the time of one step of the episode.
 
         Args:
             action: Target of the arm or force on it, depending on the mode.
@@ -771,7 +771,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def judge(self, scene: Scene) -> Judgement:
-        """Asks the task of the episode for the reward of a step, and whether it is done.
+        """Asks the task for the reward of a step, and whether the episode is finished.
 
         Args:
             scene: State after the step.
@@ -781,22 +781,25 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     @property
     def is_running(self) -> bool:
-        """True if an episode is in progress."""
+        """True if an episode has been started by `reset` and has not ended yet."""
         return self._runs
 
     @property
     def run(self) -> FusedRun:
-        """The simulated run of the episode, which a vector environment may advance."""
+        """The simulation of the present episode.
+
+        A vector environment may advance it instead of `step`, together with other episodes.
+        """
         return self._run
 
     @property
     def total_ticks(self) -> int:
-        """Number of ticks (control periods) after which the duration of an episode is over."""
+        """Number of control periods (ticks) of a complete episode."""
         return self._ticks
 
     @property
     def plants(self) -> Mapping[str, Any]:
-        """User-written models of arms, by the name of the site that they belong to."""
+        """User-written simulation models of arms, by the name of their site (controller)."""
         return self._plants
 
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:
@@ -843,7 +846,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return clipped
 
     def clip_actions(self, values: Array) -> tuple[Array, Any]:
-        """Clips actions to their bounds, and reports which of them exceeded the bounds.
+        """Limits actions to their allowed range, and reports which of them exceeded it.
 
         Args:
             values: An action, or several actions, one per row, as the policy gave them.
@@ -856,7 +859,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.clip(values, -limit, limit), exceeds
 
     def warn_of_clipping(self, values: Array, stacklevel: int) -> None:
-        """Warns of the first action of the environment that exceeds the bounds.
+        """Issues a Python warning at the first action of an agent outside of its range.
 
         Args:
             values: The action as the policy gave it.
@@ -873,7 +876,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def render(self) -> Any:
-        """Draws the arms and the goal as a picture of the present state.
+        """Draws a picture of the arms and the goal in their present state.
 
         Returns:
             A picture of shape (height, width, 3). None if the environment has no render mode.

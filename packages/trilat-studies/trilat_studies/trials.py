@@ -86,7 +86,7 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the run was completed and met every expectation of its scenario."""
+        """True if the simulation was completed and met every expectation of its scenario."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
@@ -126,7 +126,7 @@ class Trial(NamedTuple):
 
     @property
     def again(self) -> str:
-        """Shell command that repeats this trial, for the user to copy.
+        """Shell command that repeats this simulation with the same random seed, to copy.
 
         Example: "trilat test jitter --seeds 3".
         """
@@ -136,12 +136,12 @@ class Trial(NamedTuple):
 
     @property
     def look(self) -> str:
-        """Shell command that simulates this trial and records its log, to inspect a failure."""
+        """Shell command that simulates this trial and records a log, to inspect a failure."""
         arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
     def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
-        """Compares the metrics of a run with the expectations of the scenario.
+        """Compares measured quantities of a run with the expectations of its scenario.
 
         Args:
             metrics: Metrics of the run.
@@ -169,7 +169,7 @@ class Trial(NamedTuple):
         return self.evaluate(metrics, wall_s)
 
     def check(self) -> TrialResult:
-        """Runs the trial in virtual time, and returns the result if all expectations are met.
+        """Simulates the scenario, and returns the result if all expectations are met.
 
         Raises:
             AssertionError: An expectation is not met. The text contains the reasons, and the
@@ -360,7 +360,7 @@ class _ExpectationRow(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class TrialReport(Result):
-    """Results of several trials, with the texts that report them.
+    """Results of several simulations, each compared with the expectations of its scenario.
 
     Attributes:
         results: The results, in the order of scenarios and seeds.
@@ -372,12 +372,12 @@ class TrialReport(Result):
 
     @property
     def held(self) -> bool:
-        """True if all runs met all expectations. `trilat test` then ends with exit code 0."""
+        """True if all simulations met all expectations, so that `trilat test` exits with 0."""
         return all(result.held for result in self.results)
 
     @property
     def scenarios(self) -> dict[str, list[TrialResult]]:
-        """The results of each scenario, by its name or path, in the order of the trials."""
+        """Results of the simulations of each scenario, by its name or path, in their order."""
         groups: dict[str, list[TrialResult]] = {}
         for result in self.results:
             groups.setdefault(result.trial.source, []).append(result)
@@ -499,7 +499,7 @@ class TrialReport(Result):
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
-        """Returns a sentence with the number of runs that met all expectations.
+        """Returns the number of simulations that met all expectations, as a sentence.
 
         Example: "19 of 20 runs as expected".
         """

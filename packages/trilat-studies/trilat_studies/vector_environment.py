@@ -272,12 +272,12 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return super().call(name, *args, **kwargs)
 
     def render(self) -> tuple[Any, ...]:
-        """Returns a picture of the arms of each environment."""
+        """Returns one picture per environment, which shows its arms, as Gymnasium expects."""
         self._write_back()
         return super().render()
 
     def _write_back(self) -> None:
-        """Copies the states of jointly simulated episodes into their environments.
+        """Copies the states of episodes that were simulated together into their environments.
 
         The environments can then draw and save their episodes.
         """
@@ -328,10 +328,13 @@ class _Results:
         infos[key][indices] = values
 
     def put_observations(self, indices: Any, observations: Any, is_all: bool) -> None:
-        """Writes the observations of some environments into those of all environments.
+        """Writes the new observations of some environments into the arrays of all environments.
+
+        A vector environment returns the observations of all its environments together, but only
+        some of them may have been simulated in a call.
 
         Args:
-            indices: Their environments, an index of arrays.
+            indices: Indices of the simulated environments, as NumPy accepts them.
             observations: The observations, an array or arrays by name.
             is_all: True if these are the observations of all environments.
         """
@@ -403,7 +406,9 @@ class _LaneEnvs:
         self._goals: Array = np.zeros((count, *np.shape(env.task.goal)))
 
     def load(self, is_stepped: Flags) -> None:
-        """Puts new episodes, begun since the last step, into the lanes of their environments.
+        """Starts new episodes in place of those that have ended since the last step.
+
+        Episodes are simulated side by side, each in the place (lane) of its environment.
 
         Args:
             is_stepped: True for environments of the vector environment that are to be stepped.
@@ -422,7 +427,7 @@ class _LaneEnvs:
                 self._load_task(lane, env)
 
     def _load_episode(self, lane: int, env: TeleoperationEnv) -> None:
-        """Puts the new episode of an environment into its lane, if its structure permits.
+        """Adds a new episode to those that are simulated side by side, if that is possible.
 
         Args:
             lane: The lane.
@@ -473,7 +478,7 @@ class _LaneEnvs:
     def step(
         self, actions: Array, exceeds: Flags, is_stepped: Flags, results: _Results
     ) -> None:
-        """Advances the environments by one step, and writes their results into `results`.
+        """Simulates one step of several episodes side by side, and writes the results.
 
         Args:
             actions: Checked actions of all environments of the vector environment.
@@ -531,7 +536,7 @@ class _LaneEnvs:
             self._write_lane(lane, ends=True)
 
     def _advance(self, is_active: Flags) -> None:
-        """Simulates the control periods (ticks) of one step in all active lanes.
+        """Simulates one step of all active episodes, which consists of many control periods.
 
         The operator applies an action only after its delay, which may begin within a step. The
         step is then simulated in two parts.
@@ -572,7 +577,9 @@ class _LaneEnvs:
         return q if self._is_joint else self.place_end_effectors(self._user, q)
 
     def place_end_effectors(self, i: int, q: Array) -> Array:
-        """Returns the position of a site's end effector in each lane, shape (lanes, 2), in m.
+        """Returns the end effector's position of one arm in all episodes, in m.
+
+        The shape is (lanes, 2), with one lane for each episode that is simulated side by side.
 
         Args:
             i: Index of the site.
@@ -630,14 +637,17 @@ class _LaneEnvs:
         }
 
     def write_back(self) -> None:
-        """Copies the states of the episodes in progress into the environments."""
+        """Copies the states of the episodes in progress into their environments.
+
+        The episodes are simulated together in common arrays, but drawn and saved one by one.
+        """
         for lane, env in enumerate(self._envs):
             is_here = self._is_loaded[lane] and self._runs[lane] is env.run
             if is_here and env.is_running and self._steps[lane]:
                 self._write_lane(lane, ends=False)
 
     def _write_lane(self, lane: int, *, ends: bool) -> None:
-        """Copies the state of one episode from its lane into its environment.
+        """Copies the state of one episode from the common arrays into its environment.
 
         Args:
             lane: The lane.
@@ -652,37 +662,37 @@ class _LaneEnvs:
 
     @property
     def envs(self) -> list[TeleoperationEnv]:
-        """The environments, one per lane."""
+        """The reinforcement-learning environments whose episodes are simulated side by side."""
         return self._envs
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites."""
+        """Names of the sites (arm controllers), such as "m1", equal in all environments."""
         return self._names
 
     @property
     def user(self) -> int:
-        """Index of the site whose arm the policy moves."""
+        """Index of the site (arm controller) whose arm the policy moves."""
         return self._user
 
     @property
     def is_joint(self) -> bool:
-        """True if an action is a pose of the joints."""
+        """True if an action is a set of joint angles, and False if it is a position."""
         return self._is_joint
 
     @property
     def k(self) -> NDArray[np.int64]:
-        """Number of ticks that each episode has lasted so far."""
+        """Number of control periods (ticks) that each episode has lasted so far."""
         return self._steps * self._period
 
     @property
     def rate_hz(self) -> int:
-        """Tick rate of the user's site, in Hz."""
+        """Rate of the control loop of the arm that the policy moves, in Hz."""
         return self._rate_hz
 
 
 class _State:
-    """State of all jointly simulated episodes after a step, from which results are computed.
+    """State of all jointly simulated episodes after a step, to compute observations from.
 
     Args:
         envs: The environments.
@@ -704,7 +714,10 @@ class _State:
         self._new: list[list[bool]] = []
 
     def read_links(self, name: str, i: int) -> Array:
-        """Returns one field of all links to site `i`, shape (lanes, peers, numbers)."""
+        """Returns a quantity of the network links to site `i`, shape (lanes, peers, numbers).
+
+        A lane is one of the episodes that are simulated side by side.
+        """
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
@@ -740,7 +753,7 @@ class _State:
         return self._view
 
     def observe(self, goals: Array) -> dict[str, Array]:
-        """Computes the observations of all episodes, by the names that `TeleoperationEnv` uses.
+        """Computes the observations of all episodes, with the keys of `TeleoperationEnv`.
 
         Args:
             goals: Goals of the tasks.
@@ -804,7 +817,9 @@ class _State:
 
 
 class _ReachTasks:
-    """Tasks of the class `ReachTask` in several episodes, whose rewards are computed together.
+    """State of the task `ReachTask` (move to a point) in several episodes, as arrays.
+
+    The rewards of all episodes are computed together, which is faster.
 
     Args:
         count: Number of lanes.
@@ -819,7 +834,7 @@ class _ReachTasks:
         self._last_s = np.zeros(count)
 
     def load(self, lane: int, task: ReachTask, site: int) -> None:
-        """Copies the state of one task, such as its goal, into the arrays of all tasks.
+        """Copies the goal and further state of one task into the arrays of all tasks.
 
         Args:
             lane: Lane of the episode.
@@ -834,12 +849,14 @@ class _ReachTasks:
         self._last_s[lane] = task.last_s
 
     def write_back(self, lane: int, task: ReachTask) -> None:
-        """Copies the state of one task from the arrays of all tasks back into the task."""
+        """Copies the state of the task of one episode from the common arrays into the task."""
         task.reached_s = float(self._reached_s[lane])
         task.last_s = float(self._last_s[lane])
 
     def judge(self, state: _State, is_judged: Flags) -> tuple[Array, Flags]:
-        """Computes the rewards of a step, and which tasks are done, as `ReachTask.judge` does.
+        """Computes the rewards of a step in all episodes, and which tasks are done.
+
+        The results are those of `ReachTask.judge`.
 
         Args:
             state: State after the step.
@@ -915,7 +932,7 @@ def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
 
 
 def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Returns the information of one environment in the form that the environment itself uses.
+    """Returns the additional information about one environment from that of all of them.
 
     Args:
         infos: Information of all environments.

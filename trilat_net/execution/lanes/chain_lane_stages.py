@@ -64,9 +64,10 @@ def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
 
 
 def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the version of `place_joints` for one run or for eight runs at once.
+    """Returns the version of `place_joints` for a single simulation or for eight at once.
 
-    The compiler calls this function with the types of the arguments.
+    The function computes where the joints of an arm are. Numba calls this choice with the types
+    of the arguments, from which the number of simulations is known.
     """
     dispatcher: Any = place_joints
     is_one_lane = isinstance(argument_types[0], RowsInLane)
@@ -74,9 +75,10 @@ def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
 
 
 def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the version of `put_gravity_torque` for one run or for eight runs at once.
+    """Returns the version of `put_gravity_torque` for a single simulation or for eight at once.
 
-    The compiler calls this function with the types of the arguments.
+    Numba calls this choice with the types of the arguments, from which the number of
+    simulations is known.
     """
     dispatcher: Any = chain_stages.put_gravity_torque
     is_one_lane = isinstance(argument_types[0], LaneRow)
@@ -114,9 +116,10 @@ def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
 
 
 def _choose_model(argument_types: tuple[Any, ...]) -> Callable[..., None]:
-    """Returns the version of `update_model`, which only users' laws need.
+    """Returns the compiled version of `update_model`, which computes the dynamics of an arm.
 
-    The model is computed for eight runs at a time.
+    Only users' control laws need the model. It is computed for eight simulated runs at a time,
+    by vector instructions, so that the version for a single run does nothing.
     """
     dispatcher: Any = chain_stages.update_model
     site = argument_types[0]
@@ -165,9 +168,10 @@ def advance_chain_site(
     columns: IntArray,
     table: TorqueTable,
 ) -> None:
-    """Computes one tick of a site for several runs, see `advance_site`.
+    """Computes one control period of an arm for several simulations that run side by side.
 
-    All tables have a lane for each run. No two of them overlap in memory.
+    The arm is a chain of joints, see `advance_site`. All arrays have a place (lane) for each
+    simulation. No two of them overlap in memory.
 
     Args:
         k: The tick.

@@ -147,7 +147,10 @@ def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
 
 
 def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
-    """Returns the states of the network links of those runs that continue.
+    """Returns the states of the simulated network links of those runs that continue.
+
+    Several runs are simulated side by side, each at one index (lane). A search drops runs that
+    it needs no longer, so that no time is spent on them.
 
     Args:
         states: State of all runs that have been simulated together.
@@ -165,9 +168,10 @@ def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
 
 @leaf
 def _constant_delay_ns(model: Row) -> int:
-    """Returns the time from the stamp of a sample to its use, on a link that only delays.
+    """Returns the delay of a simulated link on which all messages take equally long, in ns.
 
-    A sample is never used at the time when it was sent.
+    The delay is the time from the stamp of a sample (sent state) to its use. It is at least 1
+    ns, because a sample is never used at the time at which it was sent.
     """
     return int(max(max(clamp_delay_us(model.location), model.playout_us) * 1000, 1))
 
@@ -187,11 +191,11 @@ def _is_constant(link: LinkRow, model: Row) -> bool:
 def _use_after_constant_delay(
     first: int, count: int, rate_hz: int, model: Row, used: IntArray
 ) -> int:
-    """Determines which sample a receiver uses in each tick, on a link with a constant delay.
+    """Finds which received state an arm uses in each tick, if the delay is constant.
 
-    Sample m is the state that the sender computed in tick m. It is used from tick m + w on. The
-    number w of ticks is the same for all samples if the period of the control loop is a whole
-    number of nanoseconds. Otherwise this function must not be called.
+    Sample m is the state that the sender computed in tick (control period) m. It is used from
+    tick m + w on. The number w of ticks is the same for all samples if the period of the
+    control loop is a whole number of nanoseconds. Otherwise this function must not be called.
 
     Args:
         first: First tick of a block of ticks.
@@ -231,7 +235,7 @@ def _draw_uniform_delays(
 
 @lane_leaf
 def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -> None:
-    """Draws the random numbers that decide which of several samples the network loses.
+    """Draws random numbers that decide which of several messages a simulated network loses.
 
     Args:
         first: Index of the first sample (sent state).
@@ -246,10 +250,11 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
 
 
 class DrawAddresses(NamedTuple):
-    """Addresses of compiled functions that draw the random numbers of many samples in one call.
+    """Addresses of compiled functions that draw the random numbers of many messages at once.
 
-    The loops of these functions use vector instructions. This is possible because the compiler
-    inlines every function that they call.
+    The numbers are delays and losses in a simulated network. The loops of these functions use
+    vector instructions, which is possible because the compiler inlines every function that they
+    call.
     """
 
     delays: int
@@ -257,9 +262,10 @@ class DrawAddresses(NamedTuple):
 
 
 def find_draw_addresses() -> DrawAddresses:
-    """Returns the addresses of the functions that draw delays and losses of many samples.
+    """Returns the addresses of compiled functions that draw random network delays and losses.
 
-    The functions are compiled if their code is not stored on the disk.
+    Each call draws the numbers of many messages, which is faster than one call per message. The
+    functions are compiled if their machine code is not stored on the disk.
     """
     integer = types.int64
     number = types.float64
@@ -289,9 +295,10 @@ def _release_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes in which ticks the samples of one link model come into use at the receiver.
+    """Computes at which ticks messages of a simulated link may be used, for one delay model.
 
-    The random numbers of all samples are drawn first, in loops that use vector instructions.
+    The random numbers of all messages (samples) are drawn first, in loops that use vector
+    instructions. A tick is a control period of the receiver.
 
     Args:
         first: Index of the first sample.
@@ -377,7 +384,10 @@ def _release_all_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes in which ticks samples are released, each delayed by the model of its time.
+    """Computes at which ticks the messages of a simulated network link may be used.
+
+    Each message (sample) is delayed by the delay model that holds at its time. A tick is a
+    control period of the receiver.
 
     Args:
         first_sample: Index of the first sample, whose stamp is `states.stamps_ns[0]`.
@@ -423,7 +433,9 @@ def _release_all_samples(
 def _use_released_samples(
     first: int, count: int, newest: int, releases: IntArray, used: IntArray
 ) -> int:
-    """Finds the samples in use from the ticks in which samples are released.
+    """Finds the newest received state that may be used, for each of some control periods.
+
+    The states (samples) have been released before, each for a control period (tick).
 
     Args:
         first: First tick of the block.
@@ -458,7 +470,10 @@ def _use_samples_of_link(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Determines which sample a receiver uses in each tick, on a link of any kind.
+    """Finds which received state (sample) an arm uses in each tick, on a link of any kind.
+
+    The link is a simulated network connection with delays and losses. A tick is a control
+    period.
 
     Args:
         first: First tick of the block.
@@ -502,7 +517,10 @@ def use_samples(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Computes which sample of each peer the sites of several runs use, for a block of ticks.
+    """Finds which received state each arm uses in a block of control periods.
+
+    This is done for several simulations at once. A received state (sample) comes from a peer,
+    another arm, and is delayed by the simulated network.
 
     Args:
         first: First tick of the block.
@@ -559,7 +577,9 @@ def use_samples(
 def _use_after_delay(
     count: int, delay_ns: int, rate_hz: int, newest: int, states: LinkStates, used: IntArray
 ) -> int:
-    """Finds the samples in use on a link with a constant delay between different tick rates.
+    """Finds which received state an arm uses if its peer has another control rate.
+
+    The delay of the network link is constant.
 
     Args:
         count: Number of ticks.
@@ -593,10 +613,10 @@ def use_samples_of_rates(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Computes the same as `use_samples` for sites whose tick rates differ.
+    """Computes the same as `use_samples` for arms whose control loops have different rates.
 
-    The block contains the ticks of all sites in an interval of time. A site makes its tick
-    before a later tick of another site.
+    The block contains the control periods (ticks) of all arms in an interval of time. An arm
+    makes its tick before a later tick of another arm.
 
     Args:
         first: First tick of each site in the block, shape (N,).
@@ -699,7 +719,9 @@ def use_recorded_samples(
     state: Array,
     used: IntArray,
 ) -> int:
-    """Computes the same as `use_samples` for a run from a log, in which all arrivals are known.
+    """Finds which received state each arm uses, when a run from a log is repeated.
+
+    All arrivals are known from the log. The results have the form of `use_samples`.
 
     Args:
         first: First tick of each site in the block, shape (N,).
@@ -771,14 +793,12 @@ def repeat_deliveries(
     joints: int,
     states: Array,
 ) -> None:
-    """Brings the network links of a run up to date after its ticks were computed in a lane.
+    """Brings the simulated network links of one run up to date, so that it can continue alone.
 
-    The lanes compute the deliveries without the state of the links (`use_samples`). A run that
-    continues alone needs this state, so the links are executed again for the past ticks,
-    without the arms.
-
-    The links then have the state that a run of these ticks gives them. Samples that were
-    overwritten long ago have the wrong content, but the right index.
+    Runs that are simulated side by side (in lanes) compute the deliveries without the state of
+    the links (`use_samples`). The links are therefore executed again for the past ticks
+    (control periods), without the arms. Samples that were overwritten long ago have the wrong
+    content, but the right index.
 
     Args:
         first: First tick of each site, shape (N,).

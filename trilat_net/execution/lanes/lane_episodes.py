@@ -49,7 +49,9 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Computes which samples all runs use in their next ticks, which differ from lane to lane.
+    """Finds which received states the arms of all runs use in their next control periods.
+
+    The runs are simulated side by side (in lanes), and each is at a control period of its own.
 
     Args:
         runs: Number of runs.
@@ -140,7 +142,9 @@ def _run_span(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Simulates several runs for some ticks, like `run_block` but with a clock for each run.
+    """Simulates several runs side by side for some control periods, each at its own time.
+
+    `run_block` does the same for runs that all are at the same time.
 
     Args:
         first: First tick of each run, shape (LANES,).
@@ -259,7 +263,12 @@ class LaneEpisodes(LaneRun):
     def __init__(
         self, run: FusedRun, count: int, *, hand_site: int, hand_row: int, period_ticks: int
     ) -> None:
-        """Fills all lanes with the same run, until `load` replaces it by the first episodes."""
+        """Allocates the arrays for several episodes that are simulated side by side.
+
+        An episode is one simulated run in which a program, for example a learning policy, moves
+        an arm. All places (lanes) first hold copies of the same run, until `load` replaces
+        them.
+        """
         super().__init__([run] * count)
         self.structure = self.find_structure(run)
         self.ticks = np.zeros(LANES, np.int64)
@@ -281,12 +290,19 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def find_structure(run: FusedRun) -> RunStructure:
-        """Returns the properties in which all runs must agree, which exclude the duration."""
+        """Returns the properties in which runs must agree to be simulated side by side.
+
+        Examples are the number of joints and the control laws. Durations may differ, because an
+        episode (simulated run) that ends is replaced by a new one.
+        """
         return find_structure(run)._replace(duration_s=0.0)
 
     @staticmethod
     def explain_hand(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Returns why the actions of a program cannot be computed in lanes, or "" if they can.
+        """Explains why the actions of a program that moves an arm need a slower simulation.
+
+        Episodes are faster if several are simulated side by side, but this supports only some
+        actions. The explanation is "" if the actions are supported.
 
         Args:
             rules: Limits of the program's hand.
@@ -299,9 +315,10 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: FusedRun, hand_site: int) -> str:
-        """Returns why a run cannot be computed together with others, or "" if it can.
+        """Explains why a run cannot be simulated side by side with others; "" if it can.
 
-        The function finds the answer by compiling the code.
+        The function finds the answer by compiling the code of the simulation, which can take
+        seconds.
 
         Args:
             run: The run before its first tick.
@@ -313,9 +330,10 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
-        """Starts a new episode: copies the state of a run into a lane, over the run before.
+        """Starts a new episode of reinforcement learning in place of one that has ended.
 
-        A lane is the place of one of the runs that are simulated together.
+        Several episodes (simulated runs) advance side by side, and each has a place in common
+        arrays (its lane). The function copies the initial state of the new run into the place.
 
         Args:
             lane: Index of the lane.
@@ -438,7 +456,7 @@ class LaneEpisodes(LaneRun):
         self._step_span(count, idle)
 
     def _step_span(self, count: int, idle: IntArray) -> None:
-        """Simulates all runs for some ticks, with the actions of their programs.
+        """Simulates all runs for some control periods, with the actions of their programs.
 
         Args:
             count: Number of ticks.
@@ -507,11 +525,17 @@ class LaneEpisodes(LaneRun):
 
     @property
     def has_ended(self) -> NDArray[np.bool_]:
-        """True for runs that ended because an arm left its limits, shape (runs,)."""
+        """Tells which of the simulated runs ended early because an arm left its safety limits.
+
+        The array has the shape (runs,), with True for a run that ended.
+        """
         return self._ended.ticks[: len(self.runs)] >= 0
 
     def read_site(self, name: str) -> NDArray[Any]:
-        """Returns one quantity of all sites in all runs, shape (N, runs, numbers).
+        """Returns one quantity of all N sites (controllers of one arm each) in all runs.
+
+        The array has the shape (N, runs, numbers). For "q", for example, the numbers are the
+        angles of the joints.
 
         Args:
             name: Name of the quantity, a field of `SiteRow`, for example "q".
@@ -520,9 +544,10 @@ class LaneEpisodes(LaneRun):
         return self._read(self._site, self._ended.site_rows, self._layout.site, name, dtype)
 
     def read_links(self, name: str, i: int) -> NDArray[Any]:
-        """Returns one quantity of the links over which site `i` receives, in all runs.
+        """Returns one quantity of the network links over which site `i` receives, in all runs.
 
-        The shape is (P, runs, numbers), for links from P other sites.
+        A site is the controller of one arm. The array has the shape (P, runs, numbers), for
+        links from P other sites.
         """
         dtype: Any = self._layout.link.fields[name][0]  # type: ignore[index]
         rows = slice(i * self._structure.peers, (i + 1) * self._structure.peers)

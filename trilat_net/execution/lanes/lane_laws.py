@@ -47,7 +47,7 @@ NO_LAW = "none"
 
 
 class LaneLaw(NamedTuple):
-    """Properties of a site's compiled control law on which the code of its tick depends.
+    """Properties of a control law on which the compiled code of a simulation depends.
 
     Runs for which these properties are equal share the code.
 
@@ -97,9 +97,10 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
 
 
 def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
-    """Returns the properties of a site's law on which the compiled code of its tick depends.
+    """Returns the properties of a control law on which compiled code of a simulation depends.
 
-    Runs with equal properties can be simulated together by the same code.
+    Several runs can be simulated side by side by the same code only if these properties are
+    equal.
 
     Args:
         law: The law. None if the law of the site (arm controller) is a part of the kernel.
@@ -145,7 +146,7 @@ class LawCode(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of the type in symbols of machine code."""
+        """Name of this type in the names of compiled functions, which Numba needs."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return "LawCode", (f"c{digest[:16]}",)
 
@@ -290,7 +291,11 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
         received: Any,
         sent: Any,
     ) -> None:
-        """Form of `compute_law` for this law."""
+        """Calls the control law of this site, with the arguments of `compute_law`.
+
+        The type of the first argument selects the law when the code is compiled. The argument
+        itself has no value.
+        """
         s = site[0]
         if s.mode == _DIVERGED:
             return

@@ -99,13 +99,20 @@ class LaneTable(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of the type in symbols of machine code, without characters of its full name."""
+        """Name of this type in the names of compiled functions, which Numba needs.
+
+        The full name of the type has characters that such a name must not contain.
+        """
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return type(self).__name__, (f"l{digest[:16]}",)
 
     @property
     def count(self) -> int:
-        """Number of rows that have fields of their own that are equal in all lanes."""
+        """Number of records whose constant fields the compiler knows one by one.
+
+        A field is constant if it is the same in all simulated runs (lanes), for example the
+        kind of a network link.
+        """
         return len(self.constants)
 
 
@@ -120,25 +127,42 @@ class _PartOfTable(LaneTable):
 
 
 class RowsInLane(_PartOfTable):
-    """Numba's type of all rows that belong to one lane, for example of all links of an arm."""
+    """Numba type of an array of records of one simulation, for example of all links of a site.
+
+    Several runs are simulated side by side (each in one lane). The same numbers of all runs are
+    adjacent in memory, and this type selects those of a single run.
+    """
 
 
 class LaneRow(_PartOfTable):
-    """Numba's type of one row in one lane, which functions use like the row of a single run."""
+    """Numba type of one record of one simulation, whose fields compiled code reads by name.
+
+    Several runs are simulated side by side (each in one lane), with the same numbers of all
+    runs adjacent in memory. The type hides this arrangement, so that the same source code works
+    for a run that is simulated alone.
+    """
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the field with this name, or None if the row has none."""
+        """Returns the position and type of a field of the record, such as "q", by its name.
+
+        Returns None if the record has no such field.
+        """
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field if it is the same in all lanes, else None."""
+        """Returns the value of a field that is the same in all runs, and known to the compiler.
+
+        The compiler then inserts the value into the machine code, and removes branches that the
+        value excludes. Returns None if the field can differ between the runs.
+        """
         return dict(self.constants[0]).get(name)
 
 
 class LaneNumbers(types.Type):
-    """Numba's type of an array with one integer per lane, such as the present tick.
+    """Numba type of an array with one integer for each of several runs simulated side by side.
 
-    A value of this type is a pointer to the first integer.
+    An example is the number of the present control period of each run. In machine code, a value
+    of this type is a pointer to the first integer.
     """
 
     in_lanes = True
@@ -148,7 +172,7 @@ class LaneNumbers(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of the type in symbols of machine code."""
+        """Name of this type in the names of compiled functions, which Numba needs."""
         return "LaneNumbers", (f"n{LANES}",)
 
 
@@ -232,11 +256,12 @@ def _find_number(
 
 @lower_getattr_generic(LaneRow)
 def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
-    """Generates LLVM code for reading `row.field` of a row in one lane.
+    """Generates LLVM code that reads a field of a record of one simulation, as `row.field`.
 
-    Numba calls this function when it compiles such an expression. The result is a constant if
-    the field is equal in all lanes, a number if the field is a single number, and otherwise an
-    array whose numbers are `LANES` numbers apart in memory.
+    Numba calls this function when it compiles such an expression. Several runs are simulated
+    side by side, each in one lane. The result is a constant if the field is equal in all lanes,
+    a number if the field is a single number, and otherwise an array whose numbers are `LANES`
+    numbers apart in memory.
 
     Args:
         context: Numba's context of the compilation.
@@ -303,7 +328,7 @@ def _find_row(
     index: Any,
     row_type: Any,
 ) -> Any:
-    """Generates LLVM code for `rows[index]`, the row with an index, in one lane.
+    """Generates LLVM code for `rows[index]`: one record of one of several simulations.
 
     Args:
         context: Numba's context of the compilation.
@@ -371,10 +396,10 @@ def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
 
 @intrinsic(prefer_literal=True)
 def _select_row(_context: Any, rows: Any, index: Any) -> Any:
-    """Generates LLVM code for a row whose index is a constant.
+    """Generates LLVM code for `rows[index]` with a constant index.
 
-    Only then does the compiler know the constant fields of this row, such as the kind of an
-    operator, and can remove the branches for other kinds.
+    Only then does the compiler know the constant fields of this record (row), such as the kind
+    of an operator, and can remove the branches for other kinds.
     """
     if not isinstance(index, types.IntegerLiteral):
         return None
@@ -450,9 +475,10 @@ def allocate_words(rows: int, row_length: int) -> Words:
 
 
 def read_words(rows: NDArray[Any]) -> Words:
-    """Returns the numbers of structured rows as integers with the same bits ("words").
+    """Returns the numbers of structured records as integers with the same bits ("words").
 
-    The shape is (rows, numbers of a row).
+    Numbers of all types can then be copied by the same code. The shape is (rows, numbers of a
+    row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

@@ -168,10 +168,10 @@ def list_argument_types(
     site: SiteStructure,
     clock: types.Type = types.int64,
 ) -> tuple[Any, ...]:
-    """Returns Numba's types of the arguments with which the tick of a site is compiled.
+    """Returns the Numba types for which the code of one control period is compiled.
 
     The types contain everything that the compiled code depends on: the layouts of the arrays,
-    and properties that are equal in all runs, such as the kinds of the operators.
+    and properties that are equal in all simulated runs, such as the kinds of the operators.
 
     Args:
         layout: Data types and lengths of the arrays.
@@ -216,7 +216,9 @@ def list_argument_types(
 
 
 def _type_numbers(count: int, rows: int) -> LaneTable:
-    """Returns Numba's type of a table whose rows contain one vector, `numbers`.
+    """Returns the Numba type of a table in which every row is a vector of numbers.
+
+    Compiled code addresses this vector as the field `numbers` of a row.
 
     Args:
         count: Count of numbers.
@@ -226,7 +228,11 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
 
 
 def choose_code(layout: LaneLayout) -> Callable[..., None]:
-    """Returns the function that computes a tick in lanes, for planar arms or for chains."""
+    """Returns the compiled function that advances several simulated runs by one control period.
+
+    There is one function for planar arms with two joints, and one for chains of joints from a
+    URDF file. The layout of the arrays decides which one is returned.
+    """
     return advance_site if layout.chain is None else advance_chain_site
 
 
@@ -274,7 +280,9 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
 
 
 def read_assembly(run: FusedRun, i: int) -> str:
-    """Returns the machine code of the ticks of a site as text, in which tests look for vectors.
+    """Returns the machine code for one arm as text, in which tests look for vectors.
+
+    Vector instructions must be found there, because the simulation is slow without them.
 
     Args:
         run: The run.
@@ -288,7 +296,7 @@ def read_assembly(run: FusedRun, i: int) -> str:
 
 @leaf
 def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
-    """Copies records from the lanes to arrays of each run.
+    """Copies the results of several simulations from common arrays to an array of each.
 
     Args:
         first: First tick of each site, shape (N,).
@@ -341,7 +349,7 @@ class _LinksOfRun:
     def set_pending(
         self, ticks: IntArray, links: NDArray[Any], states: Array, received: Array
     ) -> None:
-        """Stores the results of the latest ticks, with which the links can be updated later.
+        """Stores the latest results of a simulation, to update its network links later.
 
         Args:
             ticks: Number of ticks that each site has made.
@@ -589,7 +597,10 @@ class LaneRun:
             self._write_back(lane, self.runs[lane], until_s)
 
     def _use_samples(self, end: IntArray) -> int:
-        """Finds the samples that are used in a block of ticks, see `use_samples`.
+        """Finds which received state of its peers each site uses, in some control periods.
+
+        The delays of the network decide this. A site is the controller of one arm, a peer is
+        another site, and a tick is a control period; see `use_samples`.
 
         Args:
             end: Tick of each site after the block, shape (N,).
@@ -620,7 +631,10 @@ class LaneRun:
         )
 
     def _find_block_end(self, ticks: IntArray) -> IntArray:
-        """Returns the tick of each site after the next block, an interval of time.
+        """Returns the control period (tick) at which each site is at the end of the next block.
+
+        The sites (controllers of one arm each) may have different rates. A block is an interval
+        of time that all sites simulate before samples are exchanged.
 
         Args:
             ticks: Number of ticks of each site after all blocks.
@@ -637,7 +651,7 @@ class LaneRun:
         return np.clip(end, self._ticks, ticks)
 
     def _step_to(self, ticks: IntArray) -> None:
-        """Simulates all runs until they have made a number of ticks, or have ended.
+        """Continues all simulations to a number of control periods, or until all have ended.
 
         Args:
             ticks: Number of ticks of each site since the start of the runs, shape (N,).
@@ -692,9 +706,10 @@ class LaneRun:
             self._used_records[i][:, lanes, positions] = self._used[i][:, lanes, kept]
 
     def _list_present(self) -> EndedRuns:
-        """Returns the present state of all runs, as views.
+        """Returns the present state of all simulated runs, as views that share their memory.
 
-        `keep_ended_runs` copies the state of a run at the moment at which it ends.
+        When a run ends early, `keep_ended_runs` copies its state from these views, because the
+        arrays are overwritten while the other runs continue.
         """
         return EndedRuns(
             ticks=self._ended.ticks,
@@ -755,9 +770,10 @@ class LaneRun:
         self.runs = [self.runs[lane] for lane in lanes]
 
     def _widen_peaks(self, buckets: int) -> None:
-        """Enlarges the memory for the largest values in intervals of 50 ms (buckets).
+        """Enlarges the arrays that hold the largest values of each interval of 50 ms.
 
-        -1 marks an interval in which no tick has been executed.
+        The arrays must have room for all intervals up to the end of the simulation. New entries
+        are -1, which marks an interval in which no control period has been executed.
         """
         wider = allocate_words(self._sites * buckets, self._layout.columns)
         peaks = wider.reshape(self._sites, buckets, self._layout.columns, LANES)
@@ -851,10 +867,11 @@ class LaneRun:
             )
 
     def _write_sent(self, lane: int, run: FusedRun) -> None:
-        """Writes the latest samples of a lane into the records of its run.
+        """Copies the latest sent states of one run from common arrays into its own records.
 
-        A slow site accepts several samples of a faster peer at once. A run that continues alone
-        reads from the records the samples that no site has accepted yet.
+        Several runs are simulated side by side, each in one lane. A slow site (arm controller)
+        accepts several samples (sent states) of a faster peer at once. A run that continues
+        alone reads from its records the samples that no site has accepted yet.
 
         Args:
             lane: The lane.
@@ -884,7 +901,9 @@ class LaneRun:
 def _find_recorded_hands(
     feed: ReplayedInputs, actor: np.dtype[Any], most_sources: int
 ) -> RecordedHands:
-    """Returns what live operators did in a recorded run.
+    """Returns the torques or targets with which live operators moved arms in a recorded run.
+
+    A repetition of the run applies them again at the same control periods.
 
     Args:
         feed: Inputs of the recorded run.
@@ -904,14 +923,19 @@ def _find_recorded_hands(
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
-    """Returns an array of shape (N, rows, columns) as N structured rows, without copying it."""
+    """Returns an array of floats as structured records whose fields have names.
+
+    The array has the shape (N, rows, columns) for N sites. The records share its memory, so
+    that assigning to a field changes the array.
+    """
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the part of an array that belongs to one site.
+    """Returns the part of an array that belongs to one site (controller of one arm).
 
-    The array contains the rows of all sites one after another, equally many for each site.
+    The array contains the rows of all sites one after another, equally many for each site. For
+    example, site 1 of 3 has the rows 2 and 3 of 6.
     """
     rows = len(table) // sites
     return table[i * rows : (i + 1) * rows]
@@ -926,7 +950,7 @@ def _check_distinct(tables: SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured rows by numbers given as integers with the same bits ("words").
+    """Overwrites structured records by numbers given as integers with the same bits.
 
     Args:
         rows: The rows; written.
@@ -937,7 +961,9 @@ def put_rows(rows: NDArray[Any], numbers: Words) -> None:
 
 
 def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
-    """Writes how far the sites of a run are, after a number of ticks.
+    """Sets the number and time of the next control period (tick) of each site of a run.
+
+    The time is "never" for a site that has executed all its control periods, see `ProgressRow`.
 
     Args:
         progress: Rows of all sites, see `ProgressRow`; written.
@@ -954,7 +980,9 @@ def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
 
 
 def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns the indices of a field's numbers among all numbers of a row.
+    """Returns where the numbers of a field, such as "q", lie in a record.
+
+    They are given as indices among all numbers of the record (row).
 
     Args:
         layout: Data type of the row.

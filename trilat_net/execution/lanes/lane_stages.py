@@ -193,9 +193,9 @@ def advance_site(
     columns: IntArray,
     table: TorqueTable,
 ) -> None:
-    """Computes one tick of a site for several runs.
+    """Computes one control period of an arm for several simulations that run side by side.
 
-    All tables have a lane for each run. No two of them overlap in memory.
+    All arrays have a place (lane) for each simulation. No two of them overlap in memory.
 
     Args:
         k: The tick, of all lanes or of each lane, see `number_of`.
@@ -472,7 +472,7 @@ class EndedRuns(NamedTuple):
 
 @leaf
 def copy_lane(lane: int, source: Words, target: Words) -> None:
-    """Copies all numbers of one run from one array of several runs to another.
+    """Copies the state of one simulation from one array of several simulations to another.
 
     Args:
         lane: Index of the run (its lane).
@@ -537,7 +537,9 @@ def keep_ended_runs(
 
 
 class RecordedHands(NamedTuple):
-    """What live operators did in a recorded run, see `ReplayedInputs`.
+    """Torques or targets with which live operators moved the arms in a recorded run.
+
+    A repetition of the run applies them again, see `ReplayedInputs`.
 
     Attributes:
         actions: Numbers of the operators, shape (N, ticks, C).
@@ -556,7 +558,9 @@ class RecordedHands(NamedTuple):
 def _apply_recorded_hand(
     i: int, k: int, lanes: int, hands: RecordedHands, actors: Array
 ) -> None:
-    """Repeats what the live operator of a site did in a tick of a recorded run, in all lanes.
+    """Moves an arm as its operator did in a recorded run, in a control period of all copies.
+
+    The copies of the run are simulated side by side (in lanes).
 
     Args:
         i: Index of the site.
@@ -598,7 +602,7 @@ def run_block(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Simulates several runs for a block of ticks, or until all of them have ended.
+    """Simulates several runs side by side for some control periods, or until all end.
 
     Args:
         first: First tick of each site in the block, shape (N,).

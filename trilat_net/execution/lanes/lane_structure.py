@@ -85,7 +85,7 @@ def _list_actors(actors: Any) -> list[Any]:
 
 
 def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
-    """Returns why a run cannot be computed together with other runs, for a message to the user.
+    """Explains why a run cannot be simulated side by side with other runs, for the user.
 
     Args:
         run: The run before its first tick (control period).
@@ -152,7 +152,9 @@ def find_structure(run: FusedRun) -> RunStructure:
 
 
 def describe_structure(run: FusedRun) -> Hashable:
-    """Returns a key for sorting runs into groups, equal for runs that differ in numbers only.
+    """Returns a key for sorting runs into groups that can be simulated side by side.
+
+    The key is equal for runs that differ in numbers only, such as gains.
 
     Args:
         run: The run before its first tick.

@@ -53,7 +53,9 @@ _LLVM_KINDS = {
 
 
 class LaneVector(types.Type):
-    """Numba's type of eight numbers, one for each of eight runs, in one vector register.
+    """Numba type of eight numbers, one for each of eight runs, in one vector register.
+
+    One SIMD instruction then computes a number of all eight runs.
 
     Args:
         kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.
@@ -67,16 +69,25 @@ class LaneVector(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of the type in symbols of machine code."""
+        """Name of this type in the names of compiled functions, which Numba needs."""
         return "LaneVector", (self.kind,)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """Lets Numba use one number, equal in all runs, where eight floats are needed."""
+        """Tells Numba that one number may stand where a vector of eight floats is needed.
+
+        The number is then repeated eight times. Returns None, which forbids the conversion, for
+        vectors of integers or conditions, and for values that are not numbers.
+        """
         is_number = isinstance(other, types.Float | types.Integer)
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """Makes a variable a vector if one branch assigns a vector and another a number."""
+        """Returns the type of a variable that gets a vector in one branch, else a number.
+
+        Numba requires a single type per variable. It is this vector type, so that the number is
+        repeated for all eight runs. Returns None, which is an error of compilation, if the
+        vector does not contain floats or if the other value is not a number.
+        """
         is_number = isinstance(other, types.Float | types.Integer)
         return self if is_number and self.kind == "f8" else None
 
@@ -319,24 +330,40 @@ class _GroupType(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of the type in symbols of machine code."""
+        """Name of this type in the names of compiled functions, which Numba needs."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return type(self).__name__, (f"g{digest[:16]}",)
 
 
 class RowsInGroup(_GroupType):
-    """Numba's type of all rows that belong to eight adjacent lanes."""
+    """Numba type of an array of records of eight simulations, for SIMD vector instructions.
+
+    Eight runs (lanes) are simulated side by side. Indexing the array, for example with the
+    number of a network link, gives a `RowInGroup`: the record of this link in all eight runs.
+    """
 
 
 class RowInGroup(_GroupType):
-    """Numba's type of one row in eight adjacent lanes, whose numbers are `LaneVector`."""
+    """Numba type of one record of eight simulations at once, for SIMD vector instructions.
+
+    A record (row) holds for example the state of one arm. Eight runs (lanes) are simulated side
+    by side, so that a field of the row, such as an angle, is a vector of eight numbers
+    (`LaneVector`), one per run.
+    """
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the field with this name, or None if the row has none."""
+        """Returns the position and type of a field of the record, such as "q", by its name.
+
+        Returns None if the record has no such field.
+        """
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field if it is the same in all lanes, else None."""
+        """Returns the value of a field that is the same in all runs, and known to the compiler.
+
+        The compiler then inserts the value into the machine code, and removes branches that the
+        value excludes. Returns None if the field can differ between the runs.
+        """
         return dict(self.constants[0]).get(name)
 
 

@@ -32,7 +32,9 @@ site tick.
 
 
 class RunGroup:
-    """Some runs that are simulated together: with vector instructions, or one after the other.
+    """Several simulations that advance together, by vector instructions where possible.
+
+    Otherwise they are computed one after the other.
 
     Args:
         members: Indices of the runs in the sequence that was divided into groups.
@@ -63,7 +65,7 @@ class RunGroup:
         self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the runs until they are as long as a run of `until_s` seconds.
+        """Continues the simulated runs of the group up to a time. Calls may follow one another.
 
         Args:
             until_s: The time, s, later than that of the previous call.
@@ -81,7 +83,9 @@ class RunGroup:
             run.advance_to(until_s)
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Continues with some of the runs only, so that no time is spent on the others.
+        """Continues with some of the runs only, so that no time is spent on other runs.
+
+        A search for the best gains, for example, drops runs that are already worse than others.
 
         Args:
             chosen: Indices in `members` of the runs that continue, in ascending order. No arm

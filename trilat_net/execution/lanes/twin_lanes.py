@@ -27,7 +27,7 @@ from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
-    """Error if a run and its displaced copies (twins) cannot be simulated together any more.
+    """Error: a run and its displaced copies (twins) can no longer be simulated together.
 
     The reason is that an arm left its limits, or that a control law failed. The caller then
     simulates the runs again, one by one.
@@ -55,7 +55,9 @@ def suits_twins(run: FusedRun, runs: int, ticks: Sequence[int], least_site_ticks
 
 
 class TwinLanes(LaneRun):
-    """A run and its twins (slightly displaced copies), each in a lane. The run is in lane 0.
+    """A run and slightly displaced copies of it (twins), simulated side by side.
+
+    The run has the index (lane) 0.
 
     Args:
         run: The run before its first tick (control period), which does not advance. See
@@ -74,7 +76,11 @@ class TwinLanes(LaneRun):
         feed: ReplayedInputs,
         kept: int,
     ) -> None:
-        """Copies the initial state of the run into the lanes of the run and of all twins."""
+        """Copies the initial state of a run into the arrays of the run and its twins.
+
+        The twins are copies that are later displaced slightly, to measure whether the
+        difference grows, as it does in an unstable system.
+        """
         super().__init__([run], 1 << kept.bit_length())
         self._count = count
         self._feed = feed
@@ -94,7 +100,9 @@ class TwinLanes(LaneRun):
         self._changing = floats
 
     def step_to(self, last_ns: int) -> None:
-        """Executes all planned ticks (control periods) of the run and its twins up to a time.
+        """Continues a run and its displaced copies (twins) up to a time, tick by tick.
+
+        A tick is a control period.
 
         Args:
             last_ns: Time of the last tick to be executed, ns since the epoch.
@@ -137,14 +145,18 @@ class TwinLanes(LaneRun):
         return age
 
     def read_times(self, i: int) -> IntArray:
-        """Returns the times of the ticks of site i in the last call of `step_to`, ns."""
+        """Returns the times of the control periods of site `i` in the last call of `step_to`.
+
+        The times are in ns since the common start of the sites. A site is the controller of one
+        arm.
+        """
         # The equation of `tick_ns`.
         ticks = np.arange(self._last_ticks[i], self._ticks[i])
         times_ns: IntArray = ticks * NS_PER_S // self._rates_hz[i]
         return times_ns
 
     def read_records(self, i: int, columns: slice, runs: slice) -> Array:
-        """Returns numbers of the ticks that the last call of `step_to` executed.
+        """Returns results of the control periods that the last call of `step_to` executed.
 
         Args:
             i: Index of the site (arm controller).
@@ -161,7 +173,10 @@ class TwinLanes(LaneRun):
 
 
 class LaneTwin:
-    """One of the runs in `TwinLanes`, with those methods of `FusedRun` that twins need.
+    """A run or a slightly displaced copy of it (twin), simulated side by side with others.
+
+    The class has those methods of `FusedRun` with which the growth of the displacement is
+    measured, so that callers need not know how the runs are simulated.
 
     Args:
         lanes: The run and its twins.
@@ -176,7 +191,11 @@ class LaneTwin:
         self._lane = lane
 
     def copy_state(self, other: "LaneTwin") -> None:
-        """Makes this run continue from exactly the same state as another run."""
+        """Makes this run continue from exactly the same state as another run.
+
+        The other run belongs to the same simulation. Both then give the same results, until one
+        of them is displaced.
+        """
         self.scale_difference(other, 0.0)
 
     def scale_difference(self, other: "LaneTwin", factor: float) -> None:
@@ -198,13 +217,20 @@ class LaneTwin:
         _scale(mine, states[:, :, other._lane], np.full(mine.shape, True), factor)
 
     def displace(self, field: str, offsets: Array) -> None:
-        """Adds offsets to one field of the state of all sites, see `FusedRun.displace`."""
+        """Adds small offsets to one field of the state of all sites, such as the angles "q".
+
+        The measured growth of the resulting difference shows whether the system is stable. For
+        the shape of the offsets see `FusedRun.displace`.
+        """
         columns = self._find_columns(field)
         words = slice(columns.start, columns.start + offsets.shape[1])
         self._lanes._site.view(np.float64)[:, words, self._lane] += offsets
 
     def measure_distance(self, other: "LaneTwin", field: str) -> float:
-        """Returns the largest difference of a field, see `FusedRun.measure_distance`."""
+        """Returns the largest absolute difference of one field, such as "q", between two runs.
+
+        For the fields and units see `FusedRun.measure_distance`.
+        """
         numbers = self._lanes._site.view(np.float64)[:, self._find_columns(field)]
         difference = numbers[:, :, self._lane] - numbers[:, :, other._lane]
         return float(np.abs(difference).max())

@@ -68,7 +68,7 @@ class MessageRun(NamedTuple):
 
 
 def allocate_run(slots: int, messages: int = 1) -> MessageRun:
-    """Returns empty arrays for the messages that one call of `walk_messages` finds.
+    """Returns empty arrays that receive the messages of one call of `walk_messages`.
 
     Args:
         slots: Number of slots, the small numbers that stand for channels.

@@ -69,7 +69,7 @@ class IndexedRecords:
         marks: NDArray[np.int32],
         counts: NDArray[np.int32],
     ) -> None:
-        """Stores the records, and where `index_records` has found their values."""
+        """Stores encoded records, with the positions of their values from `index_records`."""
         self.messages = messages
         self._peers = peers
         self._layout = layout
@@ -82,7 +82,7 @@ class IndexedRecords:
         return len(self.messages)
 
     def select(self, rows: Ints | slice) -> "IndexedRecords":
-        """Returns some of the records, or all of them in another order.
+        """Returns some of the records, or all of them in another order, without decoding them.
 
         Args:
             rows: Indices of the records, or a slice.
@@ -99,32 +99,33 @@ class IndexedRecords:
 
     @property
     def ticks(self) -> Ints:
-        """Tick of each record, shape (K,)."""
+        """Number of the control period (tick) of each of the K records, shape (K,)."""
         return np.ascontiguousarray(self._heads[:, _TICK])
 
     @property
     def boots(self) -> Ints:
-        """Number that identifies the start of the process (boot) in each record, shape (K,).
+        """Random number that identifies the start of the process in each record, shape (K,).
 
-        It is an unsigned number of 64 bits, given as the signed number with the same bits.
+        A restarted process has another number. It has 64 bits and no sign, but is given as the
+        signed number with the same bits.
         """
         return self._heads[:, _BOOT]
 
     @property
     def mode_codes(self) -> Ints:
-        """Number of the operating mode in each record, shape (K,), see `Mode`."""
+        """Code of the controller's operating mode in each record, shape (K,), see `Mode`."""
         return self._heads[:, _MODE]
 
     @property
     def modes(self) -> NDArray[np.object_]:
-        """Name of the operating mode in each record, such as "run", shape (K,)."""
+        """Name of the controller's operating mode in each record, such as "run", shape (K,)."""
         bits = np.empty(max(map(int, MODE_WORDS)) + 1, np.object_)
         for mode, word in MODE_WORDS.items():
             bits[int(mode)] = word
         return bits[self.mode_codes]
 
     def ints(self, field: str) -> Ints:
-        """Returns an integer field of each record, shape (K,).
+        """Returns one integer field of all K records as an array of the shape (K,).
 
         Args:
             field: Name of the field, one of `_INTS`.
@@ -134,11 +135,11 @@ class IndexedRecords:
         return np.ascontiguousarray(self._gather_ints(mark, gaps)[:, -1])
 
     def has_ints(self, field: str) -> bool:
-        """True if a field of the records is an integer that `ints` can read."""
+        """True if the records have an integer field of this name, which `ints` can read."""
         return field in _INTS
 
     def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
-        """Returns integers that follow a position (mark) in each record.
+        """Reads integers at known distances behind a position in each encoded record.
 
         The result has the shape (K, number of gaps). A gap is the number of bytes before an
         integer.
@@ -155,21 +156,22 @@ class IndexedRecords:
 
     @property
     def used(self) -> Ints:
-        """Which sample of each peer the control law used in each tick, shape (K, P).
+        """Which received state of each peer the control law used in each record, shape (K, P).
 
-        A peer is another site, and a sample is the state that it sent in one tick. The number
-        of that tick is given for each of P peers, or -1 before the first sample.
+        A peer is another arm controller (site), which sends a state (sample) in each tick
+        (control period). The number of that tick is given for each of P peers, or -1 before the
+        first sample.
         """
         peers = self._exact.peers
         lengths = self._exact.lengths
         return self._gather_ints(record_scan.USED, lengths[len(lengths) - peers :].tolist())
 
     def vector_words(self, fields: Sequence[str]) -> Ints:
-        """Returns the bits of all numbers of some vectors, shape (K, numbers).
+        """Returns some vectors of all K records as bits, to compare records bit by bit.
 
-        Bits are returned because equal bits mean equal numbers, also for NaN and signed zeros.
-        Compiled code reads the numbers at fixed distances after a position in each record, the
-        mark. The vectors lie after one of two marks. Therefore the numbers are read in up to
+        The shape is (K, numbers). Equal bits mean equal numbers, also for NaN and signed zeros.
+        Compiled code reads the numbers at fixed distances after a known position (mark) in each
+        encoded record. A record has two such positions, so that the numbers are read in up to
         two groups.
 
         Args:
@@ -200,9 +202,9 @@ class IndexedRecords:
         return bits
 
     def _gather_floats(self, mark: int, places: Sequence[int]) -> Ints:
-        """Returns the bits of numbers at fixed offsets from a position (mark) in each record.
+        """Reads the bits of floats at fixed distances behind a position in each encoded record.
 
-        The result has the shape (K, count of offsets).
+        The result has the shape (K, number of distances).
         """
         bits = np.zeros((len(self), len(places)), np.int64)
         record_scan.gather_floats(
@@ -215,7 +217,7 @@ class IndexedRecords:
         return bits
 
     def _vector_places(self) -> dict[str, tuple[int, int, int]]:
-        """Returns where the vectors lie in a record, by their names.
+        """Returns where the vectors, such as joint angles, lie in an encoded record, by name.
 
         Returns:
             For each vector: the column of `marks` with the position from which its offset
@@ -238,7 +240,7 @@ class IndexedRecords:
         return places
 
     def vectors(self, fields: Sequence[str]) -> dict[str, Array]:
-        """Returns some vectors of each record.
+        """Reads some vectors, such as joint angles, from all encoded records.
 
         Args:
             fields: Names of the vectors.
@@ -276,7 +278,10 @@ class IndexedRecords:
 
     @property
     def change_counts(self) -> NDArray[np.int32]:
-        """Number of texts in the field `cmd` of each record, shape (K,)."""
+        """Number of changes of settings that each record contains, shape (K,).
+
+        They are the strings of the field `cmd`. Most records contain none.
+        """
         return self._counts[:, record_scan.CHANGE_COUNT]
 
     @property
@@ -299,7 +304,10 @@ class IndexedRecords:
 
     @property
     def memories(self) -> NDArray[np.object_]:
-        """Field `mem` of each record as a list of numbers, shape (K,)."""
+        """Internal state of the control law in each record, as lists of numbers, shape (K,).
+
+        It is the field `mem` of a record, which a simulation needs to continue from the record.
+        """
         counts, bits = self.memory_words
         numbers = bits.view(np.float64).tolist()
         lists = np.empty(len(self), np.object_)

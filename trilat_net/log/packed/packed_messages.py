@@ -45,7 +45,7 @@ class PackedMessages(Sequence[bytes]):
 
     @classmethod
     def pack(cls, payloads: Sequence[bytes]) -> "PackedMessages":
-        """Stores messages in one block of bytes.
+        """Stores encoded messages in one block of bytes, which needs little memory.
 
         Args:
             payloads: The encoded messages. Packed messages are returned unchanged.
@@ -59,7 +59,7 @@ class PackedMessages(Sequence[bytes]):
         return cls(data, starts, ends)
 
     def select(self, rows: Ints | slice) -> "PackedMessages":
-        """Returns some of the messages, in any order. Their bytes are not copied.
+        """Returns some of the messages, in any order, without copying their bytes.
 
         Args:
             rows: Index of each message in this sequence, or a slice.

@@ -76,7 +76,7 @@ _SIZES = _list_sizes()
 
 @leaf
 def _read_int(data: Bytes, offset: int) -> int:
-    """Decodes the integer (MessagePack) that begins at an offset.
+    """Decodes the integer that begins at an offset, in the binary format MessagePack.
 
     The result is a signed number of 64 bits. An unsigned number of 2^63 or more becomes the
     negative number with the same bits.
@@ -98,9 +98,9 @@ def _read_int(data: Bytes, offset: int) -> int:
 
 @leaf
 def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the offset after a literal, the constant bytes between two values of a record.
+    """Returns the offset after constant bytes that every encoded record has at this point.
 
-    The result is -1 if the record has other bytes there.
+    The result is -1 if the record has other bytes there, so that it must be decoded otherwise.
     """
     after: int = offset + layout.lengths[literal]
     if after > end:
@@ -115,7 +115,7 @@ def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any
 
 @leaf
 def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the offset of the integer that follows some constant bytes (a literal).
+    """Returns the offset of an integer in an encoded record, after constant bytes.
 
     Args:
         data: The records.
@@ -218,7 +218,7 @@ def _after_stamps(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _after_texts(data: Bytes, offset: int, end: int) -> int:
-    """Returns the offset after a list of texts in ASCII, such as the changes of a record.
+    """Returns the offset after a list of ASCII strings, such as the changes in a record.
 
     The result is -1 if there is no such list. Other characters than ASCII are left to the
     general decoder, which checks their encoding.
@@ -254,9 +254,10 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
-    """Returns the index of the operating mode whose name begins at an offset. -1 for no mode.
+    """Returns the index of the controller's operating mode whose name begins at an offset.
 
-    A name has at most eight letters. It is compared with all names as one integer.
+    The result is -1 if no mode has this name. A name has at most eight letters, so that it is
+    compared as one integer.
     """
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED
@@ -285,7 +286,7 @@ def _mask_bytes(mask: int) -> int:
 def _scan_record(
     data: Bytes, start: int, end: int, layout: Any, heads: Ints, marks: Any, counts: Any
 ) -> bool:
-    """Checks that one record has the exact layout, and finds where its values lie.
+    """Checks that one encoded record has the expected bytes, and finds where its values lie.
 
     The arguments are those of `scan_records`, for one record from `start` to before `end`.
 
@@ -422,7 +423,7 @@ def scan_records(
 
 @loop_leaf
 def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints) -> None:
-    """Reads some integers that follow each other, such as the used samples, from each record.
+    """Reads integers that follow each other, at known positions of each encoded record.
 
     Args:
         data: The encoded records, followed by padding.
@@ -486,7 +487,9 @@ def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: I
 
 @loop_leaf
 def gather_memories(data: Bytes, starts: Ints, marks: Any, counts: Any, bits: Ints) -> None:
-    """Reads the internal state of the control law (field `mem`) from every record, as bits.
+    """Reads the internal state of the control law from every encoded record, as bits.
+
+    It is the field `mem` of a record.
 
     Args:
         data: The encoded records, followed by padding.

@@ -112,7 +112,7 @@ def _pack_stamp(stamp_ns: int) -> bytes:
 
 
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
-    """Returns the format of a list of floats, as the module `struct` defines it.
+    """Returns how a list of floats is encoded in a ROS 2 message, for the module `struct`.
 
     Args:
         offset: Position of the list, in bytes after the header.
@@ -143,7 +143,10 @@ class JointStatePacker:
     def __init__(
         self, names: Sequence[str], *, velocity: bool = True, effort: bool = True
     ) -> None:
-        """Computes the layout of the messages from the names of the joints."""
+        """Computes the positions of all fields in a `JointState` message from the joint names.
+
+        This is done once, so that encoding a message only fills in numbers.
+        """
         # The names follow the stamp of 8 bytes and an empty frame.
         frame = ""
         self._names = _pack_fields(8, frame, len(names), *names)
@@ -165,7 +168,7 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Encodes one message of the type `sensor_msgs/msg/JointState`.
+        """Encodes one `sensor_msgs/msg/JointState`, the ROS 2 message about a robot's joints.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -197,7 +200,10 @@ class TransformPacker:
     """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        """Computes the layout of the messages from the names of the frames."""
+        """Computes the positions of all fields in a transform message from the frames' names.
+
+        This is done once, so that encoding a message only fills in numbers.
+        """
         self._names: list[bytes] = []
         struct_format = "<4sI"
         # The number of transforms takes the first 4 bytes.
@@ -213,7 +219,7 @@ class TransformPacker:
         self._pack = struct.Struct(struct_format).pack
 
     def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Encodes one message of the type `tf2_msgs/msg/TFMessage`.
+        """Encodes one `tf2_msgs/msg/TFMessage`, the ROS 2 message with poses of frames.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -259,7 +265,7 @@ def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes
 
 
 def pack_string(text: str) -> bytes:
-    """Encodes a `std_msgs/msg/String`."""
+    """Encodes a ROS 2 message of the type `std_msgs/msg/String`, in the CDR format of ROS 2."""
     return _HEAD + _pack_fields(0, text)
 
 
@@ -383,7 +389,7 @@ class _CdrReader:
         self._position = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """Decodes the next numbers of the message.
+        """Decodes the next numbers of a ROS 2 message, in the CDR format of ROS 2.
 
         Args:
             code: Type of the numbers, in the notation of the module `struct`.
@@ -416,7 +422,7 @@ class _CdrReader:
         return int(count)
 
     def text(self) -> str:
-        """Decodes the next string."""
+        """Decodes the next string of a ROS 2 message, and moves on to the next field."""
         length = self.count()
         if not length:
             return ""
@@ -424,11 +430,13 @@ class _CdrReader:
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
-        """Decodes the next list of floats."""
+        """Decodes the next list of floats of a ROS 2 message, and moves to the next field."""
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Decodes a `std_msgs/msg/Header`, with which many messages begin.
+        """Decodes the time and the frame with which many ROS 2 messages begin.
+
+        Their type is `std_msgs/msg/Header`.
 
         Returns:
             The time stamp in ns on the sender's clock, and the name of the coordinate frame.

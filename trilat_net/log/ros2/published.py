@@ -97,7 +97,7 @@ def list_full_topics(scenario: Scenario, session: str, table: TopicTable) -> Top
 
 
 class SiteMessages:
-    """Encodes everything that one site publishes as messages of ROS 2.
+    """Encodes everything that one arm controller (site) publishes as ROS 2 messages.
 
     Args:
         scenario: Scenario of the session.
@@ -113,7 +113,7 @@ class SiteMessages:
     """
 
     def __init__(self, scenario: Scenario, site: str, epoch_unix_ns: int) -> None:
-        """Prepares the encoding of all messages of the site: names, frames and layouts."""
+        """Prepares the encoding of all ROS 2 messages about one arm, such as joint names."""
         self._arm = scenario.arms[site]
         self._epoch_unix_ns = epoch_unix_ns
         settings = scenario.sites[site]
@@ -224,7 +224,7 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Computes the time stamp of all messages that are made from one record.
+        """Returns the time stamp of all ROS 2 messages that are made from one record.
 
         Args:
             record: The record.
@@ -240,10 +240,9 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> NamedMessages:
-        """Converts a record of a site (arm controller) to ROS 2 messages.
+        """Converts the state of an arm in one control period to ROS 2 messages.
 
-        A record contains the state of the site in one period of its control loop: motion,
-        reference, torques and mode.
+        The state is a record of a site (arm controller): motion, reference, torques and mode.
 
         Args:
             record: The record. The records must be passed in the order of their times, because
@@ -354,7 +353,7 @@ class SiteMessages:
         pose: Sequence[float],
         stamp_ns: int,
     ) -> bytes:
-        """Encodes a pose of the end effector, as position and unit quaternion.
+        """Encodes a pose of the end effector as a ROS 2 message: position and unit quaternion.
 
         Args:
             topic: Name of the topic. Successive quaternions of a topic do not jump.
@@ -371,7 +370,7 @@ class SiteMessages:
         return self._pack_vectors(stamp_ns, position, aligned_quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
-        """Returns the position of the end effector, in m.
+        """Returns the position of the arm's end effector from a record, in m.
 
         Args:
             record: The record (result of a control period), whose joint angles are used if
@@ -433,7 +432,7 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Encodes the poses of all links of the arm in a tick, for viewers that draw the arm.
+        """Encodes the poses of all links of an arm for viewers, in one control period.
 
         Args:
             record: The record (result of a control period), which contains the joint positions.
@@ -455,7 +454,7 @@ class SiteMessages:
             yield self._pack_shared_frame(stamp_ns, numbers)
 
     def pack_statistics(self, stats: LinkStats) -> NamedMessages:
-        """Encodes the statistics of a site's links, such as ages and losses.
+        """Encodes statistics of network links, such as delays and losses, as ROS 2 messages.
 
         Args:
             stats: The statistics.
@@ -480,7 +479,7 @@ def _fill_rotation(values: Sequence[float]) -> list[float]:
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Encodes the status of all sites of a session for the ROS topic `/diagnostics`.
+    """Encodes the status of all arm controllers for the ROS 2 topic `/diagnostics`.
 
     Args:
         session: Name of the session.

@@ -48,7 +48,7 @@ _PLANAR_DOWN = (0.0, -1.0, 0.0)
 
 
 class _JointFrame(NamedTuple):
-    """A joint of the arm, which determines the frame of its child link.
+    """A joint of an arm, which determines the pose of the link that it moves (child link).
 
     Attributes:
         origin_m: Origin of the link's frame in the parent link's frame, in m.
@@ -66,7 +66,7 @@ class _JointFrame(NamedTuple):
     q_index: int
 
     def compute_transform(self, position: float) -> Transform:
-        """Computes the pose of the link relative to its parent, for a position of the joint.
+        """Computes the pose of a link relative to the link before it, by the joint's position.
 
         Args:
             position: Position of the joint, in rad or m.
@@ -288,7 +288,7 @@ class RobotModel:
         return transforms
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
-        """Encodes the poses of all frames as one message of the topic `/tf`.
+        """Encodes the poses of all links of an arm as one ROS 2 message of the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -298,7 +298,7 @@ class RobotModel:
         return self.pack_transforms(stamp_ns, transforms)
 
     def pack_transforms(self, stamp_ns: int, transforms: Iterable[FramePose]) -> bytes:
-        """Encodes computed poses as one message of the topic `/tf`.
+        """Encodes given poses of frames as one ROS 2 message of the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -371,7 +371,7 @@ def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
 
 
 def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame:
-    """Reads the frame of a joint, with the same defaults as `read_urdf`.
+    """Reads from a URDF where a joint is, with the same defaults as `read_urdf`.
 
     Args:
         joint: The joint's element in the URDF.

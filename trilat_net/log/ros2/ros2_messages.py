@@ -70,7 +70,7 @@ class Ros2Channel(NamedTuple):
     latched: bool = False
 
     def is_robot_description(self) -> bool:
-        """Returns True if the channel contains the URDF of an arm, whatever its topic is."""
+        """True if the channel contains the URDF (geometry) of an arm, whatever its topic is."""
         content = self.about.get("content")
         return self.kind == cdr.STRING and content == ROBOT_METADATA["content"]
 
@@ -93,7 +93,11 @@ class StandardChannels:
         self._channel_numbers: dict[str, int] = {}
 
     def __getitem__(self, topic: str) -> int:
-        """Returns the number of a topic's channel, and registers the channel if necessary."""
+        """Returns the number of a topic's channel in an MCAP file.
+
+        The channel is registered in the file at the first access, so that the file declares no
+        channel without messages.
+        """
         if topic not in self._channel_numbers:
             channel = self._known[topic]
             schema_number = self._get_schema_number(channel.kind)
@@ -181,7 +185,7 @@ class _ArrayChannel:
     """
 
     def __init__(self, content: str, unit: str, *entry_names: Sequence[str]) -> None:
-        """Describes the channel, and prepares the encoding of its arrays."""
+        """Describes a channel of number arrays, and prepares the encoding of its messages."""
         joined_names = [" ".join(axis_entries) for axis_entries in entry_names]
         metadata = {
             "content": content,
@@ -226,7 +230,7 @@ class Ros2SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        """Describes all channels of the site from its arm and its peers."""
+        """Describes all ROS 2 channels of a site (arm controller) and of its network links."""
         arm = scenario.arms[site]
         self._arm = arm
         self._peers = scenario.peers(site)
@@ -329,7 +333,9 @@ class Ros2SiteChannels:
         return Ros2Channel(cdr.JOINT_STATE, metadata)
 
     def _join_units(self, revolute_unit: str) -> str:
-        """Returns the units of all joints as a string, such as "rad or m".
+        """Returns the units of one quantity for all joints, such as "rad or m".
+
+        A revolute joint has an angle in rad, a prismatic joint a position in m.
 
         Args:
             revolute_unit: Unit of the quantity for a revolute joint.
@@ -480,10 +486,10 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Collects the curves that viewers draw, from some records of a site.
+    """Collects the curves that viewers draw from some records of an arm controller (site).
 
-    The curves are the joint positions q, their references q_des, the velocities qd, the
-    torques tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
+    The curves are the joint positions q, their references q_des, the velocities qd, the torques
+    tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
     theta_hat, the numbers that the control law sends, and the mode. If the sites share the pose
     x of the end effector instead, the joints have no reference. Then q is repeated in place of
     q_des, and e is x - x_des.

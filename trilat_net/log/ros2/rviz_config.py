@@ -25,7 +25,7 @@ _SUFFIX = ".rviz"
 
 
 def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
-    """Returns the configuration of RViz for the topics of a session or a bag.
+    """Returns settings with which the viewer RViz shows the arms of a session or a bag.
 
     Args:
         topics: Descriptions of the topics by their full names, which begin with /.
@@ -61,7 +61,7 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
 
 
 def _fill_template(template: str, **values: str) -> str:
-    """Returns the text of a template with values in place of its placeholders.
+    """Returns a text in which placeholders are replaced by values.
 
     Args:
         template: Name of the file of the template, without its suffix.

@@ -80,7 +80,7 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TopicTable(NamedTuple):
-    """States under which names the topics of a session appear in ROS 2.
+    """Under which names the topics of a session appear in ROS 2, as the user chose.
 
     Attributes:
         names: Name of each topic in ROS 2, by its name in trilat-net.
@@ -161,7 +161,7 @@ def _list_names(naming: str) -> dict[str, str]:
 
 
 def _read_names_file(source: str) -> TopicTable:
-    """Reads a names file: the changed names, and the robots by site (arm controller).
+    """Reads a user's file with names of ROS 2 topics and with settings of robots.
 
     Raises:
         UsageError: The file cannot be read, or is not valid TOML.
@@ -189,7 +189,7 @@ def _read_names_file(source: str) -> TopicTable:
 
 
 def _check_names(source: str, names: Mapping[str, object]) -> None:
-    """Checks that all topics exist and that their names are valid in ROS 2.
+    """Checks that topics which a user renamed exist, and that ROS 2 permits the new names.
 
     Args:
         source: Name of the file, for the error message.
@@ -209,7 +209,7 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
 
 
 def _check_unique_names(source: str, table: TopicTable) -> None:
-    """Checks that no two topics have the same full name.
+    """Checks that no two quantities have the same topic name in ROS 2.
 
     Args:
         source: Name of the file, for the error message.

@@ -50,10 +50,11 @@ _get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Writes the two rows of a bucket: one at once, and one half a bucket later.
+    """Writes two messages for each interval of time: one at its end, and one half later.
 
-    A row contains the values of all curves at one time. The second row is written by `flush`,
-    or before the first row of the next bucket.
+    A message contains the values of all curves of a viewer at one time (a row). An interval is
+    called a bucket. The second row is written by `flush`, or before the first row of the next
+    bucket.
 
     Args:
         write: Function that writes a row: time, values, and arrival time in Unix ns.
@@ -80,7 +81,9 @@ class _BucketOutput:
         self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the row of curve values that `add` has kept, if it was not written yet.
+        """Writes the second message of a time interval, if it was not written yet.
+
+        `add` has kept its curve values, so that messages are evenly spaced in time.
 
         Args:
             log_ns: Arrival time that the log states for the message, in Unix time, in ns.
@@ -361,10 +364,10 @@ class _SiteBuckets:
         self._first_tick = self._bucket_ticks * next_bucket
 
     def _flush_late_records(self, log_ns: int) -> None:
-        """Writes the records that arrived after their time interval (bucket) was written.
+        """Writes for viewers the records that arrived after their interval was written.
 
-        As for other intervals, the minimum and the maximum of each curve are written, here on
-        the fast and on the slow channels at once.
+        As for other intervals (buckets), the minimum and the maximum of each curve are written,
+        here on the fast and on the slow channels at once.
         """
         if self._late_records:
             rows = self._decimate(self._late_records)
@@ -374,7 +377,7 @@ class _SiteBuckets:
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
-        """Returns the values of the curves that are written less often than the joints.
+        """Returns the values of curves that need fewer points per second than the joint angles.
 
         Args:
             rows: Values of all curves at some times.
@@ -465,7 +468,7 @@ class VizChannels:
         views_hz: float,
         put: PutMessage,
     ) -> None:
-        """Prepares the channels of the session and of each site. No message is written yet."""
+        """Prepares channels for viewers such as Foxglove. No message is written yet."""
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
 
@@ -520,7 +523,9 @@ class VizChannels:
             buckets.finish(log_ns)
 
     def open_channels(self, file: McapWriter) -> ros2_messages.StandardChannels:
-        """Returns the channels for viewers of a file, which are registered when needed.
+        """Returns the channels of a file that viewers such as Foxglove display.
+
+        A channel is registered in the file only when its first message is written.
 
         Args:
             file: The file.
@@ -550,7 +555,7 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
         return None
 
     def make_views(session: str, epoch_unix_ns: int, put: PutMessage) -> VizChannels:
-        """Creates the messages for viewers of one file of the log.
+        """Prepares the messages for viewers, such as Foxglove, of one file of the log.
 
         Args:
             session: Name of the session.

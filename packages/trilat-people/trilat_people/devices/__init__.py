@@ -13,7 +13,7 @@ from trilat_net.errors import UsageError
 
 
 def open_device(text: str) -> Device:
-    """Creates the object for the input device that the option --device names.
+    """Connects to the input device, such as a SpaceMouse, that the option --device names.
 
     Args:
         text: Value of the option: the name of the device, optionally followed by "=" and its

@@ -95,7 +95,9 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Waits for the next state of the device from the service, and returns it.
+        """Waits for the next state of the haptic device: position, velocity and buttons.
+
+        A service of its manufacturer sends the states.
 
         Raises:
             ConnectionError: The service has no device, or has closed the connection.
@@ -115,7 +117,9 @@ class HaplyInverse3:
             return DeviceState(_NO_POSITION, _NO_POSITION, {})
 
     def _parse_state(self, message: Any) -> DeviceState:
-        """Returns the state of the first Inverse3 in a message, with the buttons of all grips.
+        """Returns position, velocity and buttons of a haptic device, from a message about it.
+
+        The device is the first Inverse3 in the message. The buttons are those of all grips.
 
         Args:
             message: Decoded message of the service.

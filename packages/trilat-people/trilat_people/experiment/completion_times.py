@@ -62,7 +62,9 @@ class CompletionTime(NamedTuple):
 
 
 class CompletionComparison(NamedTuple):
-    """Comparison of the completion times under two conditions, by a sign test.
+    """Comparison of how long a task takes under two conditions of an experiment.
+
+    It uses a sign test, because trials that were not completed have no exact time.
 
     Attributes:
         first: Name of the first condition.
@@ -318,7 +320,9 @@ def _replace_infinity(time_s: float) -> float | None:
 def to_table(
     results: Sequence[CompletionTime] | Sequence[CompletionComparison],
 ) -> list[dict[str, Any]]:
-    """Converts completion times, or their comparisons, to table rows for CSV and JSON.
+    """Converts completion times, or comparisons of them, to table rows for CSV and JSON.
+
+    A completion time is the time that a participant needs for a trial.
 
     Args:
         results: Completion times of conditions, or their comparisons.

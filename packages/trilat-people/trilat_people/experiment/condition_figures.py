@@ -254,7 +254,7 @@ def draw_learning(
 
 
 def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
-    """Returns the plot options of the line of each condition, which differ in their colour.
+    """Returns the plot options of the line of each experimental condition, such as its colour.
 
     Colours follow the order in which conditions appear in the rows, and repeat after the last.
     """
@@ -316,9 +316,9 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
 
 
 def _add_panel(figure: Figure, measure: str) -> Axes:
-    """Adds the only panel of a figure, labelled with a measure and its unit.
+    """Adds the only panel of a figure, with a vertical axis for one measure.
 
-    The unit is the end of the name: "path_m" is labelled "path, m".
+    The unit is the end of the measure's name: "path_m" is labelled "path, m".
     """
     panels = style.add_panels(figure, 1, 1)
     axes: Axes = panels[0, 0]

@@ -241,19 +241,18 @@ class ExperimentAnalysis(Result):
         return not (is_excluded or row["practice"] or row["catch"])
 
     def _sort_by_condition(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Returns rows in the order in which the protocol lists the conditions.
+        """Returns table rows in the order in which the experiment's protocol lists conditions.
 
-        Tables and figures then show the conditions in the order of the author. Rows of one
-        condition keep their order.
+        Rows of one condition keep their order.
         """
         conditions = list(self._experiment.plan.protocol.conditions)
         return sorted(rows, key=lambda row: conditions.index(row["condition"]))
 
     def _list_unit_measures(self) -> list[str]:
-        """Lists the measures that a participant or pair has only once per condition.
+        """Lists the measures of which a participant has only one value per condition.
 
-        These are gains by a training and perception thresholds: names that begin with "gain_"
-        or "threshold_".
+        Examples are gains by a training and perception thresholds, with names that begin with
+        "gain_" or "threshold_". In an experiment with pairs, a pair has one value.
         """
         keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
         return [key for key in keys if key.startswith(("gain_", "threshold_"))]
@@ -277,10 +276,10 @@ class ExperimentAnalysis(Result):
             self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
 
     def _has_censored_times(self) -> bool:
-        """Returns True if some of the trials that count were not completed.
+        """Returns True if participants did not complete some of the trials.
 
-        Their completion times are censored: known only to be longer than the limit. Then the
-        analysis uses medians in place of means.
+        Completion times of such trials are only known to be longer than the limit (censored).
+        The analysis then uses medians in place of means.
         """
         return any(time.censored for time in self.times)
 
@@ -367,7 +366,7 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the table rows in which a measure of the experiment can be found.
+        """Returns the rows of the result table that contains a given measure.
 
         Depending on the measure, a row is a trial, a participant or pair, or a completed
         questionnaire.
@@ -465,7 +464,7 @@ class ExperimentAnalysis(Result):
     def _average_learning(
         self, rows: Sequence[Row], measure: str
     ) -> dict[str, dict[str, float]]:
-        """Returns the mean of a learning measure for each condition and unit.
+        """Returns the mean of a learning measure for each condition and participant or pair.
 
         If some trials were not completed, medians take the place of means. A median that was
         not reached is left out.
@@ -558,7 +557,7 @@ class ExperimentAnalysis(Result):
         return {name: value for name, value in facts.items() if value is not None}
 
     def _list_computed(self) -> list[str]:
-        """Returns the names of the statistical analyses that were computed, for the report.
+        """Returns the names of the statistical methods that were applied, for the report.
 
         An example is ["intervals of 95 %", "effect sizes"]. With one participant the list is
         empty.
@@ -580,7 +579,7 @@ class ExperimentAnalysis(Result):
         return [analysis for analysis, computed in is_computed.items() if computed]
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes tables, figures and a report into a folder.
+        """Writes the tables, figures and the report of an experiment into a folder.
 
         Afterwards, `paths` lists the written files.
 
@@ -606,9 +605,10 @@ class ExperimentAnalysis(Result):
         return self
 
     def _encode_files(self) -> dict[str, str]:
-        """Returns the contents of the tables and of the JSON by file name.
+        """Returns the contents of all result files except figures, by file name.
 
-        Tables about completion times and missing answers exist only if they have a row.
+        They are CSV tables and a JSON file. Tables about completion times and missing answers
+        exist only if they have a row.
         """
         tables = {
             "conditions.csv": self._list_means(),
@@ -709,9 +709,9 @@ class ExperimentAnalysis(Result):
         return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the comparisons as a table, one row per measure and pair of conditions.
+        """Returns a table of how the conditions differ, one row per measure and pair of them.
 
-        This is the file comparisons.csv, and the data frame of this result.
+        The file comparisons.csv and the data frame of this result have these rows.
         """
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
@@ -1056,7 +1056,7 @@ def _describe_mean(mean: ConditionMean) -> str:
 
 
 def _list_points(rows: Sequence[Row], name: str) -> Array:
-    """Returns a point of each trial, in m, shape (K, 2).
+    """Returns one point of the movement in each trial, in m, shape (K, 2).
 
     Args:
         rows: The K trials.
@@ -1066,7 +1066,7 @@ def _list_points(rows: Sequence[Row], name: str) -> Array:
 
 
 def _format_interval(interval: tuple[float, float | None] | None) -> str:
-    """Returns an interval as text, for example "[3.06, 3.22]".
+    """Returns a confidence interval as text, for example "[3.06, 3.22]".
 
     An upper end of None lies beyond the time limit, and is written as `NOT_REACHED`. Without an
     interval the text is "-".
@@ -1079,9 +1079,9 @@ def _format_interval(interval: tuple[float, float | None] | None) -> str:
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the cells of a CSV row.
+    """Yields the names and values of the columns of a CSV row, which has no nested values.
 
-    An interval becomes two cells, for example "interval_low".
+    A confidence interval, for example, becomes two columns such as "interval_low".
     """
     for key, value in row.items():
         if key in ("interval", "bootstrap"):

@@ -161,7 +161,7 @@ class Experiment(Result):
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns what people did besides finished trials, in the order of time.
+        """Returns everything that the journal notes besides finished trials, in order of time.
 
         Each entry is a consent, the answers to a questionnaire, or a trial that was aborted.
         Empty if nothing has been noted yet.
@@ -234,9 +234,10 @@ class Experiment(Result):
                 notes.add(note)
 
     def status(self) -> _ExperimentStatus:
-        """Returns the progress: how many trials are done, and which trial is next.
+        """Returns the progress of the experiment: how many trials are done, and which is next.
 
-        It is read from the journal, so another process may be running the experiment.
+        It is read from the journal on disk, so that another process may be running the
+        experiment.
         """
         done = self.read_entries()
         remaining = [trial for trial in self.plan.trials if trial.number not in done]
@@ -284,9 +285,9 @@ class Experiment(Result):
         return self
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the table of finished trials, one row per trial, in the order of the plan.
+        """Returns a table of the finished trials of the experiment, in the order of the plan.
 
-        A row contains the participants, the condition and the measures of the trial.
+        A row contains the participants, the condition and the measures of one trial.
         """
         finished_trials = self.read_entries()
         choices = self.list_choices()
@@ -347,7 +348,7 @@ class Experiment(Result):
         return {"difference": difference, "right": right}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns what people answered, with a row for each item of each questionnaire.
+        """Returns the participants' answers, one row per item of each questionnaire.
 
         The file questionnaires.csv has these rows. The value of a missing answer is None.
         """
@@ -367,7 +368,8 @@ class Experiment(Result):
     def list_scores(self) -> list[dict[str, Any]]:
         """Returns the scores of the completed questionnaires, one row per questionnaire.
 
-        The score is under the name of the questionnaire. It is None if an answer is missing.
+        The column of the score has the name of the questionnaire. A score is None if an answer
+        is missing.
         """
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
         rows: list[dict[str, Any]] = []
@@ -434,9 +436,10 @@ class Experiment(Result):
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the progress as plain values, which `trilat experiment status --json` prints.
+        """Returns the progress of the experiment as plain values, for JSON.
 
-        "trials" is the number of planned trials, and "done" that of finished ones.
+        `trilat experiment status --json` prints them. "trials" is the number of planned trials,
+        and "done" that of finished ones.
         """
         status = self.status()
         protocol = self.plan.protocol
@@ -451,7 +454,7 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text about the progress, with a table of the conditions.
+        """Yields the text about the progress of the experiment, with a table of the conditions.
 
         The table states the median completion time of each condition, in which a trial that was
         not completed counts as longer than any other.

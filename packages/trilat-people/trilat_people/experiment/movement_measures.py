@@ -32,7 +32,9 @@ ONSET_SHARE = 0.05
 
 
 def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
-    """Returns the samples of a movement as an array of finite numbers, shape (K,) or (K, D).
+    """Returns a recorded movement as an array of finite numbers, shape (K,) or (K, D).
+
+    K is the number of recorded times, and D the number of coordinates.
 
     Args:
         name: Name of the samples in error messages.
@@ -57,7 +59,7 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
 
 
 def _read_same_shape(**values: ArrayLike) -> list[Array]:
-    """Returns several arrays of samples as floats, after checking that their shapes agree.
+    """Converts several recorded series to arrays of floats, and checks their equal length.
 
     Args:
         **values: Arrays of K samples with D axes, shape (K, D), by the name for messages.
@@ -76,7 +78,7 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
 
 
 def _integrate(values: Array, rate_hz: float) -> float:
-    """Returns the integral over time of K samples, shape (K,), by the trapezoidal rule.
+    """Returns the integral over time of K equally spaced values, by the trapezoidal rule.
 
     Args:
         values: The samples, at a constant rate.
@@ -237,7 +239,10 @@ class Throughput(NamedTuple):
 
     @property
     def bits_s(self) -> float:
-        """The throughput in bit/s: the index of difficulty over the mean movement time."""
+        """Throughput of pointing movements in bit/s, as Fitts's law defines it.
+
+        It is the index of difficulty over the mean movement time.
+        """
         return self.difficulty_bits / self.time_s
 
 
@@ -345,7 +350,7 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 class PairMeasures(NamedTuple):
-    """Forces and work of two users who move a shared object together in a trial.
+    """Forces and work of two people who move a shared object together in a trial.
 
     Args:
         internal_rms_n: RMS of the force that cancels, over all axes and samples, in N.
@@ -455,7 +460,9 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
 
 
 def raw_tlx(ratings: Mapping[str, float]) -> float:
-    """Returns the raw NASA Task Load Index: the mean of six ratings.
+    """Returns how demanding a task was by the raw NASA Task Load Index.
+
+    It is the mean of six ratings of a participant.
 
     Args:
         ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
@@ -467,7 +474,9 @@ def raw_tlx(ratings: Mapping[str, float]) -> float:
 
 
 def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> float:
-    """Returns the weighted NASA Task Load Index: the weighted mean of six ratings.
+    """Returns how demanding a task was by the weighted NASA Task Load Index.
+
+    It is the weighted mean of six ratings of a participant.
 
     Args:
         ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
@@ -496,7 +505,9 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
 
 
 def sus_score(answers: Sequence[int]) -> float:
-    """Returns the score of the System Usability Scale (SUS), from 0 to 100.
+    """Returns how usable a participant found a system, from 0 to 100.
+
+    It is the score of the System Usability Scale (SUS), a questionnaire of ten items.
 
     Args:
         answers: Ten answers from 1 (strongly disagree) to 5, in the order of the questions.

@@ -111,7 +111,9 @@ class _Training(Frozen, frozen=True):
 
 
 class Protocol(Frozen, frozen=True):
-    """Protocol of an experiment. The attributes are the keys of its TOML file.
+    """Plan of an experiment with people, as an experimenter writes it in a TOML file.
+
+    The attributes are the keys of this file.
 
     Attributes:
         name: Name of the experiment.
@@ -276,7 +278,7 @@ class PlannedTrial(NamedTuple):
 
     @property
     def file(self) -> str:
-        """File name of the trial's log: number, participants, block, trial and condition.
+        """Name of the file with the trial's log: number, participants, block, trial, condition.
 
         Example: "00017-P01-P02-b1-t03-near.mcap".
         """
@@ -337,7 +339,9 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Summarises the plan, as `trilat experiment check --json` prints it.
+        """Summarises the planned trials of an experiment as plain values, for JSON.
+
+        `trilat experiment check --json` prints them.
 
         Returns:
             Counts, conditions, and the order of the conditions for each group, ready for JSON.
@@ -649,7 +653,7 @@ def _list_pseudonyms(protocol: Protocol) -> list[str]:
 
 
 def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields a sentence for each problem with the pseudonyms of participants.
+    """Yields a sentence for each mistake in the pseudonyms of an experiment's participants.
 
     Two participants have the same pseudonym, or a force limit names one that nobody has.
     """
@@ -701,10 +705,10 @@ def _find_form_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_group_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with the users and the number of participants.
+    """Yields a sentence for each mistake in the number of participants of an experiment.
 
     Some designs balance the orders of conditions only if the number of groups is a multiple of
-    the number of orders.
+    the number of orders. The users that a task needs are checked, too.
     """
     users = protocol.users
     name_count = len(_list_pseudonyms(protocol))
@@ -797,9 +801,10 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
 def limit_forces(
     scenario: Scenario, protocol: Protocol, group: Sequence[str]
 ) -> dict[str, Any]:
-    """Returns sites with lower force limits, for participants who must not push hard.
+    """Lowers the force limits of the arms of participants who must not push hard.
 
-    The protocol states these participants and their limits under `force_limit_n`.
+    The protocol states these participants and their limits under `force_limit_n`. The result
+    has the changed settings of their sites (arm controllers).
 
     Args:
         scenario: Scenario of the condition.

@@ -36,7 +36,9 @@ Answers = Mapping[str, float | None]
 
 
 class Questionnaire(Frozen, frozen=True):
-    """A questionnaire of a protocol. A shipped questionnaire needs only its name.
+    """A questionnaire that participants of an experiment answer on a web page.
+
+    A shipped questionnaire, such as the NASA Task Load Index, needs only its name.
 
     Attributes:
         name: Name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
@@ -65,11 +67,14 @@ class Questionnaire(Frozen, frozen=True):
 
     @property
     def is_forced(self) -> bool:
-        """True if every item must be answered, as for the choice of a perception test."""
+        """True if a participant must answer every item, as in a perception test.
+
+        In other questionnaires, an item may be left out.
+        """
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
-        """Checks the answers that a page sent, and assigns them to the items.
+        """Checks a participant's answers from a web page, and assigns them to the questions.
 
         Args:
             values: Answers in the order of the items. None for a missing answer.
@@ -91,16 +96,17 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
-        """Returns True if a value is on the scale, or is a missing answer that is allowed.
+        """Returns True if an answer is on the scale, or is missing and may be missing.
 
-        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on.
+        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on. None is a missing
+        answer.
         """
         if value is None:
             return not self.is_forced
         return value in range(self.least, self.most + 1, self.step)
 
     def score(self, answers: Answers) -> float | None:
-        """Computes the score of a completed questionnaire.
+        """Computes the score of a questionnaire from a participant's answers.
 
         Args:
             answers: The answers by item.
@@ -129,9 +135,10 @@ def _read_shipped() -> dict[str, Any]:
 
 
 def find_form(questionnaire: Questionnaire) -> Questionnaire:
-    """Returns a questionnaire with its items filled in.
+    """Returns a questionnaire with the questions that participants answer.
 
-    A protocol names a shipped questionnaire without stating its items.
+    An experiment's protocol may name a shipped questionnaire without stating its questions
+    (items).
 
     Args:
         questionnaire: The questionnaire as the protocol states it.

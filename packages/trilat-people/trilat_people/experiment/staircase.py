@@ -60,19 +60,20 @@ class Staircase(Frozen, frozen=True):
 
     @property
     def measure(self) -> str:
-        """Name of the measured perception threshold, with its unit.
+        """Name of the perception threshold that the experiment measures, with its unit.
 
-        It is "threshold_" and the last part of the scenario key that is varied. For example,
-        the key `link.delay_ms` gives threshold_delay_ms.
+        It is "threshold_" and the last part of the varied setting. For example, the key
+        `link.delay_ms` gives threshold_delay_ms.
         """
         parts = [part for part in self.key.split(".") if not part.isdigit()]
         return f"threshold_{parts[-1]}"
 
     @property
     def form(self) -> Questionnaire:
-        """Questionnaire with the question that participants answer after each pair of trials.
+        """Question that participants answer after each pair of trials.
 
-        The answer is 1 or 2, the trial of the pair in which the value seemed larger.
+        The answer is 1 or 2, the trial of the pair in which the varied quantity, such as a
+        delay, seemed larger.
         """
         return Questionnaire(
             name=CHOICE,

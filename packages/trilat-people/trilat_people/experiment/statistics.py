@@ -40,9 +40,10 @@ _ROUNDING = 1e-12
 
 
 def import_scipy_stats() -> Any:
-    """Imports and returns the module `scipy.stats`.
+    """Imports and returns the module `scipy.stats`, when statistics are needed.
 
-    It takes longer to import than everything else of an experiment, and trials do not need it.
+    The import takes longer than all other imports of an experiment together, and trials do not
+    need it.
     """
     # The import takes half a second, and most commands do not need it.
     from scipy import stats
@@ -106,7 +107,7 @@ def average_trials(
 
 
 def read_number(value: Any, measure: str, row: Row) -> float:
-    """Converts the value of a measure in a table to a number, and refuses any other text.
+    """Converts an entry of a result table to a number, and refuses any other text.
 
     Args:
         value: A number, or its text from a CSV file.
@@ -407,7 +408,9 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 
 
 class MixedEffect(NamedTuple):
-    """Effect of a condition in a mixed model, relative to the first condition.
+    """Effect of one condition on a measure in a mixed model, a regression for repeated trials.
+
+    It is relative to the first condition.
 
     Args:
         condition: Name of the condition.
@@ -750,7 +753,9 @@ def simulate_power(
 
 
 def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
-    """Returns simulated trials in the form of rows, as an experiment would have them.
+    """Returns simulated measurements as table rows, as a real experiment would have them.
+
+    The power of a statistical test is found by analysing them.
 
     Args:
         values: Deviations from the means, by participant, condition and trial.

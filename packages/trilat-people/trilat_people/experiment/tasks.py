@@ -55,7 +55,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def longest_s(self) -> float:
-        """Longest duration of a trial after its target appears, in s.
+        """Longest duration of a trial, from the appearance of its target on, in s.
 
         With a time limit (`has_limit`), a trial that has not succeeded by then has failed.
         Without one, every trial lasts exactly that long.
@@ -64,22 +64,22 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def has_limit(self) -> bool:
-        """True if a trial fails when `longest_s` is over.
+        """True if a trial fails when the participant has not finished in `longest_s` seconds.
 
-        False if every trial lasts that long.
+        False if every trial lasts exactly that long, as for following a moving target.
         """
         return True
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task is for two users together.
+        """True if two participants perform the task together.
 
-        The protocol must then name two masters.
+        The protocol of the experiment must then name two master arms.
         """
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Creates the goal of one trial: it states the target and decides when the trial ends.
+        """Creates the goal of one trial, which states its target and decides when it ends.
 
         Args:
             start_m: Position of the slave's end effector at the start, shape (2,) or (3,), in
@@ -91,7 +91,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
 
 class TrialGoal:
-    """The goal of one trial: where its target is, and when the trial ends.
+    """Target of one trial of an experiment, and the rule that decides when the trial ends.
 
     Args:
         start_m: Position of the slave's end effector at the start, in m.
@@ -120,7 +120,7 @@ class TrialGoal:
         self.appears_s = 0.0
 
     def find_target_m(self, t_s: float, user: int | None = None) -> Array:
-        """Returns the target position of the end effector, shape (2,) or (3,), in m.
+        """Returns where the end effector shall be at a time, shape (2,) or (3,), in m.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -185,7 +185,7 @@ class TrialGoal:
         position_m: Array,  # noqa: ARG002
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes measures of this task only, such as the mean force against a wall.
+        """Computes measures that only this task has, such as the mean force against a wall.
 
         Args:
             after_s: Times since the target's appearance, shape (K,), in s.
@@ -210,9 +210,10 @@ class TrialGoal:
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> "Outcome | None":
-        """Judges whether the trial ends now, after the target has appeared.
+        """Decides in each control period whether the trial succeeds, fails or continues.
 
-        Each task implements it. The arguments and the result are those of `judge`.
+        Each task implements this method, which is called after the target has appeared. For the
+        arguments and the result see `judge`.
         """
         raise NotImplementedError
 
@@ -232,7 +233,9 @@ class Outcome(NamedTuple):
 
 
 class ReachTrial(TrialTask, frozen=True, tag="reach"):
-    """The task to reach targets on a ring, each opposite the previous one (ISO 9241-411).
+    """Task of an experiment: move the arm to targets on a ring, as in ISO 9241-411.
+
+    Each target is opposite the previous one.
 
     Attributes:
         targets: Number of targets.
@@ -265,10 +268,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task needs two users.
+        """True if two participants reach the target together.
 
-        A second user is needed to receive the control of the slave arm from the first user
-        during the trial (handover).
+        The first one then hands over the control of the slave arm to the second one during the
+        trial.
         """
         return self.handover_s is not None
 
@@ -503,7 +506,7 @@ class _ReachGoal(_DwellGoal):
 
 
 class ContactTrial(TrialTask, frozen=True, tag="contact"):
-    """The task to press a wall with a given force, and to hold the force for some time.
+    """Task of an experiment: press a wall with a given force, and hold it for some time.
 
     Attributes:
         axis: Axis of the arm's base frame along which the target is drawn, from 0.
@@ -532,7 +535,10 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """Time after which a trial has failed if the force was not held, in s."""
+        """Time limit of a trial in s, within which the force at the wall must be held.
+
+        The trial has failed after this time.
+        """
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
@@ -547,9 +553,9 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
 
 class _ContactGoal(_DwellGoal):
-    """Goal of a trial of `ContactTrial`: to press a wall with a force for some time.
+    """Decides when a trial has succeeded in which a wall is pressed with a force for some time.
 
-    The position plays no role: only the force is judged.
+    Only the force is judged, not the position. See `ContactTrial`.
     """
 
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
@@ -560,10 +566,7 @@ class _ContactGoal(_DwellGoal):
         self._target_m: Array = start_m + task.distance_m * direction
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
-        """Returns the point at the wall that users see as the target, in m.
-
-        It does not move.
-        """
+        """Returns the fixed point on the wall that participants see as the target, in m."""
         return self._target_m
 
     def compute_measures(
@@ -626,20 +629,23 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False, because every tracking trial lasts exactly `duration_s`, and none fails."""
+        """False: following a moving target takes exactly `duration_s`, and cannot fail."""
         return False
 
     @property
     def needs_pair(self) -> bool:
-        """True if the tracking task needs two users.
+        """True if two participants follow a moving target together.
 
-        The two users then see different targets, and must agree on a position of the slave arm.
+        They see different targets, and must agree on a position of the slave arm.
         """
         return self.apart_m > 0.0
 
     @property
     def longest_s(self) -> float:
-        """Duration of every tracking trial after its target has appeared, in s."""
+        """Duration of every trial of following a moving target, in s.
+
+        It counts from the moment at which the target appears.
+        """
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
@@ -737,7 +743,9 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Computes the position of an end effector from the state that its site sends, in m.
+    """Computes the position of the slave's end effector from a state of its arm, in m.
+
+    The state is the one that the site (arm controller) sends to other sites.
 
     Args:
         arm: Arm of the site.

@@ -54,7 +54,7 @@ REST_S = 0.1
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
-    """Result of a finished trial, as the journal of the experiment stores it.
+    """Result of one finished trial, as the experiment's journal file stores it.
 
     Attributes:
         cell: Number of the trial.
@@ -281,7 +281,7 @@ class ExperimentTrial:
         return magnitude_n
 
     def _place_end_effector(self, q: Array) -> EndEffectorRows:
-        """Returns the slave's end effector in K records: positions and Jacobians.
+        """Computes the positions and Jacobians of the slave's end effector from K records.
 
         Args:
             q: Joint positions, shape (K, n), in rad or m. The joints count as being at rest.
@@ -334,9 +334,10 @@ class ExperimentTrial:
         )
 
     def _judge_log(self, log: Log) -> Outcome | None:
-        """Judges a recorded trial, record by record, as a live trial is judged.
+        """Decides from the recorded log of a trial when it succeeded or failed.
 
-        A run that diverged, because an arm exceeded its limits, has failed at that time.
+        It is judged record by record, as a trial in progress is judged. A trial in which an arm
+        left its limits has failed at that time.
 
         Returns:
             The outcome. None if the log ends before the trial does.
@@ -525,10 +526,9 @@ class SyntheticTrial(ExperimentTrial):
     people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        """Returns the synthetic participants of the trial, by the sites whose arms they move.
+        """Creates models of the participants of a trial, by the sites whose arms they move.
 
-        Each call returns participants at the start of the trial, because a player keeps a
-        state.
+        Each call creates them anew, because a model keeps a state during a trial.
 
         Args:
             scenario: Scenario of the trial.
@@ -618,10 +618,10 @@ class SyntheticTrial(ExperimentTrial):
         return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
-        """Runs the trial in virtual time, writes its log, and returns its result.
+        """Simulates a trial with a model of the participant, and writes its log.
 
         A first run without a log finds out when the trial ends, so that the log stops soon
-        after.
+        after. Returns the result of the trial.
 
         Args:
             path: Path of the log.

@@ -287,10 +287,10 @@ class ExperimentSessions:
         has_begun = False
 
         def begins() -> bool:
-            """Returns True once all participants have said on their pages that they are ready.
+            """Returns True once all participants have said that they are ready.
 
-            The session waits for this before its first tick. Then the pages change to the
-            picture of the trial.
+            They do so on their web pages. The session waits for this before its first control
+            period. Then the pages change to the picture of the trial.
             """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
@@ -362,9 +362,9 @@ class ExperimentSessions:
 
 
 def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns the reason why a trial must be repeated. Empty if it counts.
+    """Returns the reason why a trial of an experiment must be repeated. Empty if it counts.
 
-    A trial in which an arm has diverged is not repeated: it counts as failed.
+    A trial in which an arm has left its limits is not repeated: it counts as failed.
     """
     if result.interrupted:
         return "the experiment was interrupted"
@@ -437,7 +437,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
-                """Returns True once Ctrl-C or an experimenter's page has requested the end."""
+                """Returns True once Ctrl-C or an experimenter's page has requested to stop."""
                 return interrupt.is_requested() or page.end_requested.is_set()
 
             sessions = ExperimentSessions(

@@ -73,7 +73,7 @@ class TrialWatch:
 
     @property
     def over(self) -> bool:
-        """True once the session of the trial can end.
+        """True once the session in which a trial takes place can end.
 
         After an abort, the session can end at once. After the outcome, it continues for
         `END_DELAY_NS`, so that the log contains what follows.
@@ -268,7 +268,7 @@ class Stage:
         return request
 
     def show_trial(self, watch: TrialWatch) -> None:
-        """Tells all pages that the session of a trial is about to begin.
+        """Shows on all open web pages that a trial is about to begin.
 
         Args:
             watch: Object that judges the trial while its session runs.
@@ -278,7 +278,7 @@ class Stage:
         self._phase = "starting"
 
     def show_checking(self) -> None:
-        """Tells all pages that a trial has ended and that its log is being checked."""
+        """Shows on all open web pages that a trial has ended, and that its log is checked."""
         self._watch = None
         self._phase = "checking"
 
@@ -302,7 +302,7 @@ class Stage:
             self._feedback["succeeded"] = entry.succeeded
 
     def show_end(self) -> None:
-        """Tells all pages that the experiment has ended."""
+        """Shows on all open web pages that the experiment has ended."""
         self._request = None
         self._step = None
         self._phase = "over"
@@ -350,7 +350,7 @@ class Stage:
         return self._watch.poll(view, absent_sites)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
-        """Processes a message of a page, such as the answers to a questionnaire.
+        """Processes a message of a participant's web page, such as answers to a questionnaire.
 
         Args:
             site: Name of the user's site. Empty for an experimenter.
@@ -473,7 +473,7 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns the fields of a step that only experimenters may see, such as the condition.
+        """Returns what only experimenters may see of the present step, such as the condition.
 
         Participants who knew the condition might expect an effect.
 

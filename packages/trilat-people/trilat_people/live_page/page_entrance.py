@@ -61,7 +61,7 @@ class Strangers:
         self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Removes a connection that was closed, or that has become a page with a known role.
+        """Removes a connection that was closed, or whose web page has proved its role.
 
         A connection that is not in the list changes nothing.
         """
@@ -88,7 +88,7 @@ Page = TypeVar("Page", bound=_SeatedPage)
 
 
 def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
-    """Finds out whether there are as many open pages of a role as allowed.
+    """Returns True if as many web pages of a role are open as are allowed.
 
     Args:
         pages: The open pages of all roles.
@@ -126,7 +126,9 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
 
 
 def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
-    """Lists the pages that compete with a new page of a role for a place.
+    """Lists the open web pages that a new page of a role may have to replace.
+
+    Only a limited number of pages per role may be open.
 
     Args:
         pages: The open pages.

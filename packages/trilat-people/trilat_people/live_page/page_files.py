@@ -57,7 +57,7 @@ class PageFiles:
         self.results: dict[str, Path] = {}
 
     def add_results(self, paths: Iterable[Path]) -> None:
-        """Makes the report and the log of the ended session available for download.
+        """Offers the report and the log of an ended session for download in the browser.
 
         Each call uses a new secret in the addresses. Files above `MAX_FILE_BYTES` are left out.
 
@@ -69,7 +69,7 @@ class PageFiles:
         self.results |= {f"/{secret}/{path.name}": path for path in sendable}
 
     def find(self, path: str) -> Response | None:
-        """Finds the file that a browser requests.
+        """Returns the response of the web server to a browser's request for a file.
 
         Args:
             path: Path of the requested address.

@@ -33,10 +33,10 @@ class BrowserOpening:
         self._folder: Path | None = None
 
     def open(self) -> None:
-        """Opens a browser at the link, by a file that redirects to it.
+        """Opens a browser at the secret link of a page, by a file that redirects to the link.
 
-        If there is no browser, or the file cannot be written, nothing happens. The user has the
-        printed link.
+        If there is no browser, or the file cannot be written, nothing happens, as the link is
+        printed for the user anyway.
         """
         # A RuntimeError means that the user has no home directory.
         with suppress(OSError, webbrowser.Error, RuntimeError):
@@ -65,7 +65,10 @@ class BrowserOpening:
         return file
 
     def remove_file(self) -> None:
-        """Removes the file with the link, once the page is open or the server ends."""
+        """Removes the temporary file with the secret link of a page.
+
+        It is called once the browser has opened the page, or when the server ends.
+        """
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None

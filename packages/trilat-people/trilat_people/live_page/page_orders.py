@@ -75,9 +75,9 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """Message of a page that it has drawn the last frame, so that the next one can be sent.
+    """Message of a web page that it has drawn a state, so that the next one can be sent.
 
-    A frame is a message of the server that describes the present state of the session.
+    The server describes the present state of the session in messages called frames.
 
     Attributes:
         n: Number of the frame that was drawn.
@@ -87,7 +87,7 @@ class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """Request of a page to receive or return the right to move arms and change settings.
+    """Request of a web page to receive or return the right to move arms and change settings.
 
     Attributes:
         want: True to ask for the right, False to return it.
@@ -112,14 +112,14 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Request of a page to stop all arms at once. Every role may send it, also a watcher.
+    """Request of a web page to stop all arms at once. Everybody may send it, also a watcher.
 
     The session continues: the arms come to rest until somebody releases them.
     """
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Request of a page to let stopped arms move again, or to reset arms after a fault.
+    """Request of a web page to let stopped arms move again, or to reset arms after a fault.
 
     Attributes:
         order: "enable" to let stopped arms follow the other arms again, "reset" to end faults.
@@ -160,7 +160,7 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """Request of a page to mark the present moment in the log by an event with a text.
+    """Request of a web page to mark the present moment in the log, by an event with a text.
 
     Attributes:
         text: The text, for example "contact".
@@ -182,7 +182,7 @@ class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
 
 
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
-    """Request of a page to take hold of an arm, to move it, or to release it.
+    """Request of a web page to take hold of an arm, to move it, or to release it.
 
     Attributes:
         site: Name of the process ("site") that controls the arm.
@@ -197,7 +197,7 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """Request of a page to end the session in an orderly way, so that its log is complete.
+    """Request of a web page to end the session in an orderly way, so that its log is complete.
 
     Only sessions that were started together with their page accept it.
     """
@@ -219,7 +219,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """Request of a page to end the running trial of an experiment, and to repeat it later.
+    """Request of a web page to end the running trial of an experiment, and to repeat it later.
 
     Attributes:
         why: The reason, for the journal of the experiment.
@@ -266,7 +266,7 @@ class _TokenBucket:
 
 
 class MessageLimits:
-    """Limits how many messages a page may send, for each kind of message and for all together.
+    """Limits how many messages a web page may send, per kind of message and in total.
 
     A page that sends more messages than a person can cause is faulty or hostile. The messages
     in excess are dropped.
@@ -332,7 +332,7 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The rights of the person at a page, and the arm whose user's view the page shows.
+    """The rights of a person at a web page, and the arm from whose side the page shows all.
 
     Attributes:
         kind: An experimenter may do everything, a user may hold the arm of one site, and a
@@ -365,7 +365,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """Who sits at the page, as the events of sites name the person: "the user of m1"."""
+        """Who uses a web page, as events of the session call the person: "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -374,10 +374,10 @@ class Role:
 
     @property
     def query(self) -> str:
-        """Part of a page's web address that states the role, such as "as=m1" or "watch".
+        """Part of a web page's address that states the role of its user, such as "as=m1".
 
-        The text "as=m1" stands for the view of the user of site m1. It is empty for an
-        experimenter.
+        "as=m1" is the role of the user of the arm m1, and "watch" that of a watcher. The text
+        is empty for an experimenter.
         """
         fields: list[str] = []
         if self.kind == "watcher":
@@ -442,7 +442,7 @@ class RoleLinks:
         return None
 
     def _make_token(self, role: Role) -> str:
-        """Returns the secret token in the link of a role. It grants the rights of the role.
+        """Returns the secret text (token) in a link, which grants the rights of one role.
 
         The token is a keyed digest of the role. Nobody without the server's secret can guess
         it.
@@ -452,9 +452,10 @@ class RoleLinks:
         return digest[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        """Returns True if a token is that of a role.
+        """Returns True if a secret text from a link (token) gives the rights of a role.
 
-        The comparison takes the same time for any token.
+        The comparison takes the same time for any token, so that nobody can guess one by
+        timing.
         """
         role_token = self._make_token(role)
         # The time of this comparison does not reveal how many characters are right.
@@ -519,13 +520,16 @@ class PageHands:
         sender.send(HandMessage, **content)
 
     def release(self) -> None:
-        """Releases all arms that the page holds, for example because the page was closed."""
+        """Releases all arms that the user of a web page moves.
+
+        This happens for example when the page is closed.
+        """
         for site in list(self._held_sites):
             message = MoveHand(site=site, grip=False)
             self.move(message, pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
-        """Finds out whether this page is the one that holds the arm of a site.
+        """Returns True if the user of this web page holds the arm of a site.
 
         Args:
             site: Name of the site.
@@ -539,7 +543,7 @@ class PageHands:
 
 
 class _OpenQuery(NamedTuple):
-    """A request that was sent to a site, whose reply has not come yet.
+    """A request that was sent to an arm controller (site) and has not been answered yet.
 
     Attributes:
         inbox: Inbox that receives the reply.
@@ -621,7 +625,7 @@ class OrderDesk:
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Requests sites to stop their arms at once, ahead of all waiting requests.
+        """Requests arm controllers (sites) to stop at once, ahead of all waiting requests.
 
         Waiting requests that would release the same arms are withdrawn.
 
@@ -686,7 +690,7 @@ class OrderDesk:
         self._open_queries[site, channel] = _OpenQuery(inbox, sent_ns, request)
 
     def mark(self, site: str, text: str) -> None:
-        """Queues a text that a site publishes as an event, to mark this moment in the log.
+        """Requests a site to publish an event with a text, which marks this moment in the log.
 
         Args:
             site: Name of the site that publishes the event.
@@ -728,10 +732,11 @@ class OrderDesk:
     def _handle_reply(
         self, site: str, channel: str, request: ChangeRequest, payload: bytes
     ) -> None:
-        """Stores the reply of a site for the pages, or repeats a refused stop in an older form.
+        """Stores the reply of a site to a request, so that web pages can show it.
 
-        A site of an older program does not know the field `source` and refuses the whole
-        request, but its arm must stop too. A reply that cannot be decoded is counted.
+        A refused stop is repeated in an older form: a site of an older program does not know
+        the field `source` and refuses the whole request, but its arm must stop too. A reply
+        that cannot be decoded is counted.
         """
         try:
             reply = decode(payload, ChangeReply)

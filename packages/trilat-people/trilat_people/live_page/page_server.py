@@ -144,7 +144,7 @@ class _Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Counts a new connection as a stranger, until the role of its page is known.
+        """Counts a new connection as that of a stranger, until its page has proved its role.
 
         Args:
             transport: The connection.
@@ -153,7 +153,7 @@ class _Visitor(ServerConnection):
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Removes a closed connection from the strangers.
+        """Removes a closed connection from the strangers (connections without a role).
 
         Args:
             exc: Reason why it was closed. None if it was closed in order.
@@ -253,7 +253,7 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """Command-line options that determine how the page of a session is served.
+    """Command-line options that determine how a session's web page is served.
 
     Attributes:
         host: Address at which the server listens.
@@ -271,7 +271,7 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the TLS settings with which the server encrypts its connections to browsers.
+        """Returns the TLS settings by which connections to browsers are encrypted.
 
         Returns:
             The settings, with the certificate and the private key from the folder `tls`. None
@@ -410,7 +410,7 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends the server and closes its pages, waiting at most five seconds for its thread."""
+        """Ends the web server and closes its pages. Waits at most 5 s for its thread."""
         self._ending.set()
         if self._loop is not None and self._stop is not None:
             # The loop of the server may have ended already.
@@ -503,9 +503,9 @@ class PageServer:
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, part: str, error: Exception) -> None:
-        """Counts a failure of the page, and prints the first failure of each kind.
+        """Counts an error of the web server, and prints the first error of each kind.
 
-        The page is no part of the session, so the server continues after any error.
+        The server takes no part in the control of the arms, and continues after any error.
 
         Args:
             part: Part of the page that failed, for example "frame".
@@ -519,7 +519,7 @@ class PageServer:
                 self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        """Listens for browsers and serves pages, until the end of the server is requested.
+        """Accepts connections of browsers and serves web pages, until the server shall end.
 
         It sets `address`, the link with the port that was chosen, and then reports that it is
         ready.
@@ -589,10 +589,9 @@ class PageServer:
             self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
-        """Receives the session's messages and makes a frame, thirty times a second.
+        """Receives the session's messages and offers pages its state, 30 times a second.
 
-        If one step fails, the failure is counted, and the other steps continue. In the end of
-        each round, the pages may send the new frame.
+        If one step fails, the failure is counted, and the other steps continue.
         """
         while True:
             started_ns = self._clock.monotonic_ns()
@@ -618,7 +617,7 @@ class PageServer:
             await asyncio.sleep(max(0.002, remaining_s))
 
     def _poll_stage(self) -> None:
-        """Lets the experiment judge the new records, and writes its marks into the log.
+        """Lets the experiment judge new records of the arms, and writes its marks into the log.
 
         A mark is, for example, "trial 3 begins". Without an experiment nothing happens.
         """
@@ -630,9 +629,10 @@ class PageServer:
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
-        """Makes the next frame, the message from which pages draw the present state.
+        """Composes the next message (frame) from which web pages draw the present state.
 
-        The replies of sites to requests of pages are collected too. The latest 20 are kept.
+        The replies of sites (arm controllers) to requests of pages are collected, too. The
+        latest 20 are kept.
         """
         self._frame_number += 1
         for site, channel, is_accepted, text in self._desk.replies:
@@ -651,9 +651,9 @@ class PageServer:
         self._frames_as_site.clear()
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Returns the response to an HTTP request.
+        """Returns the response to an HTTP request of a browser.
 
-        The library calls this function for each request, before it opens a WebSocket.
+        The WebSocket library calls this function for each request, before it opens a WebSocket.
 
         Returns:
             The response with a file or an error. None to open a WebSocket.
@@ -703,10 +703,10 @@ class PageServer:
         return None
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        """Serves one page until its connection ends.
+        """Exchanges messages with one web page until its connection ends.
 
-        A page of a user takes part at once. A page of an experimenter does so if no other page
-        of an experimenter takes part.
+        The page of a user may move its arm at once. The page of an experimenter controls the
+        session if no other page of an experimenter does.
         """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
@@ -743,7 +743,7 @@ class PageServer:
             self._pages.discard(page)
 
     def _close_page_for(self, role: Role) -> None:
-        """Closes an older page if there are too many pages of a role for a new one.
+        """Closes an older web page of a role if no more pages of this role may be open.
 
         The arms that the person at the closed page holds are released.
 
@@ -765,7 +765,7 @@ class PageServer:
         task.add_done_callback(self._closing.discard)
 
     def _receive(self, page: Page, text: str | bytes) -> None:
-        """Decodes and handles a message of a page, unless the page sends too many.
+        """Decodes and handles a message of a web page, unless the page sends too many.
 
         A message that releases an arm is always handled, because holding the arm could be
         dangerous.
@@ -816,7 +816,9 @@ class PageServer:
             self._control_session(page, message)
 
     def _note_drawn_frame(self, page: Page, frame_number: int) -> None:
-        """Notes that a page has drawn a frame, so that further frames can be sent to it.
+        """Notes that a web page has drawn a state of the arms, and can receive newer ones.
+
+        A slow browser is thereby not flooded.
 
         Args:
             page: The page.
@@ -885,7 +887,10 @@ class PageServer:
 
     @property
     def experimenters(self) -> set[Page]:
-        """The open pages of experimenters. Those of them that take part control the session."""
+        """The open web pages of experimenters.
+
+        Those of them that take part control the session.
+        """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:
@@ -909,10 +914,10 @@ class PageServer:
         self.refused["was not asked"] += 1
 
     def _settle_requests(self) -> None:
-        """Decides on requests to take part that nobody has answered in time.
+        """Decides on requests for the control of a session that nobody has answered in time.
 
-        The page may take part if the asked pages have gone, or if the time is over and they no
-        longer hold an arm.
+        A page receives the control if the asked pages have gone, or if the time is over and
+        they no longer hold an arm.
         """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
@@ -927,9 +932,10 @@ class PageServer:
                 page.asks = None
 
     def _list_held_sites(self, page: Page) -> list[str]:
-        """Lists the sites whose arms a page holds, according to the newest frame.
+        """Lists the arms that the person at a web page holds, by the names of their sites.
 
-        Only the sites' records say who holds an arm. Before the first frame the list is empty.
+        Only the records of sites (arm controllers) say who holds an arm. Before the first
+        record the list is empty.
         """
         sites = (self._frame or {}).get("sites", {})
         held_sites: list[str] = []
@@ -939,7 +945,7 @@ class PageServer:
         return held_sites
 
     async def _send(self, page: Page) -> None:
-        """Sends a page the newest frame, each time the page has drawn an earlier frame.
+        """Sends a web page the newest state, each time the page has drawn an earlier one.
 
         The first message is a greeting with the constants of the session. A page for a site
         that the session does not have is closed. The coroutine ends with the connection.
@@ -1022,7 +1028,9 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
-        """Returns the present step of the experiment for a page. Empty without an experiment.
+        """Returns what a web page shows of the present step of an experiment.
+
+        The result is empty without an experiment.
 
         Args:
             page: The page.
@@ -1087,7 +1095,7 @@ class PageServer:
         return numbers
 
     def _list_notices(self, page: Page) -> list[dict[str, Any]]:
-        """Lists the replies of sites that a page has not received yet.
+        """Lists the replies of sites (arm controllers) that a web page has not received yet.
 
         The replies name keys and commands, which only an experimenter can use. Pages of other
         roles receive only which sites refused to stop.
@@ -1105,10 +1113,10 @@ class PageServer:
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns the frame for the user of an arm, who sees the other arms delayed.
+        """Returns what the user of one arm may see, in which the other arms appear delayed.
 
         It has no plots and no events, which would reveal the present state. All pages of the
-        arm get the same frame.
+        arm get the same message (frame).
 
         Args:
             site: Name of the site that controls the arm.
@@ -1122,9 +1130,9 @@ class PageServer:
         return {**self._frames_as_site[site], **hidden_fields}
 
     def _describe_all(self, page: Page) -> dict[str, Any]:
-        """Returns the frame for a page that sees everything, with new points and events.
+        """Returns the state for a web page that sees everything, with new points and events.
 
-        The page remembers how many points and events were sent to it. Its first frame has all
+        The page remembers how many points and events were sent to it. The first message has all
         that are kept.
 
         Args:

@@ -68,7 +68,7 @@ def _round(values: Array, digits: int = 5) -> list[Any]:
 
 
 class _ArmFrames:
-    """Composes the parts of a page's messages that describe one arm: shape, pose and forces.
+    """Composes the parts of messages to a web page that describe one arm: shape, pose, forces.
 
     Args:
         scenario: Scenario of the session.
@@ -88,7 +88,7 @@ class _ArmFrames:
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
-        """Describes what does not change during the session, so that a page can draw the arm.
+        """Describes the constant properties of an arm, so that a web page can draw it.
 
         Returns:
             Role, colour, joints, walls, limits and further constants of the arm, as plain
@@ -137,10 +137,9 @@ class _ArmFrames:
         }
 
     def _describe_hand(self) -> Json | None:
-        """Describes how people can hold the arm: by force or position, and in which limits.
+        """Describes how people can hold the arm: by force or position, and within which limits.
 
-        None if the scenario has no operator of the kind "live" at this site, so that nobody can
-        hold the arm.
+        None if the scenario (the settings of the session) does not let people hold this arm.
         """
         hand = self._hand
         if hand is None:
@@ -166,7 +165,7 @@ class _ArmFrames:
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Computes where the joints of the arm are, for a page that draws it.
+        """Computes where the joints of the arm are, for a web page that draws the arm.
 
         Args:
             q: Positions of the joints, shape (n,), in rad or m.
@@ -183,7 +182,7 @@ class _ArmFrames:
         }
 
     def describe_start(self) -> Json:
-        """Computes where the joints of the arm are before the first tick of the session.
+        """Computes where the joints of the arm are before the first control period.
 
         Returns:
             The pose as `describe_pose` returns it, with the tick -1 and no bodies.
@@ -271,7 +270,7 @@ class _ArmFrames:
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
-        """Describes who holds the arm in the last record, with which strength, and its target.
+        """Describes who holds the arm at present, how firmly, and where the arm shall go.
 
         Empty if nobody can hold the arm.
 
@@ -323,9 +322,9 @@ class _ArmFrames:
         return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
     def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force of the control law that a user feels in the last record, in N.
+        """Returns the force of the remote arms that a user feels at the present, in N.
 
-        The force follows from the law's torque without gravity compensation.
+        It follows from the torque of the control law without gravity compensation.
 
         Returns:
             The components of the force. Empty if the masses of the arm are not known.
@@ -395,7 +394,7 @@ class SessionFrames:
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
-        """Describes what does not change during the session, for a page that draws it.
+        """Describes the constant facts about a session, for a web page that draws it.
 
         Returns:
             The sites, the links and the names of the plotted values, as plain values for JSON.
@@ -441,7 +440,7 @@ class SessionFrames:
         }
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
-        """Describes a session that has not begun: its present and its missing members.
+        """Describes for a web page which processes a session that has not begun waits for.
 
         Args:
             scenario: Scenario of the session. None until a member has sent it.
@@ -458,9 +457,10 @@ class SessionFrames:
         }
 
     def make_frame(self) -> Json | None:
-        """Composes the frame of this moment from the records since the previous frame.
+        """Composes the present state of all arms for web pages, as one message (frame).
 
-        The new points are also added to the plots `points` and `energies`.
+        It covers all records since the previous frame. New points are also added to the plots
+        `points` and `energies`.
 
         Returns:
             The present state of all arms and links, as plain values for JSON. None until every
@@ -522,10 +522,10 @@ class SessionFrames:
         self.points.add(point)
 
     def _add_energies(self) -> None:
-        """Adds the new values of the energies V and supplied to the energy plot.
+        """Adds new values of the stored and the supplied energy to the plot on the web page.
 
-        There is a value for each complete tick. At most one per `ENERGY_PERIOD_S` becomes a
-        point.
+        There is a value for each complete control period. At most one per `ENERGY_PERIOD_S`
+        becomes a point.
         """
         new_energies = self._view.advance_energy()
         if new_energies is None:
@@ -601,10 +601,10 @@ class SessionFrames:
         }
 
     def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
-        """Returns the age of a site's record at a time, in ms.
+        """Returns how old the shown pose of an arm is at a given time, in ms.
 
-        The users of an experiment or a demonstration see there how old the pose of a remote arm
-        is.
+        The users of an experiment or a demonstration see there how late a remote arm appears to
+        them.
 
         Args:
             site: Name of the site.
@@ -655,7 +655,7 @@ class SessionFrames:
         return pose
 
     def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
-        """Describes the present state of one site and its arm, as a part of a frame.
+        """Describes the present state of one arm and its controller (site) for web pages.
 
         Args:
             name: Name of the site.
@@ -720,7 +720,7 @@ class SessionFrames:
     def _describe_new_records(
         self, name: str, site: SiteView
     ) -> tuple[Json, list[float], bool]:
-        """Describes the newest state of an arm, with the extremes since the previous frame.
+        """Describes the newest state of an arm, with the extremes since the last description.
 
         Without new records, the newest record is evaluated again.
 
@@ -792,10 +792,10 @@ class SessionFrames:
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns how many samples of a peer have arrived, and with which delay.
+    """Returns how many messages of a peer have arrived at a site, and with which delay.
 
-    A sample is the state that a peer, another site, publishes in a control period. The
-    receiving site counts them in its statistics.
+    A message (sample) is the state that a peer, another site, publishes in a control period.
+    The receiving site counts them in its statistics.
 
     Args:
         receiving: View of the receiving site.
@@ -817,7 +817,7 @@ def _count_samples(receiving: SiteView, peer: str) -> Json:
 
 
 def _describe_alarm(alarm: LifeAlarm) -> Json:
-    """Returns an alarm for a page.
+    """Returns an alarm, for example about a stopped arm, in the form that a web page shows.
 
     The page has a button for the command that ends the alarm. Therefore the advice does not
     name a shell command.
@@ -832,7 +832,7 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
 
 
 def render_event(event: Event) -> Json:
-    """Formats an event of the session for the list of events on a page.
+    """Formats an event of the session, such as a lost connection, for the list on a page.
 
     Args:
         event: The event.

@@ -77,9 +77,10 @@ class Tail(Generic[T]):
         self.count = 0
 
     def add(self, entry: T) -> None:
-        """Adds an entry. If the list is full, its oldest entry is dropped.
+        """Adds an entry to the end of a list of limited length.
 
-        A reader that was too slow then misses the dropped entry.
+        If the list is full, its oldest entry is dropped. A reader that was too slow then misses
+        this entry.
 
         Args:
             entry: The entry, for example a point of a plot.
@@ -211,15 +212,18 @@ class SiteView:
 
     @property
     def ended(self) -> bool:
-        """True once the site has published its end, so that no further records are expected."""
+        """True once the site has published its end, after which it sends no more records.
+
+        A site is the controller of one arm.
+        """
         return self.reception.final_ticks is not None
 
     @property
     def complete(self) -> int:
-        """Number of the last tick up to which no record of the site can still arrive.
+        """Control period (tick) up to which all records of the site are there or lost for good.
 
-        A record is the result of one tick, a period of the site's control loop. Every record up
-        to this tick has arrived or is lost for good. The value is -1 before the first record.
+        A record is the result of one tick. No earlier record can still arrive. The value is -1
+        before the first record.
         """
         record_account = self.reception.accounts[topics.STATE]
         gap = record_account.find_requestable_gap()
@@ -280,15 +284,18 @@ class SessionView:
 
     @property
     def running(self) -> bool:
-        """True once every site has replied that it runs. Before that, `sites` is empty."""
+        """True once every site (arm controller) has replied that it runs.
+
+        Before that, `sites` is empty.
+        """
         return bool(self.sites)
 
     @property
     def ended(self) -> bool:
-        """True once there is nothing more to observe.
+        """True once there is nothing more to observe of the session.
 
-        This is the case if every site has published its end or has left the network, or if
-        `finish` was called. A session that has not begun has not ended.
+        This is the case if every site (arm controller) has published its end or has left the
+        network, or if `finish` was called. A session that has not begun has not ended.
         """
         if not self.running:
             return False
@@ -300,8 +307,9 @@ class SessionView:
     def has_left(self) -> bool:
         """True if every site has disappeared from the network for longer than `AWAY_NS`.
 
-        The time counts from the last sign of a site: the end of its liveliness token, or its
-        last message. A short loss of the connection therefore does not end the observation.
+        The time counts from the last sign of a site (arm controller): its last message, or the
+        notice that it is gone. A short loss of the connection therefore does not end the
+        observation.
         """
         if self._left_ns is None:
             return False
@@ -310,17 +318,17 @@ class SessionView:
         return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
     def finish(self) -> None:
-        """Marks the session as ended, also if the end of a site was not received.
+        """Marks the session as ended, even if the message about the end of a site was lost.
 
         The process that runs the session calls this when the processes of all sites have ended.
         """
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
-        """Computes for how long no message of a running site has arrived.
+        """Returns for how long no message of a running site has arrived, in s.
 
-        A silence shorter than `MIN_SILENCE_NS` counts as 0, because it is normal. A site that
-        has ended is not silent.
+        A site is the controller of one arm. A silence shorter than `MIN_SILENCE_NS` counts as
+        0, because it is normal. A site that has ended is not silent.
 
         Args:
             site: The site.
@@ -338,10 +346,10 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """Time for which no running site has been heard, in s. It is 0 while any site is heard.
+        """Time for which no running site (arm controller) has been heard, in s.
 
         Displays then say that they wait, because either the session or their own connection is
-        gone.
+        gone. It is 0 while any site is heard.
         """
         silences_s: list[float] = []
         for site in self.sites.values():
@@ -448,9 +456,10 @@ class SessionView:
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
-        """Receives the replies of members, and observes the sites once all of them run.
+        """Receives the replies of a session's processes, and observes its sites once they run.
 
-        The scenario comes with the first reply. An invalid scenario is counted as dropped.
+        A site is the controller of one arm. The scenario (settings of the session) comes with
+        the first reply. An invalid scenario is counted as dropped.
         """
         for info in self._query.poll():
             self.members[info.member] = info
@@ -563,9 +572,9 @@ class SessionView:
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
-        """Gives up the records before the first message, if the observer has joined late.
+        """Gives up requesting records that a site sent before a late observer joined.
 
-        All events of the site are still requested.
+        All events of the site (arm controller) are still requested.
 
         Args:
             site: The site.
@@ -607,7 +616,7 @@ class SessionView:
             self._store_event(name, site, content)
 
     def _store_record(self, name: str, site: SiteView, record: State) -> None:
-        """Stores a record in the window of its site, and applies the changes that it states.
+        """Stores a received record of an arm, and notes the changes of settings that it states.
 
         Records that were sent again may come late. Only a newer one becomes the site's
         `record`.

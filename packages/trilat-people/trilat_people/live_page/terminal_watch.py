@@ -48,7 +48,7 @@ def watch_session(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> int:
-    """Connects to a running session and shows it until it ends or a signal arrives.
+    """Shows a running session, as an observer, until it ends or a signal arrives.
 
     Args:
         session: Name of the session.
@@ -98,7 +98,7 @@ def watch_session(
 
 
 class SessionWatch:
-    """Composes the texts that `trilat watch` shows in a terminal about a running session.
+    """Composes the text by which `trilat watch` shows a running session in a terminal.
 
     Args:
         bus: Network connection that reaches the session.
@@ -165,7 +165,7 @@ class SessionWatch:
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
-        """Sites that need attention because they hold, are stopped or have a fault.
+        """Arm controllers (sites) that need attention: they hold, are stopped or have a fault.
 
         Each entry contains the name of the site and its alarm. Empty if there are none.
         """
@@ -295,7 +295,10 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         return
 
     def read() -> str:
-        """Returns the keys pressed since the last call. Empty if the terminal has gone."""
+        """Returns the keys that were pressed since the last call.
+
+        Empty if there were none, or if the terminal has gone.
+        """
         with suppress(OSError):
             readable, _, _ = select.select([keyboard], [], [], 0.0)
             if readable:

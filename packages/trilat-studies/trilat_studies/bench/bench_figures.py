@@ -82,7 +82,7 @@ def _list_figures_with_values(results: BenchResults) -> list[str]:
 
 
 def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
-    """Collects the numbers of a figure, a field of laws and links for each of its panels.
+    """Collects the numbers of a figure, as one array of laws and links for each panel.
 
     Args:
         results: The results of the suite.
@@ -100,7 +100,7 @@ def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
 
 
 def _draw_bench(results: BenchResults, name: str) -> Figure:
-    """Draws one of the figures that compare the control laws of the suite.
+    """Draws one of the figures that compare the control laws of the benchmark.
 
     Args:
         results: The results of the suite.
@@ -175,7 +175,7 @@ def _choose_scale(fields: list[Array]) -> Normalize:
 
 
 def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
-    """Lists the rows of a task's panel: the laws that have results in the task.
+    """Lists the control laws that have results in a task, one per row of the figure's panel.
 
     Returns:
         Pairs of the name of a law and the form of the suite in which it runs.
@@ -189,7 +189,9 @@ def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
-    """Collects the numbers of the panel of one task, by which its fields are coloured.
+    """Collects the mean values by which the fields of one panel of a figure are coloured.
+
+    A field belongs to a control law (row) and a network link (column).
 
     Args:
         results: The results of the benchmark.
@@ -231,7 +233,7 @@ def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
 
 
 def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
-    """Writes the names of the laws beside the rows of a task's panel.
+    """Writes the names of control laws beside the rows of a panel of the figure.
 
     Args:
         axes: The panel.
@@ -247,7 +249,7 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
-    """Marks cells of a task's panel whose mean hides runs that are not stable, or are open.
+    """Marks fields of a figure whose mean value hides runs that are not stable, or are open.
 
     A cross stands for a run that is not stable, a dot for a run whose stability is open.
 
@@ -276,7 +278,7 @@ def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
-    """Writes the results of a benchmark of control laws as a page, tables and figures.
+    """Writes the results of the benchmark of control laws as a page, tables and figures.
 
     Args:
         results: The results of the benchmark.

@@ -407,7 +407,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Identifier of these gains in the file of all tuned gains.
+        """Identifier of these control gains in the file of all tuned gains.
 
         It consists of the kind of scenario (`form`), the name of the control law, and the round
         trip of the links in ms.
@@ -419,7 +419,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Converts overrides of a scenario to texts KEY=VALUE, as the command line accepts them.
+    """Converts changed settings of a scenario to texts KEY=VALUE for the command line.
 
     Args:
         settings: Values by key of the scenario.
@@ -428,7 +428,9 @@ def format_settings(settings: Settings) -> list[str]:
 
 
 def load_tuning_task(form: str, law: str, round_trip_ms: int) -> TuningScenario:
-    """Loads the scenario in which the benchmark tunes a control law for a round trip.
+    """Loads the scenario in which the gains of a control law are tuned for the benchmark.
+
+    The law is tuned for one round trip of the network.
 
     Args:
         form: Kind of scenario, a key of `BASES`, such as "two" for two arms.
@@ -492,7 +494,7 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Reads gains that were tuned before from a file.
+    """Reads from a file the control gains that were tuned for the benchmark before.
 
     Args:
         path: The file.
@@ -673,7 +675,7 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
 
 
 def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes tuned gains into a file, and keeps the other gains of the file.
+    """Writes tuned control gains into a file, and keeps other gains that the file has.
 
     Args:
         tuned: The gains to write. They replace gains in the file that were tuned for the same
@@ -715,14 +717,14 @@ class BenchCell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the cell in results: task, law and link, as in "contact/wave/rtt272"."""
+        """Name of the law, task and network link in results, as in "contact/wave/rtt272"."""
         return f"{self.task}/{self.law}/{self.link}"
 
     @property
     def inputs(self) -> str:
-        """Digest of everything that determines these runs: base scenario, task, link and gains.
+        """Hash of everything that determines these simulations: scenario, task, link and gains.
 
-        Stored runs with another digest are out of date and are not used.
+        Stored results with another hash are out of date and are not used.
         """
         parts = (
             _load_base_text(self.form),
@@ -734,15 +736,15 @@ class BenchCell(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name of this law, task and link in the journal of finished runs.
+        """Name under which the journal of finished runs stores this law, task and link.
 
-        The name contains the digest `inputs` of the scenario and the gains. Therefore runs with
+        The name contains the hash `inputs` of the scenario and the gains. Therefore runs with
         other gains are not mistaken for these runs.
         """
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the scenario of one run: a law with its tuned gains in a task over a link.
+        """Returns the scenario of one simulation: a control law with its tuned gains in a task.
 
         Args:
             seed: Seed of the run.
@@ -754,7 +756,7 @@ class BenchCell(NamedTuple):
 
 
 class BenchPlan(NamedTuple):
-    """All runs of a benchmark of control laws, or of a selected part, ready to be executed.
+    """All simulations of the benchmark of control laws, or of a part, ready to be executed.
 
     Attributes:
         study: Name of the study, which is a selection of tasks, laws and links.
@@ -781,19 +783,20 @@ class BenchPlan(NamedTuple):
 
     @property
     def links(self) -> list[str]:
-        """Names of the network links of the benchmark, in the order of its figures."""
+        """Names of the benchmark's simulated network links, in the order of its figures."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
     def runs(self) -> int:
-        """Number of runs of all cells: one per seed.
+        """Number of simulations of the benchmark: one per random seed and combination.
 
-        Confirming repetitions come in addition.
+        A combination is a control law in a task over a network link. Repetitions that confirm a
+        result come in addition.
         """
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns the part of the plan for one law in one task over one link, by its name.
+        """Returns one combination of law, task and link, by its name "contact/wave/rtt272".
 
         Args:
             name: Name of the cell, as in "contact/wave/rtt272": task, law and link.
@@ -829,7 +832,7 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Plans a study of the suite, or a part of it.
+    """Plans one of the studies of the benchmark of control laws, or a part of it.
 
     Args:
         study: A key of `STUDIES`.
@@ -878,7 +881,7 @@ def plan_bench(
 
 
 def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[str]) -> str:
-    """Returns the error text for a selection of which no cell can run.
+    """Returns the error text if the user has selected laws that run in no selected task.
 
     Args:
         tasks: Names of the selected tasks.
@@ -903,7 +906,7 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Explains why the benchmark has no run of a control law in a task, for the tables.
+    """Explains in a table why the benchmark does not simulate a control law in a task.
 
     Args:
         law: Name of the control law.

@@ -45,7 +45,9 @@ LEAST_SEEDS = 20
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns the name under which the journal of finished runs stores the runs of a cell.
+    """Returns the name under which a journal stores the finished simulations of one law.
+
+    It belongs to one control law in one task over one network link.
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
@@ -208,14 +210,14 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of runs that are judged stable.
+        """Number of simulations that were judged stable.
 
-        Runs that only came to rest do not count.
+        Runs in which the arms only came to rest do not count.
         """
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Counts the runs of the cell with a given judgement of their stability.
+        """Counts the simulations with a given judgement, for example "not stable".
 
         Args:
             stability: The judgement to count, for example `Stability.NOT_STABLE`.
@@ -296,10 +298,10 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """The results of the benchmark or of a part of it, to be printed, written and searched.
+    """Results of the benchmark or of a part of it, to be printed, written and searched.
 
-    The benchmark runs control laws in several tasks over several links. `places` has one result
-    per cell: a law in a task over a link.
+    The benchmark simulates control laws in several tasks over several network links. `places`
+    has one result per combination of law, task and link.
 
     Attributes:
         plan: Plan of the suite.
@@ -346,16 +348,18 @@ class BenchResults(Result):
             yield _tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns a sentence with the study's name and its numbers of cells and runs.
+        """Returns one sentence with the name of the benchmark and its number of simulations.
 
-        A cell is a control law in a task over a link.
+        It also counts the combinations (cells) of control law, task and network link.
         """
         cells = count_nouns(len(self.places), "cell")
         runs = count_nouns(len(self.runs), "run")
         return f"{self.plan.study}: {cells}, {runs}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat bench --json` prints them.
+        """Converts the results of the benchmark to plain values, for JSON.
+
+        `trilat bench --json` prints them.
 
         Returns:
             The study, the gains that its cells use, and the rows of all cells ("places").
@@ -374,7 +378,7 @@ class BenchResults(Result):
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
-        """Yields the results of a task, optionally those of one control law or one link only.
+        """Yields the results of one task, for all or one of the control laws and links.
 
         Args:
             task: Name of the task, such as "contact".
@@ -387,7 +391,7 @@ class BenchResults(Result):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of one law in one task over one link.
+        """Returns the result of one control law in one task over one network link.
 
         Args:
             task: Name of the task.
@@ -401,9 +405,9 @@ class BenchResults(Result):
 
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the tuned gains with which the laws ran, each once.
+    """Returns the tuned gains with which the control laws were simulated, each once.
 
-    Several tasks and links may share the same gains.
+    Several tasks and network links may share the same gains.
     """
     gains_by_name = {str(cell.tuned): cell.tuned for cell in results.plan.cells}
     return list(gains_by_name.values())
@@ -549,7 +553,7 @@ def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
 
 
 def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
-    """Returns the entries of a law's row in the table of properties, without its name.
+    """Returns the properties of a control law in a task, as entries of a row of a table.
 
     Args:
         law_results: The results of the law in the task, one per link.
@@ -684,9 +688,9 @@ def _tabulate_round_trips(results: BenchResults) -> TextTable:
 
 
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
-    """Returns the mean error of a law in a task over a link, in rad.
+    """Returns the mean position error of a law in a task over a link, in rad.
 
-    None if the law did not run there, or if a run diverged or missed its wall.
+    None if the law did not run there, or if an arm left its limits or missed its wall.
     """
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
@@ -771,7 +775,7 @@ def _tabulate_gains(results: BenchResults) -> TextTable:
 def build_bench_page(
     results: BenchResults, command: str, pictures: Mapping[str, str] = {}
 ) -> str:
-    """Builds the page of the results in Markdown.
+    """Composes the Markdown page that reports the results of the benchmark.
 
     Args:
         results: Results of the suite or of a part of it.
@@ -807,7 +811,7 @@ def build_bench_page(
 
 
 def encode_runs(results: BenchResults) -> str:
-    """Encodes all runs as a CSV table, one line per run.
+    """Encodes all simulations of a benchmark as a CSV table, one line per simulation.
 
     Args:
         results: Results of the suite or of a part of it.
@@ -829,7 +833,7 @@ _CELL_COLUMNS = ("task", "law", "link", "form")
 
 
 def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
-    """Returns the columns that identify a cell: task, law, link and form.
+    """Returns the columns that identify a result in a table: task, law, link and form.
 
     The form is the kind of scenario: how many arms, and whether gravity acts on them.
     """
@@ -837,9 +841,10 @@ def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
 
 
 def _build_row(result: BenchCellResult) -> dict[str, Any]:
-    """Returns the row of a cell in JSON and CSV: judgements, and means with intervals.
+    """Returns the results of one law in one task over one link, as a row of a table.
 
-    Unknown numbers are None, for example the force of the wall in a task without a wall.
+    It has judgements, and means with intervals, for JSON and CSV. Unknown numbers are None, for
+    example the force of the wall in a task without a wall.
 
     Args:
         result: Results of the cell.

@@ -172,7 +172,7 @@ class JudgedRun(NamedTuple):
 
     @property
     def diverged(self) -> bool:
-        """True if an arm exceeded its limits, which ended the run before its time."""
+        """True if the simulation ended early because an arm exceeded its safety limits."""
         return self.end.diverged_at_s is not None
 
 
@@ -768,7 +768,9 @@ def _estimate_impedance(
 def _run_window(
     item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
 ) -> _TipMotion | None:
-    """Executes a run with other settings, and returns the user's motion within a window.
+    """Repeats a simulation with other settings, and returns how the user's arm moved.
+
+    Only a given interval of time is returned. None if an arm left its limits.
 
     Args:
         item: The run.
@@ -827,7 +829,7 @@ BenchFolder = StudyFolder[BenchPlan, BenchRun]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
-    """Creates the folder of a benchmark, or opens an existing folder with finished runs.
+    """Creates the folder of a benchmark, or opens one in which some runs are finished.
 
     Args:
         plan: Plan of the benchmark.
@@ -896,7 +898,7 @@ def run_bench(
     *,
     confirm: bool = False,  # noqa: ARG001
 ) -> BenchResults:
-    """Executes the runs of a benchmark that are not finished yet.
+    """Executes those simulations of a benchmark that are not finished yet.
 
     Args:
         folder: Folder of the benchmark. Its journal contains the finished runs.

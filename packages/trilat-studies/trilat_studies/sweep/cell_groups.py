@@ -43,12 +43,15 @@ class CellGroups(NamedTuple):
 
     @property
     def group_count(self) -> int:
-        """Number of groups: the product of the numbers of parts of all axes."""
+        """Number of groups into which the simulations of a parameter sweep are divided.
+
+        It is the product of the numbers of parts into which the axes are divided.
+        """
         return prod(map(len, self.parts))
 
     @property
     def sentence(self) -> str:
-        """Sentence that tells the user which axes divide the sweep.
+        """Sentence that tells the user along which parameters a sweep is divided into groups.
 
         Empty if there is only one group.
         """

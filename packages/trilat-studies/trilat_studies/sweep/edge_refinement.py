@@ -45,10 +45,11 @@ def choose_side(*, stable: int, decided: int) -> int:
 
 
 class EdgeRefinement:
-    """Chooses the cells of a sweep along the stability edge, in rounds of finer resolution.
+    """Chooses which parameter combinations of a sweep are simulated, near edges of stability.
 
-    The caller runs the cells that `find_next_cells` returns, and passes their results to its
-    next call, until no cells are returned.
+    It begins with a coarse grid and makes it finer in rounds. The caller simulates the
+    combinations (cells) that `find_next_cells` returns, and passes their results to its next
+    call, until no cells are returned.
 
     Args:
         plan: The sweep, whose `refine` is the number of halvings.
@@ -64,7 +65,9 @@ class EdgeRefinement:
         self._chosen = np.zeros(plan.cells, bool)
 
     def find_next_cells(self, sides: Mapping[int, int]) -> list[int]:
-        """Stores the results of the last round, and returns the cells of the next round.
+        """Stores the results of the last simulations, and returns which ones are needed next.
+
+        They are combinations of the swept parameters (cells) near an edge of stability.
 
         Args:
             sides: Side of each cell that has run since the last call.
@@ -87,7 +90,10 @@ class EdgeRefinement:
         return []
 
     def list_coarse_cells(self) -> list[int]:
-        """Returns the numbers of the cells of the coarse grid, with which the sweep begins."""
+        """Returns the numbers of the parameter combinations with which a refined sweep begins.
+
+        They form a coarse grid, which is refined where neighbouring results differ.
+        """
         is_needed = np.zeros(self._shape, bool)
         for panel in self._iterate_panels():
             is_needed[panel] = self._mark_lattice()
@@ -95,9 +101,10 @@ class EdgeRefinement:
         return numbers
 
     def count_most_cells(self) -> int:
-        """Estimates how many cells will run, if the edge crosses each panel of the map once.
+        """Estimates how many parameter combinations will be simulated in a refined sweep.
 
-        The estimate serves to tell the user how long the sweep will take.
+        It is assumed that the edge of stability crosses each panel of the map once. The
+        estimate serves to tell the user how long the sweep will take.
         """
         panels = sum(1 for _ in self._iterate_panels())
         along_edge = 0
@@ -119,9 +126,9 @@ class EdgeRefinement:
         yield from itertools.product(*indices)
 
     def _find_lines(self, dimension: int, level: int) -> NDArray[np.int64]:
-        """Returns the indices along one axis at which the boxes of a level have their corners.
+        """Returns the indices along one axis at which the grid of one resolution has its lines.
 
-        Level 0 is the coarse grid. Each further level halves the boxes.
+        Level 0 is the coarse grid. Each further level halves the distance of the lines.
         """
         last = self._shape[dimension] - 1
         stride = 1 << (self._halvings - level)
@@ -135,9 +142,10 @@ class EdgeRefinement:
         return is_needed
 
     def _mark_panel(self, panel: tuple[int | slice, ...]) -> NDArray[np.bool_]:
-        """Marks the cells of a panel that must run at the present level of resolution.
+        """Marks the parameter combinations of a panel that must be simulated in this round.
 
-        They are the points that halve the boxes which the edge crosses.
+        They are the points that halve the boxes of the grid which the edge of stability
+        crosses.
 
         Args:
             panel: Index of the panel.

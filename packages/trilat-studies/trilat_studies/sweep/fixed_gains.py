@@ -43,7 +43,7 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
 
 
 def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
-    """Yields one text for each combination of a law and its gains in a scenario.
+    """Yields one text for each control law of a sweep, with the gains that are not swept.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -66,7 +66,7 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
 
 
 def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
-    """Yields the gains of a site's law that no axis of the sweep changes, with their values.
+    """Yields the control gains that a parameter sweep leaves unchanged, with their values.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -119,7 +119,7 @@ def _read_default_settings(law: ImportedLaw) -> dict[str, Any]:
 
 
 def _list_defaults(arguments: ast.arguments) -> dict[str, Any]:
-    """Returns the defaults of a function's arguments, by name.
+    """Returns the default values of a Python function's arguments, by name.
 
     Args:
         arguments: The arguments, as Python's parser returns them.

@@ -222,7 +222,7 @@ def _count_columns(panels: int, form: FigureSize) -> int:
 
 
 def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
-    """Returns the height of a panel, in inches.
+    """Returns the height of a panel of the stability map, in inches.
 
     Args:
         plane: The map. If only one axis is drawn, its panels are low strips.
@@ -234,7 +234,7 @@ def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
 
 
 def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
-    """Returns the lines of the caption, which names the gains that were not swept.
+    """Returns the lines of a figure's caption, which names the gains that were not swept.
 
     Args:
         fixed: Gains that were not swept, one text per control law.
@@ -286,7 +286,9 @@ def _write_caption(
 
 
 def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
-    """Draws the cells of a panel, hatches the undecided ones, and draws the lines on top.
+    """Draws one panel of a stability map: its coloured cells, and lines of theory on top.
+
+    Cells whose result is undecided are hatched.
 
     Args:
         axes: Where to draw.
@@ -307,10 +309,10 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 
 
 def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Draws the coloured cells of a panel. Cells without runs stay empty.
+    """Draws the coloured cells of a panel, one for each combination of two parameters.
 
     The colour shows the growth exponent if the sweep measured it, else the share of stable runs
-    if there are several seeds, else the class of the single run.
+    if there are several seeds, else the class of the single run. Cells without runs stay empty.
 
     Args:
         axes: The panel of the figure.
@@ -342,7 +344,7 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Hatches the cells of which half or more of the runs are undecided.
+    """Hatches the cells of a map in which half or more of the simulations are undecided.
 
     Neighbouring cells of a row form one rectangle, because the hatching would show seams.
 
@@ -445,16 +447,16 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
 
 
 def _find_line_style(line: MapLine) -> dict[str, Any]:
-    """Returns the plot options of a line.
+    """Returns the plot options, such as colour and dashes, of a line in a stability map.
 
-    Lines of the same kind have the same rank and style.
+    Lines of the same kind have the same style in all panels.
     """
     style_index = line.rank % len(_LINE_STYLES)
     return _LINE_STYLES[style_index]
 
 
 def _extend_positions(axis: PlaneAxis) -> Array:
-    """Returns the positions of an axis's values with the borders of the panel at both ends.
+    """Returns the positions of an axis's values, extended by the borders of the panel.
 
     A line that is known at the first and the last value is thereby drawn up to the border.
     """
@@ -483,7 +485,7 @@ def _extrapolate_rows(rows: Array, positions: Array) -> Array:
 
 
 def _extrapolate_row(rows: Array, positions: Array) -> Array:
-    """Returns a row outside of a field, on the straight line through the two nearest rows.
+    """Extends a field of numbers by a row, on the straight line through two nearest rows.
 
     Args:
         rows: The nearest row and the one behind it, shape (2, m).
@@ -499,7 +501,7 @@ def _extrapolate_row(rows: Array, positions: Array) -> Array:
 
 
 def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
-    """Returns which cells have runs but no clear result and must be hatched.
+    """Returns which cells of a map have simulations without a clear result, to hatch them.
 
     These are the cells of which half or more of the runs are undecided. On a map of growth
     exponents, they are the cells without an exponent.
@@ -517,7 +519,9 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
 
 
 def _set_scale(axes: Axes, plane: MapPlane) -> None:
-    """Sets the limits of a panel to the borders of its outer cells, and sets its ticks.
+    """Sets the limits and the ticks of both axes of a panel of the stability map.
+
+    The limits are the outer borders of the first and the last cells.
 
     Args:
         axes: The panel in the figure.
@@ -536,7 +540,7 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
 
 
 def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
-    """Sets the ticks of one axis of a panel.
+    """Sets the ticks of one axis of a panel of the stability map.
 
     If the values are equally spaced, the ticks are round numbers. Otherwise they are the values
     themselves.
@@ -552,7 +556,7 @@ def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
 
 
 def _find_exponent_limit(plane: MapPlane) -> float:
-    """Returns the exponent at which the colours end, in 1/s.
+    """Returns the growth exponent at which the colour scale of a map ends, in 1/s.
 
     The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed it,
     so that a few large exponents do not make all others pale.
@@ -612,9 +616,10 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
 
 
 def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Writes the numbers of stable and of decided runs into the cells whose runs disagree.
+    """Writes the numbers of stable and of decided runs into cells whose runs disagree.
 
-    Nothing is written if the numbers do not fit into a cell.
+    The runs of a cell differ in their random seeds. Nothing is written if the numbers do not
+    fit into a cell.
     """
     extent = axes.get_window_extent()
     dpi = axes.figure.dpi
@@ -646,7 +651,7 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
-    """Draws the legend: the classes or the edge of the classes, the hatching, and the lines.
+    """Draws the legend of a stability map: its colours, its hatching and its lines.
 
     Args:
         figure: The Matplotlib figure.
@@ -811,7 +816,10 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 
 
 def describe_refined_cells(plane: MapPlane) -> str:
-    """Returns how many cells of a refined sweep ran, as in "1243 of 40401 cells ran"."""
+    """Returns how many parameter combinations ran, as in "1243 of 40401 cells ran".
+
+    A refined sweep simulates only those near an edge of stability.
+    """
     ran = sum(int((panel.runs > 0).sum()) for panel in plane.panels)
     cells = sum(panel.runs.size for panel in plane.panels)
     return f"{ran} of {count_nouns(cells, 'cell')} ran"
@@ -912,9 +920,9 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
 
 
 def _format_edge(edge: StabilityEdge) -> str:
-    """Returns an edge of stability as text: "40 to 60", the values between which it lies.
+    """Returns an edge of stability as text, such as "40 to 60", between which values it lies.
 
-    A line of theory has a single value, "52.3".
+    An edge that is computed from theory has a single value, such as "52.3".
     """
     if edge.low == edge.high:
         return f"{edge.low:.4g}"
@@ -922,7 +930,9 @@ def _format_edge(edge: StabilityEdge) -> str:
 
 
 def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
-    """Returns the text of the edge that is nearest to a value. "-" if there are no edges.
+    """Returns the measured edge that is nearest to a predicted value, as text.
+
+    "-" if there are no edges.
 
     Args:
         value: Value on the vertical axis, usually that of a line of theory.
@@ -935,7 +945,10 @@ def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
 
 
 def _compare_with_line(edge: StabilityEdge, values: Sequence[float]) -> list[str]:
-    """Returns the table cells of a line: its crossing nearest to an edge, and the difference.
+    """Compares a measured edge of stability with a line that theory predicts.
+
+    Returns the table cells with the crossing of the line nearest to the edge, and the
+    difference.
 
     Args:
         edge: The measured edge.

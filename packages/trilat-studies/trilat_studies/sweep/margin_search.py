@@ -107,10 +107,10 @@ def search_key_margin(
     results: dict[float, bool | None] = {}
 
     def classify(value: float) -> bool | None:
-        """Returns whether the scenario is stable at a value of the searched key.
+        """Returns whether the scenario is stable at a value of the searched parameter.
 
-        Scan and bisection may come to the same value. It is run once, and the result is kept.
-        None means that the run is undecided.
+        Scan and bisection may come to the same value. It is simulated once, and the result is
+        kept. None means that the run is undecided.
         """
         if value not in results:
             results[value] = stable(value)
@@ -194,7 +194,7 @@ def _bisect(
 
 
 class SearchRange(NamedTuple):
-    """Key of a scenario along which edges of stability are searched, and the searched range.
+    """A setting along which the limits of stability are searched, and the searched range.
 
     Attributes:
         key: Scenario key along which edges are searched.
@@ -257,7 +257,7 @@ class GridPointMargin(NamedTuple):
 
 
 def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
-    """Parses the range of a search, such as "control.d=0.2:3".
+    """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
 
     Args:
         text: Text of the form KEY=FROM:TO.
@@ -370,7 +370,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        """Returns the scenario of this grid point and seed with a value of the searched key.
+        """Returns the scenario of one combination with a value of the searched setting.
 
         Args:
             value: Value of the scenario key along which the limit of stability is searched.
@@ -379,7 +379,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
-        """Runs the scenario with a value of the searched key, as a cell of a sweep is run.
+        """Simulates the scenario with a value of the searched parameter, and judges the run.
 
         Args:
             value: Value of the searched key.
@@ -410,9 +410,9 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the edge that is nearest to a value. None if there are no edges.
+    """Returns the predicted limit of stability that is nearest to a measured one.
 
-    The table shows the edge of theory that is nearest to the measured one.
+    None if there are no predicted limits.
     """
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
@@ -439,7 +439,7 @@ class SweepMargins(Result):
     def command(self) -> str:
         """Shell command that repeats this search for limits of stability.
 
-        The page with the results shows it.
+        The web page with the results shows the command, so that a user can copy it.
         """
         low = format_override_value(self.within.low)
         high = format_override_value(self.within.high)
@@ -492,7 +492,7 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields the table of the measured and predicted limits of stability."""
+        """Yields a table of the limits of stability, as simulated and as predicted."""
         yield self.table()
 
     def headline(self) -> str:
@@ -521,7 +521,9 @@ class SweepMargins(Result):
         }
 
     def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
-        """Returns the plain values of a grid point for `to_dict`: position, seed and edges.
+        """Returns the result of one combination of swept parameters as plain values for JSON.
+
+        These are its position in the grid, its random seed and its edges of stability.
 
         Args:
             point: Margin of the grid point.
@@ -582,7 +584,7 @@ class SweepMargins(Result):
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> list[Path]:
-        """Writes the results into an existing folder, as margin.json and margin.md.
+        """Writes the limits of stability into an existing folder, as margin.json and margin.md.
 
         Args:
             folder: The folder.
@@ -598,7 +600,7 @@ class SweepMargins(Result):
 
 
 def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
-    """Returns two table cells: a measured edge, as in "40 to 41", and its stable side.
+    """Returns two table cells: a limit of stability as in "40 to 41", and its stable side.
 
     Args:
         margin: The edges of the grid point.
@@ -620,7 +622,9 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
 
 def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
-    """Returns two table cells: an edge from theory, and its difference from the measured edge.
+    """Returns two table cells: a limit of stability from theory, and its deviation.
+
+    The deviation is the difference from the measured limit.
 
     Args:
         span: The measured edge. None if there is no edge, and thus no difference.

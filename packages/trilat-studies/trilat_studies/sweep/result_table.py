@@ -42,7 +42,7 @@ trace exceeds the default limit of the csv module, 131 072 characters.
 
 
 def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Iterator[str]:
-    """Yields the CSV text of a header and of each row, so that a table may be large.
+    """Yields a table as CSV text line by line, so that a large one needs little memory.
 
     Args:
         rows: The rows, as values by column.
@@ -60,9 +60,9 @@ def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> It
 
 
 class ResultTable:
-    """Columns of the file results.csv of a sweep, with which its rows are written and read.
+    """Columns of the file results.csv of a parameter sweep, to write and read its rows.
 
-    The columns depend on the sweep: each swept key has one.
+    Each swept parameter has a column, so that the columns depend on the sweep.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -75,11 +75,11 @@ class ResultTable:
 
     @property
     def columns(self) -> list[str]:
-        """Names of all columns, in the order of the file."""
+        """Names of all columns of the table of a sweep, in the order of the CSV file."""
         return [*self._kinds, _SCENARIO_COLUMN]
 
     def encode(self, rows: Iterable[ResultRow]) -> Iterator[str]:
-        """Yields the header of the table, and the text of each row.
+        """Yields the CSV text of a sweep's results: a header, then the text of each row.
 
         Args:
             rows: The runs, one mapping from columns to values per run.
@@ -94,7 +94,7 @@ class ResultTable:
         return line
 
     def parse(self, line: Mapping[str, str]) -> ResultRow:
-        """Returns the row of a line of the CSV table, with the complete text of its scenario.
+        """Returns the results in one line of a CSV table, with the scenario's full text.
 
         Args:
             line: Texts of the line, by column.
@@ -185,7 +185,7 @@ class StoredRows(Sequence[ResultRow]):
     __hash__ = None  # type: ignore[assignment]
 
     def find_cell(self, number: int) -> list[ResultRow]:
-        """Reads the rows of one cell from the file: its runs with different random seeds.
+        """Reads the results of one combination of parameters, one row per random seed.
 
         Args:
             number: Number of the cell.
@@ -208,7 +208,7 @@ class StoredRows(Sequence[ResultRow]):
                     yield self._name_fields(fields)
 
     def _name_fields(self, fields: Sequence[str]) -> dict[str, str]:
-        """Returns the texts of a row, in the order of the file, as texts by column.
+        """Returns the fields of one line of the CSV table by the names of their columns.
 
         Raises:
             ValueError: The row has too few or too many fields.
@@ -217,7 +217,7 @@ class StoredRows(Sequence[ResultRow]):
 
     @contextmanager
     def _explaining_errors(self) -> Iterator[None]:
-        """Replaces errors of a damaged table by one that names the file.
+        """Replaces errors of a damaged CSV table by an error that names the file.
 
         Raises:
             UsageError: The table cannot be read.
@@ -231,7 +231,7 @@ class StoredRows(Sequence[ResultRow]):
 
 
 def read_rows(file: Path, plan: SweepPlan) -> Sequence[ResultRow]:
-    """Reads the table of results of a sweep. The rows of a large table stay in the file.
+    """Reads the results of a parameter sweep. The rows of a large table stay in the file.
 
     Args:
         file: The CSV table.
@@ -274,9 +274,10 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
 
 
 def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns that identify a cell, with their types: number, axes and law.
+    """Returns the columns of a CSV table that identify a combination of swept parameters.
 
-    The types serve to read the CSV table again.
+    They are its number, the value of each axis, and the control law, with the types by which
+    the table is read again.
     """
     column_types: dict[str, type] = {"cell": int}
     for axis in plan.axes:
@@ -286,7 +287,7 @@ def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
 
 
 def format_table_cell(value: Any, kind: type) -> str:
-    """Returns the text of a cell of the CSV table, from which numbers parse back bit for bit.
+    """Converts a value to a field of a CSV table, from which a number reads back bit for bit.
 
     Args:
         value: The value. None becomes an empty text.
@@ -300,7 +301,7 @@ def format_table_cell(value: Any, kind: type) -> str:
 
 
 def _parse_cell(text: str, kind: type) -> Any:
-    """Returns the value of a cell of the CSV table; the inverse of `format_table_cell`.
+    """Converts a field of a sweep's CSV table to a value; the inverse of `format_table_cell`.
 
     Args:
         text: Text of the cell.

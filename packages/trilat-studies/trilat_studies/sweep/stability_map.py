@@ -78,7 +78,10 @@ class PlaneAxis(NamedTuple):
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the values are equally spaced, up to rounding, or fewer than three."""
+        """True if the values on an axis of the map are equally spaced, up to rounding.
+
+        It is also true for fewer than three values.
+        """
         steps = np.diff(self.values)
         if len(steps) < 2:
             return True
@@ -87,7 +90,7 @@ class PlaneAxis(NamedTuple):
 
     @property
     def positions(self) -> Array:
-        """Positions at which the values are drawn along the axis, shape (K,) for K values.
+        """Positions at which the K swept values are drawn along an axis of a map, shape (K,).
 
         Equally spaced values are drawn at their own positions. Other values, as in 1, 10, 100,
         are drawn at equal distances, at their indices.
@@ -124,13 +127,16 @@ class MapPanel(NamedTuple):
 
     @property
     def runs(self) -> RunCounts:
-        """Number of all runs at each grid point, decided or not, shape (y, x)."""
+        """Number of simulations at each grid point of a map, decided or not, shape (y, x).
+
+        The simulations of a point differ in their random seeds.
+        """
         total: RunCounts = self.counts.sum(axis=2)
         return total
 
     @property
     def stable(self) -> RunCounts:
-        """Number of runs per grid point that were judged stable, shape (y, x)."""
+        """Number of simulations at each grid point that were judged stable, shape (y, x)."""
         is_stable = [verdict.stable is True for verdict in CELL_CLASSES]
         stable: RunCounts = self.counts[:, :, is_stable].sum(axis=2)
         return stable
@@ -147,9 +153,9 @@ class MapPanel(NamedTuple):
 
     @property
     def share(self) -> Array:
-        """Fraction of runs that are stable at each grid point of the panel.
+        """Fraction of simulations that are stable, at each grid point of a panel of the map.
 
-        Undecided runs, for example too short ones, are left out. NaN if all runs of a grid
+        Undecided simulations, for example too short ones, are left out. NaN if all of a grid
         point are undecided. The shape is (number of y values, number of x values).
         """
         stable = self.stable
@@ -160,10 +166,10 @@ class MapPanel(NamedTuple):
 
 
 class MapPlane(NamedTuple):
-    """The measured part of a stability map: panels over the same two axes.
+    """Results of the simulations in a stability map: panels over the same two parameters.
 
-    If only one swept axis has numeric values, the vertical axis y has an empty key and a single
-    value.
+    If only one swept parameter has numeric values, the vertical axis y has an empty key and a
+    single value.
 
     Attributes:
         scenario: Name of the swept scenario.
@@ -195,7 +201,10 @@ class MapPlane(NamedTuple):
 
     @property
     def seeds(self) -> int:
-        """Largest number of runs at any grid point. 1 if the sweep has a single seed."""
+        """Largest number of simulations at a grid point, which differ in their random seeds.
+
+        1 if the sweep has a single seed.
+        """
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
@@ -212,7 +221,7 @@ def fill_panel(panel: MapPanel) -> MapPanel:
     from scipy.ndimage import distance_transform_edt
 
     def find_nearest(is_missing: Any) -> Any:
-        """Returns for each grid point the indices of the nearest point that is not missing."""
+        """Returns for each grid point the indices of the nearest point with a result."""
         return distance_transform_edt(is_missing, return_distances=False, return_indices=True)
 
     if not panel.runs.any():
@@ -313,7 +322,9 @@ def build_plane(
 
 
 class _PanelRuns:
-    """Counts the runs of a panel by grid point and class, and averages their growth exponents.
+    """Counts the simulations of one panel of a map by grid point and by how they ended.
+
+    It also averages their growth exponents.
 
     Args:
         x: Horizontal axis.
@@ -333,7 +344,7 @@ class _PanelRuns:
         self.counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
 
     def add(self, run: Mapping[str, Any]) -> None:
-        """Counts a finished run at its grid point.
+        """Counts a finished simulation at its grid point of the map.
 
         Args:
             run: A row for `build_plane`.
@@ -347,7 +358,10 @@ class _PanelRuns:
         self._sums_per_s[row, column] += np.nan if exponent is None else exponent
 
     def compute_exponents(self) -> Array:
-        """Returns the mean growth exponent of each grid point, see `MapPanel`."""
+        """Returns the mean rate at which a small disturbance grows, for each grid point.
+
+        It is negative where disturbances decay, see `MapPanel`.
+        """
         runs = self.counts.sum(axis=2)
         exponents_per_s: Array = self._sums_per_s / np.maximum(runs, 1)
         exponents_per_s[runs == 0] = np.nan
@@ -358,7 +372,7 @@ _CLASS_INDEX = {verdict.value: index for index, verdict in enumerate(CELL_CLASSE
 
 
 def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
-    """Returns the title of a panel, such as "p d, delay 200 ms".
+    """Returns the title of a panel of the stability map, such as "p d, delay 200 ms".
 
     Numbers are given with the name and unit of their key. Other values are given alone, with
     spaces for underscores, except for the name of a law, which stays as it is.
@@ -800,7 +814,7 @@ _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imag
 
 
 def compute_borders(axis: PlaneAxis) -> Array:
-    """Returns the borders of the cells along an axis, halfway between the values.
+    """Returns the borders of a map's cells along an axis, halfway between the swept values.
 
     If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
 
@@ -844,7 +858,7 @@ class _FineColumns(NamedTuple):
 
 
 def _keep_columns(axis: PlaneAxis) -> _FineColumns:
-    """Returns the columns of a map alone, for lines that are not computed between them.
+    """Returns the columns of a map alone, for lines of theory without points between them.
 
     Args:
         axis: Horizontal axis of the map.
@@ -931,7 +945,7 @@ class MapLine(NamedTuple):
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: _FineColumns) -> "MapLine":
-        """Returns this line, given at fine columns, with the columns of the map apart.
+        """Divides a line of theory into its points at a map's columns and those between.
 
         Args:
             columns: The columns at which the line is given.
@@ -1200,7 +1214,7 @@ def find_criterion_edge(
     from scipy.optimize import brentq
 
     def excess(value: float) -> float:
-        """Returns by how much a value satisfies the condition; negative if it does not."""
+        """Returns by how much a value satisfies the condition. Negative if it is violated."""
         evaluated = criterion(value)
         if evaluated is None:
             raise ScenarioError("no criterion covers it")
@@ -1223,7 +1237,7 @@ LAW_AXIS = "law"
 
 
 class StabilityMap(NamedTuple):
-    """A complete stability map: the measurements and the lines from theory.
+    """Map of stable and unstable parameters: simulated results and lines from theory.
 
     Attributes:
         plane: The measurements, as panels.
@@ -1324,7 +1338,7 @@ def build_stability_map(
 
 
 def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
-    """Arranges the runs of a sweep for a map, over all values that the plan gives to its axes.
+    """Arranges the simulations of a sweep in a grid for a map, with an axis per parameter.
 
     Args:
         results: The sweep.
@@ -1401,7 +1415,7 @@ def _spread_line(
         return None
 
     def spread_rows(excess: Array) -> Array:
-        """Interpolates each column at the y values of the map."""
+        """Interpolates each column of numbers at the y values of the map."""
         columns = [np.interp(plane.y.values, y.values, column) for column in excess.T]
         return np.array(columns).T
 

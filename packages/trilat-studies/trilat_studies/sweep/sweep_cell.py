@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
 
 class CellClass(StrEnum):
-    """Result of a run of a sweep in one word, such as stable or undecided.
+    """How a simulation of a parameter sweep ended, such as stable or undecided.
 
-    The values are the texts in tables and on pages.
+    The values are the words in tables and on pages.
     """
 
     CONVERGED = "converged"
@@ -94,9 +94,10 @@ _DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
 
 
 class CellResult(msgspec.Struct, frozen=True):
-    """Result of one run of a sweep: its class, and what was measured in it.
+    """Result of one simulation of a parameter sweep: how it ended, and what was measured.
 
-    Below, e is the error of a site against its reference, and qd the velocity of a joint.
+    Below, e is the error of a site (arm controller) against its reference, and qd the velocity
+    of a joint. A cell is a combination of parameter values.
 
     Attributes:
         verdict: Class of the cell.
@@ -154,7 +155,7 @@ class CellResult(msgspec.Struct, frozen=True):
 
 
 def build_unsimulated_result(verdict: CellClass, reasons: str) -> CellResult:
-    """Returns the result of a cell without a run.
+    """Returns the result of a parameter combination that was decided without a simulation.
 
     Args:
         verdict: Class of the cell.
@@ -201,7 +202,7 @@ def check_sweepable(scenario: Scenario) -> None:
 
 
 class _CellInProgress:
-    """A cell whose run is in progress.
+    """A simulation of a parameter sweep that is in progress, and may still be extended.
 
     Args:
         scenario: Scenario of the cell. Its `duration_s` is the first duration.
@@ -221,10 +222,10 @@ class _CellInProgress:
         self.run = FusedRun(scenario, SETTLED_ERROR_RAD)
 
     def note_first_end(self) -> None:
-        """Evaluates the run at the end of the scenario's duration.
+        """Judges the simulation at the end of the planned duration, before any extension.
 
-        Totals, such as the RMS error, are taken here, before any extension. A run that chatters
-        at a wall is not extended, see `classify_cell`.
+        Totals, such as the RMS error, are taken here. A run that chatters at a wall is not
+        extended, see `classify_cell`.
         """
         self._totals = self.run.totals._asdict()
         self._evaluate()
@@ -242,7 +243,7 @@ class _CellInProgress:
         return min(2.0 * self._end_s, self._longest_s)
 
     def note_extension(self, end_s: float) -> None:
-        """Evaluates the run again after an extension, which may have shown how it ends.
+        """Judges the simulation again after it was extended, because its end was undecided.
 
         Args:
             end_s: New end of the run, in s.
@@ -252,10 +253,10 @@ class _CellInProgress:
         self._evaluate()
 
     def judge(self) -> CellResult:
-        """Returns the result of the cell, with the decision of the stability certificate.
+        """Decides how the simulation ended, with the help of the stability certificate.
 
-        It is called once, after the last extension, because the decision needs the roots of the
-        loop and takes longer than an evaluation.
+        It is called once, after the last extension, because the certificate needs the roots of
+        the control loop and takes longer than an evaluation.
         """
         judged = judge_virtual_run(self._scenario, self.run)
         decision = judged.decision
@@ -309,7 +310,9 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
 
 class _JudgedCell(NamedTuple):
-    """Result of a cell that was run side by side with others, if possible.
+    """Result of a parameter combination that was simulated side by side with others.
+
+    It may have been simulated alone, if it has a property that does not permit this.
 
     Attributes:
         result: Result of the cell.
@@ -400,9 +403,10 @@ def measure_exponent(scenario: Scenario) -> float | None:
 
 
 def judge_linearly(scenario: Scenario) -> CellResult:
-    """Classifies a cell by the rightmost characteristic root of its linear loop, without a run.
+    """Decides without a simulation whether a parameter combination is stable.
 
-    The cell is undecided if the scenario has no linear loop, or if nothing moves.
+    The linearised control loop is stable if the real parts of all its characteristic roots are
+    negative. The result is undecided if the scenario has no linear loop, or if nothing moves.
 
     Args:
         scenario: Scenario of the cell.
@@ -502,7 +506,7 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 def _build_result(
     run: FusedRun, end: RunEnd, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
-    """Returns the result of a cell, as far as its run has been simulated so far.
+    """Returns how a simulation of a sweep has ended, as far as it has been continued.
 
     Args:
         run: The run.
@@ -568,7 +572,7 @@ def diff_lines(text: str, base: str) -> LineDiff:
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
-    """Restores a text from its differences from a base, as `diff_lines` encoded them.
+    """Restores a text from its differences from another text, see `diff_lines`.
 
     Args:
         parts: Differences, as `diff_lines` returns them.
@@ -586,7 +590,7 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
 
 
 class CellRun(msgspec.Struct, frozen=True):
-    """A finished run of a sweep with its result, as the journal of the sweep stores it.
+    """A finished simulation of a sweep with its result, as the sweep's journal stores it.
 
     Attributes:
         cell: Number of the cell.

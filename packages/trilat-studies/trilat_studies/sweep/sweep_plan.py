@@ -107,13 +107,13 @@ class _SweepAxis(NamedTuple):
 
     @property
     def numeric(self) -> bool:
-        """True if all values of the axis are numbers, so that it can be an axis of a map."""
+        """True if all values of a swept parameter are numbers, as an axis of a map needs."""
         if isinstance(self.texts, _Steps):
             return True
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the override that sets one value of the key, as in "link.delay_ms=50".
+        """Returns the text that sets one value of a swept parameter, as in "link.delay_ms=50".
 
         Args:
             number: Index of the value, from 0.
@@ -122,7 +122,7 @@ class _SweepAxis(NamedTuple):
 
 
 def parse_axis(description: str) -> _SweepAxis:
-    """Parses the text with which a user describes an axis of a sweep.
+    """Parses a swept parameter, as a user writes it, such as "link.delay_ms=0:200:10".
 
     Args:
         description: Either "KEY=a:b:step", a range that includes b if a whole number of steps
@@ -156,7 +156,7 @@ def parse_axis(description: str) -> _SweepAxis:
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Converts the axes of a sweep, as a Python program may give them, to texts KEY=VALUES.
+    """Converts swept parameters, as a Python program may give them, to texts KEY=VALUES.
 
     Args:
         over: One text, a list of texts, or a mapping from keys to values. The values are a
@@ -171,7 +171,7 @@ def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
 
 
 def _join_values(values: Any) -> str:
-    """Returns the values of an axis as the text that follows "KEY=".
+    """Returns the values of a swept parameter as the text after "KEY=" in a command.
 
     Args:
         values: Finished text, a list, an array or a single value. A string that is a word, such
@@ -188,7 +188,7 @@ def _join_values(values: Any) -> str:
 
 
 def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
-    """Returns the values of a range "first:last:step".
+    """Returns the values of a swept parameter that is written as "first:last:step".
 
     Args:
         key: Scenario key of the axis, for error messages.
@@ -243,7 +243,7 @@ def _parse_decimal(key: str, text: str) -> Decimal:
 
 
 def _parse_list(key: str, text: str) -> tuple[str, ...]:
-    """Returns the values of a list "v1,v2,v3" as texts.
+    """Splits the values of a swept parameter, written as "v1,v2,v3", into separate texts.
 
     Args:
         key: Scenario key of the axis, for error messages.
@@ -318,7 +318,7 @@ _CHECKED_VALUES = 32
 
 
 class SweepCell(NamedTuple):
-    """One combination of the parameter values of a sweep and of a control law.
+    """One combination of parameter values and a control law, as a sweep simulates it.
 
     Attributes:
         number: Number of the cell, counted row by row from 0. The law changes slowest, and the
@@ -392,11 +392,11 @@ class SweepPlan(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """Number of combinations of all parameter values and control laws."""
+        """Number of combinations of all swept parameter values and control laws."""
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
-        """Returns the combination of parameter values and control law with a given number.
+        """Returns a combination of parameter values and control law by its number.
 
         Args:
             number: Number of the combination, from 0, counted row by row in the grid of the
@@ -430,7 +430,7 @@ class SweepPlan(NamedTuple):
         return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Loads the scenario of the sweep, with further overrides such as those of one cell.
+        """Loads the scenario of the sweep with further settings, such as one delay of many.
 
         Args:
             more: Further overrides KEY=VALUE.
@@ -441,12 +441,12 @@ class SweepPlan(NamedTuple):
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns the plan of the sweep as plain values for a JSON file.
+        """Returns the plan of a parameter sweep as plain values, which a JSON file stores.
 
         `plan_from_json` restores the plan from them. The keys "judge" (how runs are judged),
-        "metrics" (which further metrics are measured) and "refine" (how often the edge is
-        refined) are left out if they have their defaults, so that plans of older versions give
-        the same file.
+        "metrics" (which further quantities are measured) and "refine" (how often the edge of
+        stability is refined) are left out if they have their defaults, so that plans of older
+        versions give the same file.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -592,7 +592,9 @@ _REFINED_AXES = 2
 
 
 def list_refined_axes(axes: Sequence[_SweepAxis]) -> list[int]:
-    """Returns the indices of the axes that a refined sweep halves: the first two numeric ones.
+    """Returns which swept parameters are refined where the results of neighbours differ.
+
+    These are the first two with numbers as values. The result has their indices.
 
     Args:
         axes: All axes of the sweep.
@@ -666,7 +668,7 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
 
 
 class _Base(NamedTuple):
-    """The scenario of a sweep before its axes and laws are applied.
+    """Scenario of a sweep before any parameter is varied.
 
     Attributes:
         scenario: The scenario.
@@ -733,7 +735,7 @@ def _check_law_name(law: str) -> None:
 
 
 def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> tuple[str, ...]:
-    """Returns the overrides that give a control law to every site.
+    """Returns the settings that give the same control law to every arm.
 
     Args:
         written: Scenario as its author wrote it.
@@ -765,12 +767,12 @@ def _list_law_overrides(
 
 
 def _check_axes(plan: SweepPlan, law_index: int) -> None:
-    """Checks that a sample of the cells under one law can run.
+    """Checks that the parameter combinations of a sweep can be simulated with one control law.
 
-    Checking all cells of a large grid would take too long. The sample has up to
-    `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their first
-    values, and the corners of the grid. A single combination that is not valid is allowed: the
-    sweep refuses this cell alone.
+    Checking all combinations (cells) of a large grid would take too long. The checked ones have
+    up to `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their
+    first values, and the corners of the grid. A single combination that is not valid is
+    allowed: the sweep refuses this cell alone.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -814,7 +816,7 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
 
 
 def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
-    """Returns True if a cell is a valid scenario.
+    """Returns True if a parameter combination (cell) of a sweep is a valid scenario.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -842,7 +844,7 @@ def spread_indices(count: int) -> list[int]:
 
 
 def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
-    """Loads the scenario of a cell.
+    """Loads the scenario of one combination of swept parameters.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -897,7 +899,7 @@ def label_axis(key: str, scenario: Scenario | None = None) -> str:
 
 
 def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
-    """Returns a key with its value, such as "delay 200 ms" for link.delay_ms = 200.
+    """Returns a setting as a label with unit, such as "delay 200 ms" for link.delay_ms = 200.
 
     Args:
         key: Scenario key.
@@ -915,7 +917,7 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
 
 
 def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Splits a scenario key into the name and the unit of its quantity, for labels.
+    """Splits the name of a setting, such as delay_ms, into a name and a unit for labels.
 
     Args:
         key: Scenario key, such as "sites.s.control.K" or "link.delay_ms".
@@ -938,7 +940,7 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
 
 
 def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
-    """Returns the site, link or actor to which a key belongs, as the end of a label.
+    """Returns the site, link or actor to which a setting belongs, as the end of a label.
 
     Args:
         tables: Names of the tables that contain the key, from the outermost one.
@@ -967,7 +969,7 @@ def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
 
 
 def build_sweep_command(plan: SweepPlan, *more: str) -> str:
-    """Returns the command that runs a sweep. Options with default values are left out.
+    """Returns the shell command that repeats a sweep. Default options are left out.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -1001,7 +1003,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
 
 
 def format_override(key: str, value: Any) -> str:
-    """Returns the override KEY=VALUE that sets a key.
+    """Returns the text KEY=VALUE that changes one setting of a scenario.
 
     Args:
         key: Scenario key.

@@ -75,9 +75,9 @@ class SweepResults(Result):
     rows: Sequence[ResultRow]
 
     def blocks(self) -> Iterator[str]:
-        """Yields the lines of the text that `trilat sweep` prints.
+        """Yields the lines of text that `trilat sweep` prints about a parameter sweep.
 
-        The first lines describe the sweep, the others summarise its results.
+        The first lines describe the sweep, the following lines summarise its results.
         """
         yield from describe_sweep_plan(self.plan)
         yield from summarize_sweep(self)
@@ -90,7 +90,9 @@ class SweepResults(Result):
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat sweep --json` prints them.
+        """Converts the results of a parameter sweep to plain values, for JSON.
+
+        `trilat sweep --json` prints them.
 
         Returns:
             The facts of the plan, and a row per run with the columns of the CSV table.
@@ -99,7 +101,7 @@ class SweepResults(Result):
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
-        """Returns the table rows of one combination of parameter values, one row per seed.
+        """Returns the results of one combination of swept parameters, a row per random seed.
 
         Args:
             number: Number of the cell.
@@ -113,7 +115,7 @@ class SweepResults(Result):
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
-        """Converts the row of a run in the table to an object with named fields.
+        """Converts the table row of a simulation to an object with named fields.
 
         Fields that are missing from the row, because an older version wrote it, have the
         default values of `CellResult`.
@@ -125,7 +127,7 @@ class SweepResults(Result):
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Builds the table of results from the finished runs of a sweep.
+    """Returns the results of a parameter sweep as table rows, one per simulation.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -157,7 +159,7 @@ def iterate_cells(
 
 
 def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
-    """Yields the table rows of one cell, a combination of swept parameters: one row per run.
+    """Yields the results of one combination of swept parameters, one row per simulation.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -170,7 +172,9 @@ def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[Result
 
 
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
-    """Returns the row of a finished run: cell, results, and the command that repeats it.
+    """Returns the table row of a finished simulation, with the command that repeats it.
+
+    It has the parameter values (cell) and the results.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -207,7 +211,7 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
 def build_sim_command(
     plan: SweepPlan, overrides: Sequence[str], seed: int, duration_s: float, log: str
 ) -> str:
-    """Returns the command that simulates a run again and records its log.
+    """Returns the shell command that repeats one simulation of a sweep and records a log.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -247,7 +251,7 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
 
 
 def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
-    """Returns the results as CSV text, with one line per run.
+    """Encodes the results of a parameter sweep as CSV text, one line per simulation.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -257,7 +261,7 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
 
 
 def read_results(path: Path) -> SweepResults:
-    """Reads the results of a finished sweep.
+    """Reads the results of a finished parameter sweep from its folder.
 
     Args:
         path: Folder of the sweep, or its CSV table.
@@ -309,13 +313,16 @@ class GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """Number of runs that were judged stable or not stable. Undecided runs are left out."""
+        """Number of simulations of a combination that were judged stable or not stable.
+
+        Undecided simulations are left out.
+        """
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
-        """Number of runs of the cell that were judged stable. It is at most `decided`."""
+        """Number of simulations of a combination that were judged stable, at most `decided`."""
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
@@ -329,7 +336,7 @@ class GridPoint(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the share of stable runs among the decided ones.
+        """95 % confidence interval of the probability that a decided simulation is stable.
 
         The method is Wilson's. Also if 10 runs of 10 are stable, the lower end is below 1,
         because other seeds might give another result.
@@ -351,7 +358,7 @@ def list_totals(plan: SweepPlan) -> list[str]:
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Combines the runs of a sweep that differ only in their random seeds.
+    """Summarises the simulations of a sweep that differ only in their random seeds.
 
     Args:
         results: Results of the sweep: its plan and one row per run.
@@ -365,7 +372,9 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
 
 
 def iterate_grid_points(results: SweepResults) -> Iterator[GridPoint]:
-    """Yields the summary of each grid point, as `collect_grid_points` returns them.
+    """Yields the summary of each combination of swept parameters.
+
+    `collect_grid_points` returns the same as a list.
 
     Args:
         results: Results of the sweep, in which the rows of a cell stand together.
@@ -414,7 +423,7 @@ def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator
         column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
 
     def format_point(point: GridPoint) -> dict[str, str]:
-        """Returns the texts of the line of a point, by column."""
+        """Returns the texts of one line of the CSV table, by column, for one grid point."""
         decided = point.decided
         stable_share = point.stable / decided if decided else None
         # The values must stand in the order of the columns above.
@@ -446,7 +455,7 @@ _MAX_CELLS_SHOWN = 8
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns lines that tell the user how many runs a sweep has, and over which values.
+    """Tells the user how many simulations a sweep has, and over which values, as lines.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -538,7 +547,7 @@ GROWTH_EXPONENTS = "growth exponents of small pushes"
 
 
 def _list_quantities(plan: SweepPlan) -> dict[str, tuple[str, str]]:
-    """Returns the quantities whose ranges a summary prints: name and unit, by key.
+    """Returns the names and units of quantities whose ranges a summary prints, by key.
 
     Args:
         plan: The sweep, whose requested metrics come first.
@@ -566,7 +575,10 @@ class _ValueRange:
         self.high = -math.inf
 
     def add(self, value: float | None) -> None:
-        """Counts the value of a run. None if the run lacks the quantity."""
+        """Updates the smallest and the largest value by the value of one simulation.
+
+        A value of None, for a simulation that lacks the quantity, changes nothing.
+        """
         if value is None:
             return
         self.count += 1
@@ -604,7 +616,7 @@ class _RowTally:
 
 
 def _tally_rows(results: SweepResults) -> _RowTally:
-    """Collects the numbers of the summary of a sweep in one pass over its table of runs.
+    """Counts the results of a sweep for its summary, in one pass over all simulations.
 
     Args:
         results: Results of the sweep: its plan and one row per run.
@@ -670,7 +682,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
 
 
 def list_next_commands(folder: Path) -> list[str]:
-    """Suggests commands with which a user can continue after a sweep.
+    """Suggests shell commands that a user may want after a parameter sweep.
 
     Args:
         folder: Folder of the sweep, which the commands name.

@@ -115,7 +115,7 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
-    """Prepares the folder of a sweep: a new one, or an existing one with finished runs.
+    """Creates the folder of a sweep, or opens one in which some runs are finished.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -134,7 +134,7 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
 
 
 def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFolder:
-    """Opens the folder of a sweep that was started before.
+    """Opens the folder of a parameter sweep that was started before.
 
     Args:
         path: Path of the folder.
@@ -248,7 +248,7 @@ _RESUME_HINT = "; finished runs are kept: continue with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """Estimated duration of the runs of a sweep that remain.
+    """Estimated duration of those simulations of a sweep that remain.
 
     Attributes:
         runs: Largest possible number of runs that remain.
@@ -331,7 +331,7 @@ def run_cell(task: CellItem) -> CellRun:
 
 
 def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
-    """Returns the result of a run that was refused, with the reason in place of numbers.
+    """Returns the result of a simulation that was refused, with the reason and no numbers.
 
     Args:
         task: The run.
@@ -353,7 +353,7 @@ def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
 
 
 def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
-    """Executes several runs of a sweep, side by side where that is possible.
+    """Executes several simulations of a sweep, side by side where that is possible.
 
     Args:
         tasks: The runs, of one sweep.
@@ -387,7 +387,7 @@ def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
 
 
 def _build_scenario(task: CellItem) -> Scenario:
-    """Returns the scenario of one run of a sweep, with the values of its cell and its seed.
+    """Returns the scenario of one simulation of a sweep, with its parameters and seed.
 
     Raises:
         ScenarioError: The scenario is not valid or cannot run.
@@ -398,7 +398,7 @@ def _build_scenario(task: CellItem) -> Scenario:
 
 
 def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
-    """Measures what the sweep needs besides the class of a cell, and returns the whole result.
+    """Measures what a sweep needs besides how a simulation ended, and returns all results.
 
     Args:
         task: The run.
@@ -435,7 +435,7 @@ LANE_RUNS = 32
 
 
 def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Returns True if a sweep is large enough to compute several runs side by side (in lanes).
+    """Returns True if a sweep is so large that simulating several runs at once pays off.
 
     The code for these SIMD lanes must be compiled first, which takes some ten seconds.
 
@@ -489,7 +489,7 @@ def _compile_lanes(plan: SweepPlan) -> None:
 def estimate_sweep(
     plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
 ) -> DurationEstimate:
-    """Estimates the duration of a sweep by running a few cells that are spread over the grid.
+    """Estimates how long a sweep takes, by a few simulations spread over its parameters.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -571,7 +571,7 @@ def run_sweep(
     known: Iterable[CellRun] = (),
     on: Workers = None,
 ) -> FinishedSweep:
-    """Runs the remaining runs of a sweep, and writes the results into its folder.
+    """Executes the remaining simulations of a parameter sweep, and writes all results.
 
     Args:
         folder: Folder of the sweep. The runs in its journal are not repeated.
@@ -632,13 +632,13 @@ class _NewRuns:
         self.simulated_s = 0.0
 
     def note(self, run: CellRun) -> None:
-        """Counts a finished run, for the numbers that are printed at the end of a sweep."""
+        """Counts a finished simulation, for the totals at the end of a sweep."""
         self.runs += 1
         self.simulated_s += run.outcome.ran_s
 
 
 def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -> Counter[str]:
-    """Writes the table of results, cell by cell.
+    """Writes the results of a parameter sweep into a CSV table, combination by combination.
 
     Args:
         folder: Folder of the sweep.
@@ -651,7 +651,10 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
-        """Yields the rows of all cells, and counts why runs were computed alone."""
+        """Yields the result rows of all parameter combinations for the CSV table.
+
+        It also counts the reasons why some simulations could not run side by side with others.
+        """
         for runs in iterate_cells(plan, done):
             reasons.update(run.alone for run in runs if run.alone)
             yield from build_cell_rows(plan, runs)
@@ -703,10 +706,11 @@ class _SweepWork:
         self._tally = tally
 
     def execute(self) -> None:
-        """Executes all runs, or in a refined sweep those along the stability edge.
+        """Simulates all parameter combinations, or in a refined sweep those near an edge.
 
-        A refined sweep proceeds in rounds. The runs of a round show on which side of the edge
-        their cells lie, and this determines the cells of the next round.
+        A refined sweep proceeds in rounds. The runs of a round show on which side of the
+        stability edge their combinations (cells) lie, and this determines the cells of the next
+        round.
         """
         plan = self._plan
         if not plan.refine:
@@ -820,9 +824,9 @@ class _SweepWork:
 
 
 def find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
-    """Returns on which side of the stability edge the runs of a cell lie.
+    """Returns whether a parameter combination lies on the stable side of an edge.
 
-    The side is stable, unstable or undecided, by the majority of the runs. It is not known if
+    The side is stable, unstable or undecided, by the majority of its runs. It is not known if
     every run was refused. If the sweep measures growth exponents, a run with an exponent of at
     most 0 is stable.
 

@@ -264,7 +264,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Word for this class in printed text, such as "stable" for a candidate that settled.
+        """Word for how a candidate of a tuning ended, in printed text, such as "stable".
 
         Where possible, it is the word that the judgement of a single run uses.
         """
@@ -776,14 +776,15 @@ class TuningScenario(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Name or path of the scenario, as commands take it: "paper" or "mine.toml"."""
+        """Name or path of the scenario, as commands accept it: "paper" or "mine.toml"."""
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
-        """Returns the scenario with another table [control] for each site.
+        """Returns this scenario with other control laws or gains, for example to compare them.
 
-        If all sites have the same table and a single override produces it, this override is
-        used, so that commands stay short. Otherwise there is one override per site.
+        A table [control] in a scenario file sets the law and the gains of each arm. If all arms
+        get the same law and gains, they are set by one override (a changed setting), so that
+        commands stay short. Otherwise there is one override per arm.
 
         Args:
             controls: Table of each site.
@@ -808,7 +809,7 @@ class TuningScenario(NamedTuple):
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
     ) -> "TuningScenario":
-        """Returns this scenario with a given control law and given values of its gains.
+        """Returns this scenario with another control law and other values of its gains.
 
         Args:
             space: The control law.
@@ -820,10 +821,10 @@ class TuningScenario(NamedTuple):
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """Texts of the scenario and of its twin, which a worker process reads.
+        """Texts of the scenario, and of the same scenario without walls and some operators.
 
-        The twin is the same scenario without walls and without operators who push the arms
-        without a target pose. Its text is None if the scenario has no such parts.
+        A worker process reads them. The second one leaves out operators who push the arms
+        without a target pose. It is None if the scenario has no such parts.
         """
         twin = build_twin(self.scenario)
         twin_text = None if twin is None else twin.text
@@ -831,7 +832,7 @@ class TuningScenario(NamedTuple):
 
     @property
     def command(self) -> str:
-        """The command with which a user can simulate the scenario and record a log.
+        """Shell command with which a user can simulate the scenario and record a log.
 
         Example: "trilat sim paper --set link.delay_ms=200".
         """
@@ -840,7 +841,7 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """Everything that a worker process needs to run a control law with chosen gains.
+    """Everything that a worker process needs to simulate a control law with chosen gains.
 
     Attributes:
         runs: For each random seed, the text of the scenario, and the text of the same scenario
@@ -859,7 +860,7 @@ class CandidateItem(NamedTuple):
 
 
 def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Packs the runs of a control law with chosen gains for a worker process.
+    """Packs the simulations of one choice of control gains as work for another process.
 
     Args:
         seeds: The scenario with the law and its gains, once for each random seed. At least one.

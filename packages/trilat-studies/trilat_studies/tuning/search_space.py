@@ -163,7 +163,7 @@ class _TunedGain(NamedTuple):
 
 
 class SearchSpace(NamedTuple):
-    """The gains of one control law that are tuned, each with its unit and its range.
+    """Gains of one control law that are tuned automatically, with their units and ranges.
 
     Attributes:
         law: Name of the law. The name "known" stands for the law `adaptive` without adaptation,
@@ -340,7 +340,7 @@ _GRAVITY_ONLY = "gravity"
 
 
 def _list_search_spaces() -> Iterator[SearchSpace]:
-    """Yields the search spaces of the built-in laws that have gains to tune.
+    """Yields the gains and their ranges for each built-in control law that can be tuned.
 
     The law `known` has the gains of `adaptive` except for the adaptation gain Gamma.
     """
@@ -355,7 +355,7 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
 
 
 def _read_range(gain: str, entry: GainRange) -> _TunedGain:
-    """Returns the tuned gain that an entry of a built-in law's attribute `tune` describes.
+    """Returns a control gain to tune, with its range as a built-in law states it in `tune`.
 
     Args:
         gain: Name of the gain.
@@ -376,7 +376,7 @@ PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
 
 
 def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
-    """Returns the search spaces of some laws, in their order and without duplicates.
+    """Returns which gains of the given control laws are tuned, each law once.
 
     Args:
         laws: Names of built-in laws, or classes as in "mylaws:Spring". Empty stands for

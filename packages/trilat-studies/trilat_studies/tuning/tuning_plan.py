@@ -80,11 +80,13 @@ class Objective(StrEnum):
 
     @property
     def unit(self) -> str:
-        """Unit for tables and axes: rad for the error, s for the settling time."""
+        """Unit of the tuned quantity in tables and on axes: rad for an error, s for a time."""
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns the objective and the effort of a candidate, as a point for its Pareto front.
+        """Returns the error (or time) and the motor effort of a candidate, to compare both.
+
+        The candidates that no other one beats in both form the Pareto front.
 
         Args:
             score: Score of the candidate.
@@ -276,7 +278,7 @@ class CandidateSearch:
     def record_scores(
         self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
     ) -> None:
-        """Stores the scores of a round, from which the next round is proposed.
+        """Stores how well some gains performed, from which the next ones are proposed.
 
         Args:
             gains: The candidates that were run.
@@ -456,7 +458,7 @@ class TuningPlan(NamedTuple):
         }
 
     def estimate_s(self, jobs: int | None = None) -> float:
-        """Estimates the duration of the search from a short run, in s of real time.
+        """Estimates from a short simulation how long the tuning takes, in s of real time.
 
         Args:
             jobs: Number of worker processes. None stands for all cores.
@@ -588,7 +590,7 @@ _EDGE = 1.02
 
 @dataclass(frozen=True, repr=False)
 class TuningResult(Result):
-    """Result of a comparison of control laws, each with the best gains that a search found.
+    """Comparison of control laws, each with the best gains that a search has found.
 
     Attributes:
         plan: The comparison: its scenario, the laws and the ranges of their gains.
@@ -605,7 +607,7 @@ class TuningResult(Result):
     alone: Mapping[str, int] = field(default_factory=dict)
 
     def blocks(self) -> Iterator[Any]:
-        """Yields the parts of the text that `trilat compare --tune` prints.
+        """Yields the text that `trilat compare --tune` prints about the tuning, part by part.
 
         See `compose_tuning`.
         """
@@ -729,7 +731,7 @@ class TuningResult(Result):
         return rows
 
     def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
-        """Returns the scenario of a candidate, with which its run can be repeated.
+        """Returns the scenario with the gains of one candidate, to simulate it again.
 
         Args:
             search: Search of the candidate's law.

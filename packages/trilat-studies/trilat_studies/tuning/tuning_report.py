@@ -127,7 +127,9 @@ def tabulate_laws(tuned: "TuningResult") -> TextTable:
 
 
 def _format_front_ends(search: "CandidateSearch") -> list[str]:
-    """Returns the table cells of the two ends of a law's front: best objective, least effort.
+    """Returns two table cells with the best compromises of a law: least error, least effort.
+
+    They are the two ends of its Pareto front.
 
     Returns:
         The least objective with its effort, and the least effort with its objective. All cells
