@@ -115,7 +115,9 @@ class HandProgram(Protocol):
     """
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Decides where the program pulls the arm, from what its control process knows.
+        """Decides where the program pulls the arm, given what it may know at this moment.
+
+        The program is called at regular times, for example 50 times a second.
 
         Args:
             now: State of the arm, of the target to which it is pulled, and of the other arms.
@@ -177,6 +179,8 @@ class OwnHand:
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Collects what the user's program may know when it decides how to pull the arm.
+
+        This is the state of its own arm, and the newest states that other arms have sent.
 
         Args:
             k: Control period of the decision. Its results have not been computed yet.
@@ -287,7 +291,9 @@ class OwnHand:
         self._schedule(k, k, (), grip=False)
 
     def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
-        """Stores a command of the program until the tick (control period) in which it acts.
+        """Stores a decision of the user's program until the tick (period) in which it acts.
+
+        The wait imitates the reaction time of a person.
 
         Args:
             k: Tick of the view on which the command is based.
@@ -305,7 +311,10 @@ class OwnHand:
         self._due.append((due, command))
 
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Computes how the program pulls the arm in the next control period.
+        """Computes how the user's program pulls the arm in control period k.
+
+        Decisions whose reaction time has passed take effect. Then the point to which the arm is
+        pulled moves on by one period.
 
         Args:
             k: Number of the control period. It must follow the period of the previous call.

@@ -66,11 +66,11 @@ _KNOWN = int(Law.KNOWN)
 
 @leaf
 def rests(site: SiteRow) -> bool:
-    """Returns True if the arm comes to rest or is at rest in the present mode.
+    """Returns True if the arm is being brought to rest, or is at rest already.
 
-    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the rule for
-    other arms that are silent is `StaleAction.GLIDE`. Under the other rules, these modes do not
-    stop the arm smoothly.
+    This is so in the modes WAITING, HOLD, FAULT and STOPPED, but only if the scenario chose
+    `StaleAction.GLIDE` for arms that fall silent. With other choices, these modes do not stop
+    the arm smoothly.
     """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
@@ -93,9 +93,10 @@ def _find_brake_ratio(site: SiteRow) -> float:
 
 @leaf
 def _is_fast(site: SiteRow) -> bool:
-    """Returns True if the damping B of some joint alone would exceed its torque limit.
+    """Returns True if an arm moves so fast that braking by damping exceeds a torque limit.
 
-    The torque of the damping is B |qd|, where qd is the velocity of the joint.
+    The damping of a joint needs the torque B |qd|, where B is the damping gain in N m s/rad and
+    qd the velocity of the joint. It suffices that one joint exceeds its limit.
     """
     fast: bool = _find_brake_ratio(site) > 1.0
     return fast
@@ -323,7 +324,9 @@ def _find_slip(site: SiteRow, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque that is reduced towards zero by `change`, but not past zero.
+    """Returns a torque with a magnitude reduced by `change`, but at least zero.
+
+    For example, 3 N m reduced by 2 gives 1 N m, and -1 N m reduced by 2 gives 0.
 
     Args:
         torque: The torque, N m.

@@ -102,10 +102,11 @@ _ORDER_HELD = int(LifeOrder.HELD)
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """Returns True if none of the other arms that this arm follows is silent.
+    """Returns True if this arm has recently received the state of every arm that it follows.
 
-    Another arm, a peer, is silent if none of its samples (sent states) came into use within the
-    last `silence_ns`. Peers with a weight (dominance factor) of zero are not followed.
+    The states are called samples, and the followed arms peers. A peer counts as silent if none
+    of its samples came into use within the last `silence_ns`. Peers with a weight (dominance
+    factor) of zero are not followed, and so may be silent.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -272,10 +273,10 @@ def is_law_returning(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
-    """Enters a mode in which the arm comes to rest, FAULT or STOPPED.
+    """Stops an arm for good: enters the mode FAULT or STOPPED, which only an order can end.
 
-    Only an order ends these modes. Estimates of the arm's parameters that are not finite become
-    zero, so that the gravity torque, which holds the arm, stays finite.
+    The arm comes to rest and is then held against gravity. Estimates of its parameters that are
+    not finite become zero, because the gravity torque is computed from them and must be finite.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.

@@ -78,7 +78,10 @@ class ChannelArrays(NamedTuple):
 
 
 class LinkArrays(NamedTuple):
-    """Arrays that hold the state of a link, the one-way connection from another arm's process.
+    """Arrays that hold the state of one network link, for compiled code.
+
+    A link is the one-way connection over which an arm's process receives the states of another
+    arm. Messages wait here until their simulated delay has passed.
 
     Attributes:
         state: State of the link, shape (1,), see `link_dtype`.
@@ -115,9 +118,10 @@ this, and LOST is above it.
 
 
 def span_ticks(span_ns: int, rate_hz: int) -> int:
-    """Returns how many ticks (control periods) a time takes, rounded up.
+    """Returns how many control periods (ticks) a duration takes, rounded up.
 
-    The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
+    For example, 2.5 ms take 3 ticks of a loop at 1000 Hz. Equal to `first_tick_at`, but in
+    plain Python, for callers that have not loaded the compiled code.
 
     Args:
         span_ns: The time, ns.
@@ -208,10 +212,10 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Stores the numbers that the control law of another arm sent, until they may be used.
+    """Stores the numbers that the control law of another arm has sent, until they may be used.
 
-    The numbers came with a sample, the state of that arm. They wait together with the sample
-    until its simulated delay has passed.
+    The numbers, for example an energy, came in the same message as the state of the other arm,
+    and wait with it until its simulated delay has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
@@ -227,10 +231,10 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Passes the numbers that the control law of another arm sent to the law of this arm.
+    """Gives the control law of this arm the numbers that the law of another arm has sent.
 
-    The numbers came with a sample, the state of that arm. This function is called when the
-    simulated delay of the sample has passed.
+    The numbers, for example an energy, came in the same message as the state of the other arm.
+    The function is called when the simulated delay of this message has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
