@@ -61,7 +61,9 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
 
 
 def find_package(group: str, name: str) -> str:
-    """Returns the package of this program that has a name, or "" if none has.
+    """Returns which optional package of this program, such as trilat-studies, contains a name.
+
+    The result is "" if none does. With it, an error can tell the user what to install.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.

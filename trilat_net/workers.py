@@ -78,7 +78,10 @@ def _prepare_worker(parent: int, in_command: bool) -> None:
 
 
 def _exit_after(parent: int) -> None:
-    """Waits until the parent process has ended, and then ends this process.
+    """Ends this worker process as soon as its parent process has ended, however it ended.
+
+    The function waits in a thread. Without it, workers would go on computing after their parent
+    was killed.
 
     Args:
         parent: Process number of the parent.

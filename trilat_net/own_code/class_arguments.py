@@ -45,7 +45,10 @@ def make_own_instance(
 
 
 def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
-    """Refuses arguments that a user's class does not accept, before an object is created.
+    """Refuses arguments in a scenario that a user's class does not accept.
+
+    The check compares them with the constructor of the class, before an object is created, so
+    that the error names the wrong key of the scenario.
 
     Args:
         kind: The class, whose first argument is for the facts about the site.

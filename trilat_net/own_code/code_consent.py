@@ -102,7 +102,7 @@ def allow_own_code(
 
 
 class _RememberedFile(msgspec.Struct):
-    """File with a user's code for which a person has stored a permission to run.
+    """File with a user's code that a person has permitted to run, as stored on disk.
 
     Attributes:
         file: Path of the file.
@@ -163,7 +163,9 @@ def allow_logged_code(
 
 
 def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Makes the stored arguments available to the messages about refused code.
+    """Loads with which arguments stored permissions were given.
+
+    Messages about code that is refused then say which arguments differ.
 
     Args:
         remembered: Stored permissions, by the hash of the file.

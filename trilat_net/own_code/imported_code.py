@@ -94,10 +94,11 @@ class NamedCode(Protocol):
 
 
 class _SiteWithCode(Protocol):
-    """Interface of a site (arm controller) of a scenario whose parts may be classes of users.
+    """Interface of the part of a scenario that describes one arm and the users' classes for it.
 
-    These parts are its control law, its operators and its plant. The checks of permissions look
-    for users' classes here, without importing the types of scenarios.
+    These are its control law, the programs that move the arm, and the model of the arm. The
+    checks of permissions search here for users' classes, without importing the scenario's
+    types.
     """
 
     @property
@@ -114,7 +115,10 @@ class _SiteWithCode(Protocol):
 
 
 class ScenarioWithCode(Protocol):
-    """Interface of a scenario, the description of an experiment, that may name classes."""
+    """Interface of a scenario, the description of an experiment, which may name users' classes.
+
+    Only the attributes are listed that the checks of permissions need.
+    """
 
     @property
     def sites(self) -> Mapping[str, _SiteWithCode]:
@@ -161,7 +165,7 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission of a person to run the code of one file, which a scenario names.
+    """Permission of a person to run the code of one Python file, which a scenario names.
 
     Attributes:
         file: Path of the file. If None, it is the file that Python's import finds for the
@@ -185,7 +189,9 @@ what differs if code is refused; they permit nothing.
 
 
 def find_consent(key: CodeKey) -> CodeConsent | None:
-    """Looks up whether a user's code may run with its arguments.
+    """Returns the permission under which a user's class may run with its arguments.
+
+    The result is None if nobody has permitted the class, its present file or its arguments.
 
     Args:
         key: Class, hash of its file and arguments.
@@ -296,7 +302,10 @@ _executed: dict["_CodeSource", Any] = {}
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
-    """Control law of a scenario that is a user's class.
+    """Control law of a scenario whose torques a user's Python class computes.
+
+    The scenario names the class and the hash of its file. It does not import the class, so that
+    a scenario of a stranger can be read without running any code of it.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
@@ -518,9 +527,10 @@ PAGES = {
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Refuses a file that does not define a certain class with a certain method.
+    """Checks that a Python file defines a certain class with a certain method.
 
-    The check reads the syntax of the file, and runs no code of it.
+    The check reads the syntax of the file and runs no code of it, because nobody may have
+    permitted the code yet.
 
     Args:
         source: File, as it was read from disk.
@@ -641,7 +651,9 @@ def name_law_classes(value: Any) -> Any:
 
 @contextmanager
 def _searching(folder: Path | None) -> Iterator[None]:
-    """Makes Python search a folder for modules before all others, inside the `with` block.
+    """Makes Python search one folder for modules before all others, inside the `with` block.
+
+    A user's class can thus import other files that lie beside its own file.
 
     Args:
         folder: The folder. None for the working directory, unless Python searches it already.

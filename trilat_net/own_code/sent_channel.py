@@ -45,7 +45,10 @@ def build_channel(sends: SentVectorSpecs, layout: Layout, peers: int) -> LawChan
 
 
 def check_sends(channel: LawChannel, joints: int, path: str) -> None:
-    """Checks the names and the total length of the vectors that a control law sends.
+    """Checks the vectors that a control law declares to send: their names and total length.
+
+    The vectors travel in each network message between arms, and a long message would take too
+    much time.
 
     Args:
         channel: All vectors that the law sends to other sites (arm controllers).

@@ -173,9 +173,10 @@ CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
-    """Coordinates in which arms follow each other: joint angles, positions or poses.
+    """Coordinates in which the arms of a session follow each other.
 
-    A site is a process that runs one arm, and its peers are the other sites.
+    They are joint angles, positions of the end effectors, or whole poses. Arms with different
+    numbers of joints can only follow each other's positions or poses.
 
     Attributes:
         space: "joints": The sites share joint angles. "position": They share the positions of
@@ -198,9 +199,10 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of coordinates that sites share in task space: 3 for positions, 6 for poses.
+        """Number of coordinates of the end effector that arms send each other: 3 or 6.
 
-        It is 0 if the sites share joint angles, whose number depends on the arm.
+        These are 3 for a position and 6 for a pose. The number is 0 if they send joint angles
+        instead, because the count of joints depends on the arm.
         """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
@@ -257,9 +259,9 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 class ArmModel(NamedTuple):
-    """Model of an arm with n joints, from which dynamics and kinematics are computed.
+    """Model of an arm with n joints, which computes positions, Jacobians and inertias.
 
-    `build_arm` creates the model from the table of the arm in a scenario.
+    `build_arm` creates it from the table of the arm in a scenario.
 
     Attributes:
         theta: True inertial parameters: the five of Eq. (24) for the planar arm, ten per link
@@ -321,9 +323,9 @@ class ArmModel(NamedTuple):
         return self._replace(chain=self.chain._replace(joints=tuple(joints)))
 
     def joint_units(self, unit: str) -> list[str]:
-        """Returns the unit of a quantity for each joint.
+        """Returns the unit of a quantity for each joint, for example ["rad", "m"].
 
-        A prismatic joint has m in place of rad, and N in place of N m.
+        A joint that slides (prismatic) has m in place of rad, and N in place of N m.
 
         Args:
             unit: Unit of the quantity for a rotating joint, for example "rad/s".
@@ -532,7 +534,7 @@ def _is_positive_definite(theta: Array) -> bool:
 
 
 def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool) -> ArmModel:
-    """Converts the table of an arm in a scenario to a model for computation.
+    """Builds the model of an arm from its table in a scenario, to compute its dynamics.
 
     Args:
         arm: Table of the arm, with its lengths and masses or the name of its URDF file.
@@ -592,9 +594,10 @@ def _list_planar_bodies(arm: Arm) -> Array:
 
 
 def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
-    """Returns the planar arm as a chain.
+    """Returns the planar arm of two links as a general chain of joints.
 
-    Its joints rotate about z, and gravity acts along -y.
+    The planar arm can then be simulated together with arms from URDF files. Its joints rotate
+    about z, and gravity acts along -y.
     """
     shoulder = ChainJoint(
         prismatic=False, axis=(0.0, 0.0, 1.0), rotation=_IDENTITY, origin_m=(0.0, 0.0, 0.0)
@@ -606,6 +609,9 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
 
 def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
     """Reads the joints between the base and the tip of an arm from its URDF file.
+
+    URDF is the usual XML format for the links and joints of a robot. Nothing is read from disk
+    here: the texts of the files are an argument.
 
     Args:
         arm: Table of the arm in the scenario, which names the file, the base and the tip.
@@ -702,7 +708,7 @@ def _place_base(
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
-    """Returns the model of an arm whose chain has been read from its file.
+    """Builds the model of an arm from the joints that were read from its URDF file.
 
     Raises:
         ScenarioError: The number of drive inertias differs from that of the joints.
@@ -741,10 +747,11 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Returns a joint as the record that the simulation kernel reads.
+    """Converts a joint of a URDF file to the form that the compiled simulation reads.
 
-    A stop is a spring that pushes with the effort limit of the joint at the depth
-    `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the stiffness.
+    The ends of the joint's range become stops: a spring that pushes with the effort limit of
+    the joint at the depth `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the
+    stiffness.
 
     Args:
         joint: Joint from the file.

@@ -213,9 +213,10 @@ def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> 
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about sites whose dominance factors have no effect.
+    """Returns lines about arms for which the weights in the scenario have no effect.
 
-    Some control laws determine themselves how the sites share authority.
+    The weights (dominance factors) state how much an arm follows each of the others. Some
+    control laws determine by other settings how the arms share authority.
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
@@ -312,9 +313,9 @@ def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
 
 
 def _describe_links(scenario: Scenario) -> list[str]:
-    """Returns a line for each link, or one line if all links are equal.
+    """Returns a line of text for each network link, or a single line if all links are equal.
 
-    Lines about views follow.
+    Further lines state with which delay the users see the other arms (views).
     """
     descriptions = {name: link.describe() for name, link in scenario.links.items()}
     if len(set(descriptions.values())) > 1:
@@ -590,7 +591,7 @@ class ScenarioDifference(NamedTuple):
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
-        """Returns the key and the sites."""
+        """Returns the key that differs, with the names of the arms for which it does."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
 
 
@@ -630,9 +631,10 @@ def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    """Returns the differences between tables with the same keys.
+    """Returns the differences between several tables of scenarios, key by key.
 
-    If they contain control laws of different kinds, the laws are compared as a whole.
+    If they contain control laws of different kinds, the laws are compared as a whole, because
+    their gains have different meanings.
     """
     laws = {table.get("control", {}).get("law") for table in tables}
     if len(laws) > 1:
@@ -690,7 +692,7 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns the name of a control law and its gains as a short text for the user.
+    """Returns the name and gains of a control law as a short text, as in "p_d (K 20, d 4)".
 
     Args:
         control: Table of the law in a scenario.

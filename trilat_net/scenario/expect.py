@@ -112,9 +112,9 @@ _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
 def window_quantities(joints: int) -> tuple[str, ...]:
-    """Returns the names of the quantities that a window may limit.
+    """Returns the names of the quantities that can be limited in a part of a run (window).
 
-    A window is a part of a run for which a scenario states permitted values.
+    They include quantities of each joint, so their number depends on the arm.
 
     Args:
         joints: Number of joints of the arm, which decides how many quantities such as q1_rad
@@ -180,7 +180,9 @@ def number_window_joints(
 
 
 def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlTable:
-    """Returns a window in which the keys contain numbers of joints instead of names.
+    """Returns a table in which names of joints in the keys are replaced by their numbers.
+
+    For example, "q_elbow_rad" becomes "q3_rad" if the elbow is the third joint of the arm.
 
     Args:
         table: The window.

@@ -46,7 +46,9 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the lengths of the vectors for an arm that is a serial chain in space.
+        """Returns the lengths of the vectors that belong to an arm of several joints in space.
+
+        Gains per joint, for example, need as many numbers as the arm has joints.
 
         Args:
             joints: Number of joints of the arm.
@@ -222,7 +224,7 @@ def check_keys(
 
 
 def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
-    """Returns the problem of a key that a table must not have, with the key that may be meant.
+    """Explains that a table must not have a key, and suggests the key that may be meant.
 
     Args:
         key: The unknown key.
@@ -256,7 +258,7 @@ def hint_at_quotes(text: str) -> str:
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:
-    """Returns the keys that a table of a scenario may have: the fields of its type.
+    """Returns the keys that a table of a scenario may have, from the type that describes it.
 
     Args:
         kind: Type of the table.
@@ -265,7 +267,9 @@ def field_names(kind: StructType) -> tuple[str, ...]:
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Checks that a word of a scenario, such as the name of a law, is among the valid ones.
+    """Refuses a word of a scenario, such as the name of a law, that is not a valid choice.
+
+    The error suggests the most similar valid word.
 
     Args:
         word: A value of a scenario.

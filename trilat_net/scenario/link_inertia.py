@@ -58,7 +58,7 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
-    """Returns the symmetric 3 x 3 inertia tensor with six given entries.
+    """Returns the symmetric 3 x 3 inertia tensor of a body from its six different entries.
 
     Args:
         entries: The entries xx, xy, yy, xz, yz, zz, in this order, in kg m^2.

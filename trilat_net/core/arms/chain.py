@@ -447,7 +447,6 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
 def friction_torque(row: Row, speed: float) -> float:
     """Returns the torque with which friction opposes the motion of a joint, N m.
 
-
         f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
 
     It increases with the joint velocity v. The second term is a smooth form of dry friction,

@@ -70,7 +70,10 @@ _DETERMINISTIC_KINDS = (
 
 
 class _LossChain(NamedTuple):
-    """Markov chain with two states that decides which samples are lost (Gilbert's model).
+    """Markov chain that decides which messages a simulated network loses, in bursts.
+
+    The network is either in a good or in a bad state (Gilbert's model). From message to message
+    it may change its state, and each state has its own probability of losing a message.
 
     Attributes:
         loss_good: Probability that a sample is lost in the good state.
@@ -86,11 +89,11 @@ class _LossChain(NamedTuple):
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """Directed connection between two sites, with everything except the delay itself.
+    """Network link from one arm's process to another's, with everything except the delay.
 
-    A sample is the state that a site publishes in one tick; the link carries it to the
-    receiver. A subclass defines the delay by overriding the methods whose names begin with an
-    underscore.
+    Each process sends its state once per control period, as a sample. The link states how many
+    samples are lost, duplicated or reordered. A subclass defines the delay by overriding the
+    methods whose names begin with an underscore.
 
     Attributes:
         loss: Fraction of samples that are lost in the long run.
@@ -136,9 +139,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         raise NotImplementedError
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay, in ms.
+        """Returns the longest delay of a message on the link, ms.
 
-        An unbounded distribution is cut at three standard deviations above the mean.
+        A distribution without an upper limit is cut at three standard deviations above its
+        mean.
         """
         mean_ms, deviation_ms = self._moments()
         return mean_ms + 3.0 * deviation_ms

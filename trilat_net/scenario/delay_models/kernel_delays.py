@@ -40,9 +40,9 @@ def _normal_probability(x: float) -> float:
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """Delay with a uniform distribution between two limits.
+    """Delay of each message drawn uniformly between the mean minus and plus a half width.
 
-    The limits are the mean minus and plus the half width.
+    For example, a mean of 50 ms and a half width of 10 ms give delays from 40 to 60 ms.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -96,9 +96,9 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """Delay with a normal distribution, without negative delays.
+    """Delay of each message drawn from a normal distribution that is cut off at zero.
 
-    If a negative delay is drawn, it is drawn again.
+    A message cannot arrive before it was sent. Therefore a negative delay is drawn again.
 
     Attributes:
         delay_ms: Mean of the normal distribution, before negative delays are excluded, in ms.
@@ -115,11 +115,12 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of the normal distribution truncated at zero.
+        """Returns the mean and the standard deviation of the delay, in ms.
 
-        Let m and s be the mean and the standard deviation before the truncation, a = -m / s,
-        phi the standard normal density, Phi its integral, and H = phi(a) / Phi(-a) the hazard.
-        Then the mean is m + s H, and the standard deviation is s sqrt(1 + a H - H^2).
+        They are those of the normal distribution truncated at zero. Let m and s be the mean and
+        the standard deviation before the truncation, a = -m / s, phi the standard normal
+        density, Phi its integral, and H = phi(a) / Phi(-a) the hazard. Then the mean is m + s
+        H, and the standard deviation is s sqrt(1 + a H - H^2).
         """
         a = -self.delay_ms / self.deviation_ms
         hazard = _normal_density(a) / _normal_probability(-a)
@@ -128,7 +129,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """Base of delay models that are described by a mean and a standard deviation.
+    """Base of the delay models whose author states the mean and the standard deviation.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -157,13 +158,13 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Delay with a gamma distribution: never negative, with a long tail of large delays.
+    """Delay of each message drawn from a gamma distribution: never negative, with a long tail.
 
-    Its keys are the mean and the standard deviation.
+    The author of a scenario states the mean and the standard deviation.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model.
+        """Returns the distribution in the form in which the compiled simulation draws from it.
 
         For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
         / s^2, and its scale is s^2 / m.
@@ -173,13 +174,13 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay whose logarithm has a normal distribution. Very long delays occur at times.
+    """Delay of each message whose logarithm is normal: mostly short, at times very long.
 
-    Its keys are the mean and the standard deviation of the delay itself.
+    The author of a scenario states the mean and the standard deviation of the delay itself.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model.
+        """Returns the distribution in the form in which the compiled simulation draws from it.
 
         For the mean m and the standard deviation s, the logarithm of the delay is normal with
         the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.
@@ -219,10 +220,11 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of the mixture, plus the fixed delay.
+        """Returns the mean and the standard deviation of the delay, in ms.
 
-        The second moment of a mixture is the mixture of the second moments. Exponential
-        distributions with the means a and b have the second moments 2 a^2 and 2 b^2.
+        The delay is a fixed part plus a mixture of two exponential distributions. The second
+        moment of a mixture is the mixture of the second moments. Exponential distributions with
+        the means a and b have the second moments 2 a^2 and 2 b^2.
         """
         fast = self.fast_ms
         slow = self.slow_ms
@@ -233,9 +235,10 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Delay with a normal distribution that is correlated from sample to sample.
+    """Delay that changes slowly: if one message is slow, the next one probably is too.
 
-    If one sample is slow, the next one probably is too. Negative delays become zero.
+    The delays are normally distributed and correlated from message to message. Negative delays
+    become zero.
 
     Attributes:
         correlation: Correlation between the delays of two consecutive samples, before negative
@@ -249,7 +252,7 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of max(0, x) for a normal random number x.
+        """Returns the mean and standard deviation of the delay max(0, x) for a normal x, ms.
 
         The variance is written as a sum in which large terms do not cancel each other.
         """
@@ -266,9 +269,10 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """Link without artificial delay, the ideal network.
+    """Ideal network link, which delays and loses nothing.
 
-    The receiver uses a sample from its next tick on, since a sample cannot act in its own tick.
+    The receiver still uses a message from its next control period on, because a message cannot
+    act in the period in which it was sent.
     """
 
     def _delay(self) -> LinkModel:
@@ -285,9 +289,7 @@ class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
 
 
 class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
-    """Link with the same delay for every sample.
-
-    A sample is the state that a site publishes in one tick.
+    """Network link that delays every message by the same time.
 
     Attributes:
         delay_ms: Delay, in ms. A delay of 0 still means one period, because the receiver uses a
@@ -310,7 +312,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
 
 class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
-    """Delay that varies sinusoidally with the send time t of a sample.
+    """Network delay that rises and falls as a sine of the time t at which a message is sent.
 
         T(t) = delay + amplitude sin(2 pi t / period + phase)
 
@@ -352,9 +354,10 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """Delay that follows a recorded table of send times and delays.
+    """Network delay that repeats a measurement: a table of sending times and delays.
 
-    An author names a file with the table. A resolved scenario contains the table itself.
+    An author names a file with the table. A resolved scenario contains the table itself, so
+    that the experiment can be repeated without the file.
 
     Attributes:
         trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
@@ -376,10 +379,10 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over one pass of the table, without lost samples.
+        """Returns the mean and the standard deviation of the recorded delays, in ms.
 
-        The delay of each point is weighted by the time until the next point. NaN if all samples
-        of the table are lost.
+        The delay of each point of the table is weighted by the time until the next point, and
+        lost messages are left out. Both results are NaN if all messages were lost.
         """
         t_us, delay_us = self.points.T
         # The last point lasts as long as the point before it.

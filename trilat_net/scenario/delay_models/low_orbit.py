@@ -54,9 +54,10 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over many intervals.
+        """Returns the mean and the standard deviation of the delay, in ms, over many intervals.
 
-        The variances of the two independent random parts add up.
+        An interval is the time of 15 s or so for which a terminal keeps its satellite. The
+        variances of the two independent random parts add up.
         """
         mean_ms = self.floor_ms + self.path_ms + self.jitter_ms
         return mean_ms, math.hypot(self.path_ms, self.jitter_ms)
@@ -64,6 +65,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     def _reach_ms(self) -> float:
         """Returns the longest delay that can be drawn, in ms.
 
-        The smallest random number is 2^-53, and -log(2^-53) = 36.8.
+        The random parts are multiples of -log(x) with x of at least 2^-53, and -log(2^-53) =
+        36.8.
         """
         return self.floor_ms + 36.8 * (self.path_ms + self.jitter_ms)

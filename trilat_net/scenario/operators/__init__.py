@@ -120,7 +120,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """Operator or environment that acts only in an interval of time.
+    """Base of the operators and environments that act only between two times of a run.
 
     Attributes:
         start_s: Start of the interval, in s after the start of the run.
@@ -132,7 +132,10 @@ class TimedActor(ActorBase, frozen=True, kw_only=True):
 
 
 class SampledActor(TimedActor, frozen=True, kw_only=True):
-    """Operator or environment whose force can be held constant during a control period.
+    """Base of the operators and environments whose force may be held during a control period.
+
+    A force that is held is computed once per period, like that of a real device with a digital
+    controller. Otherwise it acts continuously.
 
     Attributes:
         sampled: If True, the force is computed once per control period and held, as by a real
@@ -284,7 +287,7 @@ def resolve_operators(
 def _find_kind(
     entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str
 ) -> type[ActorBase]:
-    """Returns the class that a table names by its key `kind`.
+    """Returns the class for the kind of operator or environment that a table names.
 
     Raises:
         ScenarioError: The key is missing or wrong, or the kind belongs to the other list.
@@ -304,7 +307,7 @@ def _find_kind(
 
 
 class _RefusedKey(NamedTuple):
-    """Key of an operator's table whose value is missing or not valid.
+    """Key of an operator's or environment's table whose value is missing or not valid.
 
     Attributes:
         key: The key.
@@ -325,7 +328,9 @@ def _check_values(
     path: str,
     counts: VectorCounts,
 ) -> None:
-    """Refuses a complete table if a value has a wrong type, range or length.
+    """Refuses the table of an operator or environment with a value of a wrong type or length.
+
+    The error says what its author may write instead.
 
     Args:
         table: Complete table.
@@ -377,9 +382,9 @@ def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: Vector
 def _find_refused_key(
     table: fields.TomlTable, kind: type[ActorBase], counts: VectorCounts
 ) -> _RefusedKey | None:
-    """Returns the first key of a complete table that is missing or not valid.
+    """Returns the first key of an operator's table whose value is missing or not valid.
 
-    None if the table is valid.
+    The table must be complete. The result is None if it is valid.
     """
     try:
         msgspec.convert(table, kind)

@@ -218,7 +218,9 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Checks that the recorded torques are in the order of time.
+        """Checks that the times in a table of recorded torques are in ascending order.
+
+        The simulation finds the torque of a time by bisection, which needs this order.
 
         Returns:
             The setting `points` and the reason. None if every time is later than the previous
@@ -234,9 +236,10 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """Operator whose torque is a sine, for example to measure a frequency response.
+    """Operator whose torque is a sine of changing frequency, for example to measure a response.
 
-    The frequency changes linearly from its first to its last value. This sweep is repeated.
+    The frequency changes linearly from its first to its last value, for example from 0.1 to 10
+    Hz. This sweep is repeated.
 
     Attributes:
         peak_nm: Amplitude on each joint, in N m.
@@ -264,9 +267,10 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
 
 
 class Multisine(TimedActor, frozen=True, tag="multisine"):
-    """Operator whose torque is a sum of sines with equal amplitude.
+    """Operator whose torque is a sum of sines with equal amplitude, to excite an arm.
 
-    Such a torque excites several frequencies at once.
+    Such a torque excites several frequencies at once, so that the response of the arm at each
+    of them can be measured in one run.
 
     Attributes:
         amplitude_nm: Amplitude of each sine on each joint, in N m.
@@ -437,9 +441,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
-        """Returns the rules that limit what an operator may command during a run.
+        """Returns the limits on what a person may command while moving an arm during a run.
 
-        They bound the speed and range of the targets, and the forces.
+        They bound the speed and range of the point to which the arm is pulled, and the forces.
 
         Args:
             rate_hz: Tick rate of the site, in Hz.
@@ -489,7 +493,10 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 def _check_frame(frame: list[Any], axes: int, path: str) -> None:
-    """Refuses directions of axes that are unknown, too few, too many, or parallel.
+    """Refuses a stated view direction of a device that is not a valid choice of axes.
+
+    The author of a scenario states how the axes of a haptic device correspond to those of the
+    arm. Unknown, missing, superfluous or parallel axes are refused.
 
     Args:
         frame: Names of the directions, one per axis.

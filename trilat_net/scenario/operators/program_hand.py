@@ -198,7 +198,10 @@ class HandSite(NamedTuple):
         )
 
     def make_rules(self) -> HandRules:
-        """Returns the limits of the actions of the program."""
+        """Returns the limits on what the program that moves this arm may command.
+
+        They bound the speed and range of the point to which the arm is pulled, and the forces.
+        """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         return self.spec.make_rules(tick_rate_hz, self.scenario.arms[self.name])
 
@@ -306,7 +309,7 @@ class HandPlayer:
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
     def _prepare(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
-        """Calls the program if it is due in tick `k`.
+        """Lets the program that moves the arm decide, if a decision is due in control period k.
 
         Returns:
             A function that returns the joint angles of the arm, in rad.
@@ -363,7 +366,10 @@ class HandPlayer:
 
 
 def make_hand_program(hand_site: HandSite) -> HandProgram:
-    """Creates the program that operates the arm of a site, an instance of the user's class.
+    """Creates an object of the user's class that moves the arm of one site.
+
+    A site is the process that runs one arm. The class is imported here, if a person has
+    permitted it to run.
 
     Args:
         hand_site: The site and the settings of the program.
