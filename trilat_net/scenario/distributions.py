@@ -114,7 +114,7 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
 
 
 def has_distribution(value: Any) -> bool:
-    """Returns True if a value of a scenario contains a random distribution, not only numbers."""
+    """Returns True if a value of a scenario is a random distribution, or a list with one."""
     entries = value if isinstance(value, list) else [value]
     return any(map(is_distribution, entries))
 

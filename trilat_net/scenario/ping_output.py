@@ -87,7 +87,7 @@ class _PingProbes(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Answer to a probe.
+    """Answer to one probe (request packet) that the program `ping` received.
 
     Attributes:
         rtt_ms: Round-trip time, in ms.
@@ -209,7 +209,9 @@ def _parse_decimal(text: str) -> float:
 
 
 def _read_fping(lines: Sequence[str], every_s: float) -> _PingProbes:
-    """Returns the probes in the output of `fping`, whose numbers start from 0 and never wrap.
+    """Reads the round trips from the output of `fping`, which numbers the probes from 0.
+
+    In contrast to `ping`, the numbers never start again from 0.
 
     Args:
         lines: Lines of the output.
@@ -253,7 +255,7 @@ def _arrange_probes(
     summary: _Summary | None,
     every_s: float,
 ) -> _PingProbes:
-    """Returns the probes of a run in the order of their numbers, including the lost ones.
+    """Returns all probes of a run of `ping` in the order of sending, including the lost ones.
 
     Args:
         answers: Answers, by the number of the probe.

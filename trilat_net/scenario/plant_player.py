@@ -65,7 +65,7 @@ class _PlantProgram(Protocol):
     """
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
-        """Advances the plant by one period under a constant control torque.
+        """Computes the motion of the arm over a control period with a constant motor torque.
 
         Args:
             tau: Control torque ON the joints, in N m, shape (n,).
@@ -78,9 +78,10 @@ class _PlantProgram(Protocol):
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns the current poses of the bodies, in the order of `PlantContext.bodies_m`.
+        """Returns the current poses of the bodies that the model moves besides the arm.
 
-        This method is called only if the plant has bodies.
+        The order is that of `PlantContext.bodies_m`. The method is called only if there are
+        bodies.
 
         Returns:
             Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
@@ -89,9 +90,9 @@ class _PlantProgram(Protocol):
 
 
 class PlantPlayer:
-    """Runs a user's plant at its site, tick by tick.
+    """Runs a user's arm model (plant) at one arm, one control period after another.
 
-    A plant is a program that computes the motion of an arm from the torques of its motors.
+    A plant is a class that computes the motion of an arm from the torques of its motors.
 
     Args:
         scenario: The scenario.
@@ -140,7 +141,7 @@ class PlantPlayer:
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
     def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Lets the plant compute the motion of the arm from a tick to the next one.
+        """Lets the user's arm model compute the motion from one control period to the next.
 
         The result is stored in `state`.
 
@@ -195,7 +196,7 @@ class PlantPlayer:
         return numbers
 
     def _call(self, tick: int, function: Callable[[], T]) -> T:
-        """Calls the code of the plant, and returns the result.
+        """Calls a function of the user's arm model, and reports an exception with its place.
 
         Args:
             tick: Tick, for the error message.

@@ -61,7 +61,10 @@ def refuse(
     path: str,
     elsewhere: Sequence[str] = (),
 ) -> ScenarioError:
-    """Returns the error for the author of a table that msgspec has refused.
+    """Converts an error of the library msgspec to one for the author of the refused table.
+
+    The new error names the wrong key by its path in the scenario, and says what may stand
+    there.
 
     Args:
         error: Error that msgspec raised when it compared the table with its type.
@@ -95,7 +98,7 @@ def refuse(
 
 
 def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] = ()) -> T:
-    """Refuses one table of a scenario that has an unknown key, or a value of a wrong type.
+    """Converts one table of a scenario to its type, and refuses unknown keys and wrong values.
 
     Args:
         table: The table as its author wrote it.
@@ -182,7 +185,7 @@ def describe_wrong_type(value: Any, expected: str) -> str:
 def _describe_wrong_value(
     message: str, table: Any, kind: Any, location: Location, path: str
 ) -> str:
-    """Returns what is wrong with a value of a wrong type or range.
+    """Explains what is wrong with a value that has a wrong type or is out of range.
 
     Args:
         message: Message of msgspec without the location.
@@ -222,7 +225,7 @@ def _describe_table_for_number(table: TomlTable, kind: Any, location: Location) 
 
 
 def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
-    """Returns what is wrong with a value that is no number, and what may stand in its place.
+    """Explains what is wrong with a value that should be a number, and what may stand there.
 
     Args:
         value: The value.
@@ -280,7 +283,10 @@ def _split_message(message: str, table: Any, kind: Any) -> tuple[str, Location]:
 
 
 def _find_refused_key(message: str, table: Any, kind: Any, location: Location) -> str | None:
-    """Returns the key of the entry of a dictionary that msgspec refuses with a message.
+    """Finds which entry of a dictionary the library msgspec has refused.
+
+    Its messages do not name the keys of dictionaries. Therefore entries are converted one by
+    one, until one gives the same message.
 
     Args:
         message: The message.
@@ -326,10 +332,10 @@ def _value_at(table: Any, location: Location) -> Any:
 
 
 def _find_table_for_number(table: Any, kind: Any, location: Location) -> Location | None:
-    """Returns the location of a table that stands where a number belongs.
+    """Finds a table that stands where a number belongs, around a refused value.
 
-    It is the table of a random distribution, or was meant to be. None if the refused value is
-    not part of such a table.
+    Such a table states a random distribution, or was meant to. The result is None if there is
+    no such table.
     """
     for length in range(1, len(location) + 1):
         start = location[:length]
@@ -340,7 +346,7 @@ def _find_table_for_number(table: Any, kind: Any, location: Location) -> Locatio
 
 
 def _list_hints(kind: Any, location: Location) -> list[Any]:
-    """Returns the types that a value at a location of a table may have.
+    """Returns the types that a value may have at a given place of a scenario's table.
 
     Args:
         kind: Type of the table.
@@ -364,7 +370,7 @@ def _list_alternatives(hint: Any) -> Iterator[Any]:
 
 
 def _list_inner_hints(hint: Any, part: str | int) -> Iterator[Any]:
-    """Yields the type of a field, a value of a dictionary or an entry of a list.
+    """Yields the types one level deeper: of a field, a dictionary's value or a list's entry.
 
     Args:
         hint: Type of the struct, dictionary or list.

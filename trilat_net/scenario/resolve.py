@@ -89,7 +89,10 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
-    """Returns the dominance factors of a site: the weights with which it follows its peers.
+    """Returns the weights with which one arm follows each of the others, in a scenario.
+
+    The weights are called dominance factors. An arm that the author did not name has the weight
+    0.
 
     Args:
         written: Row as its author wrote it. A peer that it does not name has the factor 0. None

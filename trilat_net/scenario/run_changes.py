@@ -48,7 +48,7 @@ class LinkTables(dict[str, dict[str, Any]]):
         self._planned = deque(change for change in timeline if change.link)
 
     def advance_to(self, t_ns: int) -> None:
-        """Applies the planned changes up to a time, so that the tables are valid at this time.
+        """Applies the changes of network links that the scenario plans up to a time.
 
         Args:
             t_ns: The time, in ns after the epoch (the common start time).
@@ -106,10 +106,10 @@ def resolve_change(
 
 
 def find_owner(change: Change) -> str:
-    """Returns the name of the site that must carry out a change.
+    """Returns the name of the arm whose process must carry out a change of a run.
 
-    A change of a link is carried out by the site that receives its samples. Any other change
-    names its site.
+    The receiver of a network link carries out a change of this link. Any other change names its
+    arm. The process of an arm is called a site.
 
     Args:
         change: Change of a link or of dominance factors, or a command to a site.
@@ -161,9 +161,9 @@ _ORDER_SENTENCES = {
 
 
 def describe_change(change: Change, ordered_by: str = "") -> str:
-    """Describes a change of a run to people, in a sentence without a full stop.
+    """Describes a change of a run in a phrase for people.
 
-    An example is "m2 was stopped by the experimenter at 58.2 s".
+    An example is "m2 was stopped by the experimenter at 58.2 s", without a full stop.
 
     Args:
         change: A command to a site, or a change of a link or of dominance factors.
@@ -190,7 +190,7 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
 
 
 def find_requester(sentence: str) -> str:
-    """Extracts from the sentence about a stop who requested it, for the timeline of a report.
+    """Returns who requested a stop, from the sentence about it in a log, for a report.
 
     Args:
         sentence: Sentence that `describe_change` returned.

@@ -129,9 +129,9 @@ class LinkSchedule:
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first tick at or after each of some times at which samples are due.
+    """Returns the first control period of the receiver at or after each delivery time.
 
-    It computes the same as `core.ticks.first_tick_at`, for an array of times.
+    It is `core.ticks.first_tick_at` for an array of times.
 
     Args:
         due_ns: Times in ns after the epoch (the common start time).
@@ -180,7 +180,7 @@ def draw_used_samples(
 
 
 def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
-    """Returns the newest sample that is in use in each tick.
+    """Returns, for each control period, the newest message that has been received by then.
 
     Args:
         samples: Numbers of the samples.
@@ -259,9 +259,9 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns which sample of each peer the user sees in a tick of the site.
+        """Returns which state of each other arm the user sees in one control period.
 
-        The peers are the other sites, whose arms the picture shows.
+        The states are called samples, and the other arms peers.
 
         Args:
             tick: The tick. It must not be before that of the previous call.
@@ -280,7 +280,9 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns which state of the other arms the user sees in each control period.
+        """Returns which state of each other arm the user sees in each control period of a run.
+
+        The picture is delayed, so that it shows states of earlier periods.
 
         Args:
             ticks: Number of control periods of the user's site, from the start of the run.
@@ -296,7 +298,9 @@ class PictureDelay:
         }
 
     def _draw_until(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
-        """Yields the samples that each peer sent before a tick, and when they are shown.
+        """Yields the states that each other arm sent, and from when on the user sees them.
+
+        The time is a control period (tick) of this arm.
 
         Args:
             tick: Tick of the site.

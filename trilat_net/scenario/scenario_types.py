@@ -150,11 +150,10 @@ def _or_infinity(limit: Any) -> Any:
 
 
 class Limits(Frozen, frozen=True):
-    """Limits of a site. Each limit is one number for all joints, or one number per joint.
+    """Limits of one arm, such as its largest torque, for all joints together or for each.
 
-    Some limits depend on the stale rule of the site: its reaction if the samples of another
-    site are too old or missing. Under the rule "glide", a site does not end the run, but stops
-    its own arm.
+    If a limit is exceeded, the run ends. Under the rule "glide" for silent arms, only this arm
+    is brought to rest instead.
 
     Attributes:
         tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
@@ -280,7 +279,7 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
 
     @property
     def after(self) -> LinkBase:
-        """All settings of the link after this change, not only those that change.
+        """All settings of a network link after this change, also those that stay the same.
 
         Only a change of a link has them.
         """
@@ -563,9 +562,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns the links at the start, and each state of a link after a planned change.
+        """Returns the settings of all network links, at the start and after planned changes.
 
-        For example, a scenario is random if any of them is.
+        For example, a run is random if any of these settings has random delays.
         """
         later_links = [
             link for name in self.links for _, link in scheduled_links(self.timeline, name)
@@ -808,7 +807,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the link from a peer to a site as the record that the kernel reads.
+        """Returns the network link between two arms as the compiled simulation reads it.
 
         It includes the planned changes of the link.
 

@@ -38,7 +38,7 @@ _BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
 
 
 class _SharedByAll(NamedTuple):
-    """What all sites of a scenario share while their tables are completed.
+    """Tables and files of a scenario that concern all its arms, while each arm is completed.
 
     Attributes:
         rate_hz: Tick rate of the sites that state no other, in Hz.
@@ -58,7 +58,9 @@ class _SharedByAll(NamedTuple):
 def complete_site_tables(
     tables: TomlTable, rate_hz: int, draws: Draws, files: NamedFiles
 ) -> TomlTable:
-    """Returns the complete table of every site, by name.
+    """Returns the table of every arm of a scenario with all its keys, by name.
+
+    Keys that the author left out get their values for all arms, or their defaults.
 
     Args:
         tables: Tables of the scenario file.
@@ -117,11 +119,11 @@ def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
 
 
 def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTable:
-    """Returns the complete table of a site.
+    """Returns the table of one arm with all its keys.
 
     The model of the arm comes first, because it states the number of joints, and thereby the
-    lengths of the site's vectors. The order of the draws decides the order of the table
-    `drawn`, and thereby the hash of the scenario, so it must not change.
+    lengths of all vectors. The order in which random numbers are drawn decides the order of the
+    table `drawn`, and thereby the hash of the scenario, so it must not change.
 
     Args:
         site: Table of the site, joined with the tables for all sites.
@@ -207,7 +209,7 @@ def _complete_arm(
 def _model_arm(
     table: TomlTable, task_table: TomlTable, shared: _SharedByAll, path: str
 ) -> ArmModel:
-    """Returns the model of an arm, which knows the dynamics and the number of joints.
+    """Builds the model of an arm from its table, to know its joints and dynamics.
 
     Args:
         table: Table of the arm.
@@ -241,7 +243,9 @@ def _model_arm(
 
 
 def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None:
-    """Refuses keys that belong to another kind of arm, and gravity without a direction.
+    """Refuses keys of an arm that have no effect on its kind, and gravity without a direction.
+
+    The kinds are the planar arm of two links, and a chain of joints from a URDF file.
 
     Args:
         arm: The arm.
@@ -304,7 +308,7 @@ def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
-    """Refuses vectors of a site that have too few or too many numbers.
+    """Refuses vectors of an arm, such as gains per joint, with a wrong count of numbers.
 
     Args:
         site: Complete table of the site.

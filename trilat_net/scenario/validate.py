@@ -201,7 +201,9 @@ def check_outside_arms(scenario: Scenario) -> None:
 
 
 def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
-    """Refuses a real robot whose stale rule lets its reference jump.
+    """Refuses a real robot whose reference position may jump when another arm falls silent.
+
+    A jump would move the robot suddenly. The rule for silent arms must therefore be "glide".
 
     Args:
         scenario: Description of the experiment.
@@ -218,10 +220,10 @@ def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
 
 
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a control law that its site cannot carry out.
+    """Refuses a control law that an arm cannot use, for example because its masses are unknown.
 
-    Keys of the site that contradict its plant are refused as well. The plant says who computes
-    or measures the motion of the arm: the program, a user's class, or a real robot.
+    Settings that contradict the way in which the arm moves are refused as well. An arm is
+    simulated by the program, simulated by a user's class, or a real robot.
 
     Args:
         name: Name of the site, for error messages.
@@ -256,7 +258,7 @@ def _check_law(name: str, site: SiteSpec, sites: int) -> None:
 
 
 def _check_plant(path: str, site: SiteSpec) -> None:
-    """Refuses keys that only a simulated arm, or only a real robot, can have.
+    """Refuses settings that only a simulated arm can have, or only a real robot.
 
     Args:
         path: Path of the site, for error messages.
@@ -287,7 +289,7 @@ def _check_plant(path: str, site: SiteSpec) -> None:
 
 
 def build_scenario(resolved: TomlTable) -> Scenario:
-    """Converts resolved tables to a scenario, and checks it completely.
+    """Converts complete tables of a scenario to an object, and checks them against each other.
 
     The order of the checks decides which error is reported if a scenario contains several.
 
@@ -479,7 +481,9 @@ def _check_energy_laws(scenario: Scenario) -> None:
 def _check_energy_law(
     scheme: str, name: str, laws: dict[str, LawSettings], rates_hz: dict[str, int]
 ) -> None:
-    """Refuses an energy-counting law at one site if its conditions on all sites fail.
+    """Refuses a control law that accounts for energy at one arm, if the other arms do not fit.
+
+    For example, the other arms may use another law, or control loops with other rates.
 
     Args:
         scheme: Integration scheme of the scenario.
@@ -536,7 +540,9 @@ def _check_start_poses(scenario: Scenario) -> None:
 
 
 def _check_limits(scenario: Scenario, name: str) -> None:
-    """Refuses position limits that leave no room, have no effect or exclude the start pose.
+    """Refuses limits of joint positions that contradict each other or exclude the start pose.
+
+    Limits that can never have an effect are refused as well.
 
     Args:
         scenario: The scenario.
@@ -659,7 +665,7 @@ def find_row_problem(row: Array, site: int) -> str | None:
 def _check_actors(
     actors: Sequence[operators.Operator | operators.Environment], path: str
 ) -> None:
-    """Refuses operators or bodies of the environment whose keys contradict each other.
+    """Refuses persons (operators) or environments such as walls whose settings contradict.
 
     Args:
         actors: The operators or bodies of one site.

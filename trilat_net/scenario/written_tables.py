@@ -122,7 +122,9 @@ class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class WrittenScenario(Frozen, frozen=True, kw_only=True):
-    """Tables of a scenario file as an author may write them, see `scenario_types.Scenario`.
+    """Tables of a scenario file as its author may write them, with many keys left out.
+
+    `scenario_types.Scenario` is the complete form.
 
     Attributes:
         rate_hz: Tick rate of all sites that state no other, in Hz.
@@ -186,7 +188,7 @@ def check_tables(tables: TomlTable) -> WrittenScenario:
 
 
 def _check_site_names(names: Collection[str]) -> None:
-    """Refuses names that a site cannot have, and too few or too many sites.
+    """Refuses names that an arm cannot have, and too few or too many arms in a scenario.
 
     Args:
         names: Names of the sites.
@@ -214,7 +216,7 @@ def _check_site_names(names: Collection[str]) -> None:
 
 
 def check_control(table: TomlTable, law: str, path: str) -> None:
-    """Refuses a table `control` with a key that its law does not have, or a wrong gain.
+    """Refuses a control law's table with a key that the law does not have, or a wrong gain.
 
     Args:
         table: The table as its author wrote it.
@@ -226,7 +228,7 @@ def check_control(table: TomlTable, law: str, path: str) -> None:
 
 
 def check_link(table: TomlTable, model: str, path: str) -> None:
-    """Refuses a table of a link with a key that its delay model does not have.
+    """Refuses a network link's table with a key that its delay model does not have.
 
     Args:
         table: The table as its author wrote it.
@@ -242,7 +244,7 @@ def check_link(table: TomlTable, model: str, path: str) -> None:
 def _check_foreign_keys(
     table: TomlTable, kinds: Mapping[str, StructType], group: str, chosen: str, path: str
 ) -> None:
-    """Refuses a key that belongs to another law or delay model than that of a table.
+    """Refuses a key that belongs to another control law or delay model than the chosen one.
 
     Upper and lower case count as equal, so that the user of `control.D` learns of `d`. A key
     that differs from a valid one only in its case is left to `check_table`, which suggests it.

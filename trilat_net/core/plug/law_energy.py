@@ -21,10 +21,10 @@ from ..step.vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """Numbers that a control law received from another arm and sent to it, in K periods.
+    """Numbers that an arm's control law received from another arm and sent to it, in K periods.
 
-    In each period of its control loop, a site (the process that runs one arm) sends a sample
-    with its state. The law uses the newest sample that has arrived.
+    In each period of the control loop, every arm's process sends a message (sample) with its
+    state. The receiving law uses the newest message that has arrived.
 
     Attributes:
         tick: Number of the period in which the used sample was sent, shape (K,). -1 before the

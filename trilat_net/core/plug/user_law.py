@@ -66,7 +66,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """
 
     def compute(vector: "LawVector", other: Any) -> Any:
-        """Applies the operation `operate` to two vectors, or to a vector and a number.
+        """Applies an operation, such as addition, to two vectors or to a vector and a number.
 
         Args:
             vector: The first vector.
@@ -108,12 +108,10 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """What a control law knows about another arm (a peer) in a tick.
+    """What a control law knows about one of the other arms (a peer) in a control period.
 
-    This is the newest sample of the peer that the law may use, or the peer's start pose at rest
-    before the first sample.
-
-    A sample is the state that a peer published in one of its ticks.
+    It is the newest state that the other arm has sent and whose network delay has passed (its
+    sample). Before the first one, it is the start pose of the other arm, at rest.
 
     Attributes:
         alpha: Dominance factor of the peer now, the weight with which this site follows it.
@@ -277,10 +275,10 @@ def call_law(
 
 
 class LawResults(NamedTuple):
-    """Results of a user's control law in one control period, as `call_law` returns them.
+    """Checked results of a user's control law in one control period.
 
-    They are the torque of each joint, the estimate of the arm's parameters, the memory that the
-    law keeps for the next tick, and the numbers that it sends to its peers.
+    They are the torque of each joint, the estimate of the arm's parameters, the numbers that
+    the law keeps for the next period, and those that it sends to other arms.
     """
 
     torque: list[float]
@@ -290,7 +288,10 @@ class LawResults(NamedTuple):
 
 
 def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
-    """Checks that the results of a law are finite and that its memory is not too large.
+    """Checks that the results of a user's control law are finite numbers, and not too many.
+
+    A torque that is NaN would make the simulation useless, and a large memory would fill the
+    log.
 
     Args:
         law: The law, for the error.
@@ -426,12 +427,14 @@ def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
 
 
 def law_name(law: UserLaw) -> str:
-    """Returns the name of a law as a scenario writes it, "module:Class"."""
+    """Returns the name by which a scenario selects a user's law, as in "mylaws:Spring"."""
     return f"{type(law).__module__}:{type(law).__qualname__}"
 
 
 def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
-    """Returns the error for a problem with the results of a law.
+    """Returns the error for a problem with the results of a user's control law.
+
+    The error names the arm, the class and the control period.
 
     Args:
         law: The law.

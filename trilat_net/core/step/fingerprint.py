@@ -30,7 +30,9 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 
 @leaf
 def _compute_sines(angles: Array, results: Array) -> None:
-    """Writes the sine and the cosine of each angle into `results`, for the fingerprint.
+    """Computes the sine and the cosine of many angles, whose bits the fingerprint covers.
+
+    They are the operations in which platforms are most likely to differ.
 
     Args:
         angles: The angles, shape (n,), rad.

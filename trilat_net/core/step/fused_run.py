@@ -37,11 +37,11 @@ PROGRESS_DTYPE = row_dtype("progress", {})
 
 
 class RecentRecords(NamedTuple):
-    """Latest records of a site, kept as long as another site may still need them.
+    """Latest states that an arm's process has computed, for the other arms that receive them.
 
-    A site is the process that runs one arm. A record contains the numbers that a site computes
-    in one period of its control loop. The arrays are ring buffers. If they are for several
-    sites, they have an additional first axis for the site.
+    A record contains the numbers that are computed in one period of the control loop. It is
+    kept only as long as a delayed message may still need it. The arrays are ring buffers. For
+    several arms, they have an additional first axis.
 
     Attributes:
         t_ns: Times of the records, in ns since the start of the session. The length is a power
@@ -69,7 +69,10 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def max_over_joints(buckets: Array) -> Array:
-    """Computes the largest position error and joint speed of an arm in each interval of time.
+    """Returns the largest position error and joint speed of an arm in each interval of time.
+
+    The largest values are kept per joint during the simulation, and combined here for a figure
+    or table.
 
     Args:
         buckets: Statistics of an arm with n joints in K intervals of time, which are called
@@ -89,7 +92,10 @@ def max_over_joints(buckets: Array) -> Array:
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns where the numbers that a control law sends begin among all floats of a record."""
+    """Returns the column of a record at which the numbers begin that the control law sends.
+
+    A record is the row of floats that an arm's process computes in one control period.
+    """
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
@@ -314,7 +320,7 @@ def _advance_bucket(progress: ProgressRow) -> None:
 
 @leaf
 def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
-    """Computes the gravity torque of an arm at the pose that a record contains.
+    """Computes the gravity torque of an arm at the pose in one of its records.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -339,7 +345,9 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments at the motion that a record contains.
+    """Computes the torque of operators and environments at the motion in an arm's record.
+
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -445,9 +453,10 @@ def update_sums(
 
 
 class LawArrays(NamedTuple):
-    """Compiled control laws that users wrote, for all N sites of a simulation.
+    """Arrays by which the compiled simulation calls users' control laws, for all N arms.
 
-    A site is a process that runs one arm.
+    They contain the addresses of the compiled laws, and the numbers that the laws keep and
+    send.
 
     Attributes:
         addresses: Address of the machine code of each site's law, shape (N,), see

@@ -55,10 +55,10 @@ _USER = int(Law.USER)
 def _place_arm(
     s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
 ) -> None:
-    """Computes where the links of an arm are, which the tracking errors depend on.
+    """Computes where the links of an arm are, before its tracking errors are computed.
 
-    The orientation that the end effector should follow can be computed in addition. The planar
-    arm needs neither: its equations contain the positions of its links.
+    If asked, it also computes the orientation that the end effector should follow. The planar
+    arm needs neither, because its equations contain the positions of its links.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -75,7 +75,10 @@ def _place_arm(
 
 @leaf
 def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
-    """Runs stage 4: writes the errors e, ed and r, and the dynamics that the law needs.
+    """Computes the tracking errors e, ed and r of an arm, and the dynamics that its law needs.
+
+    The error e is the position minus the reference, ed its derivative, and r the filtered
+    error. This is stage 4 of a control period.
 
     Args:
         s: State of the site (the process that runs the arm); changed.
@@ -89,7 +92,10 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate of the arm's parameters to theta_hat - gain_s Gamma Yr, in its box.
+    """Advances the estimate of the arm's parameters by theta_hat - gain_s Gamma Yr, in bounds.
+
+    Gamma is the adaptation gain, and Yr the product Y' r of the regressor and the filtered
+    error.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -141,19 +147,21 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def updates_estimate(k: int, s: SiteRow) -> bool:
-    """Returns True if an adaptive law integrates its estimate in stage 5 of this tick.
+    """Returns True if an adaptive law integrates its parameter estimate in this control period.
 
-    This is not so at the first tick of the site, nor under the scheme `digital`. Whether the
-    estimate adapts in the present mode is decided by `adapts`.
+    This is not so in the first period of an arm's process, nor under the scheme `digital`,
+    which integrates at the end of the period. `adapts` decides whether the mode allows
+    adaptation.
     """
     return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds Y' r of this tick to that of the previous tick, for the trapezoid rule.
+    """Adds the adaptation rate Y' r of this control period to that of the previous one.
 
-    The sum is written into `Yr_before`, see `_update_estimate`.
+    The estimate of the arm's parameters is integrated by the trapezoid rule, which needs this
+    sum. It is written into `Yr_before`, see `_update_estimate`.
     """
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -161,10 +169,9 @@ def sum_trapezoid(s: SiteRow) -> None:
 
 @leaf
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
-    """Computes the torque of a control law that is built in.
+    """Computes the torque of a control law that is built into the compiled simulation.
 
-    If the control law was written by a user, this function does nothing. `law_stage` computes
-    the torque of compiled user laws.
+    It does nothing for a law that was written as a Python class; `law_stage` calls such a law.
 
     Args:
         site: State of the site (the process that runs the arm), shape (1,). The torque is
@@ -287,7 +294,9 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque with which operators and environments act on the arm at a time.
+    """Computes the torque that operators and environments exert on the arm at a time.
+
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -390,7 +399,7 @@ def _advance(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> None:
-    """Simulates the arm until the next tick (stage 8), and stores what the next tick needs.
+    """Simulates the arm until the next control period, and stores what that period needs.
 
     Args:
         k: Number of the tick (control period).
@@ -415,10 +424,9 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Selects the arrays for the numbers that the control law of one peer sends.
+    """Returns the arrays for the numbers that the control law of one other arm (peer) sends.
 
-    A peer is another site (process that runs one arm). Some control laws send numbers in
-    addition to the motion of the arm, for example energies.
+    Some laws send numbers besides the motion of the arm, for example energies.
 
     Args:
         channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
@@ -534,7 +542,10 @@ def error_stages(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> None:
-    """Computes tracking errors, parameter estimate and external torque (stages 4 and 5).
+    """Computes the tracking errors, the parameter estimate and the external torque of an arm.
+
+    These are stages 4 and 5 of a control period, after the reference is known and before the
+    control law.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -637,10 +648,10 @@ def sense_stages(
 
 @leaf
 def emit_stage(s: SiteRow, record: Array) -> None:
-    """Writes the record of a tick, stage 7.
+    """Writes the results of a control period into its record, which is logged (stage 7).
 
-    If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the rule
-    `glide` the arm comes to rest instead, see `session_life`.
+    If a joint is faster than its limit, the run of this arm ends in the mode DIVERGED. Under
+    the rule `glide`, the arm comes to rest instead, see `session_life`.
 
     Args:
         s: State of the site (the process that runs the arm), with the torque of the motors;

@@ -113,10 +113,11 @@ class RecordedRows(NamedTuple):
 
 
 class SiteViews(NamedTuple):
-    """State of a site as integers, so that the compiled loop can compare all bits.
+    """State of an arm's process as 64-bit integers, to compare it bit by bit with a log.
 
-    Two floating-point numbers can be equal although their bits differ, such as 0.0 and -0.0,
-    and NaN is not equal to itself. A word is the bits of a number as an integer.
+    A comparison of floating-point numbers would miss differences: 0.0 equals -0.0 although
+    their bits differ, and NaN is not equal to itself. The bits of a number as an integer are
+    called a word.
 
     Attributes:
         site: State of the site (the process that runs the arm), as integers.
@@ -140,7 +141,7 @@ class SiteViews(NamedTuple):
 
 
 class TickRules(NamedTuple):
-    """Properties of an arm's control process (site) that stay the same during its run.
+    """Properties of an arm's process that stay the same during a run, for the compiled replay.
 
     Attributes:
         rate_hz: Tick rate, Hz.
@@ -392,7 +393,10 @@ _run_chain_ticks = leaf(_run_recorded_ticks)
 
 
 class TickRepeater:
-    """Computes recorded control periods (ticks) of an arm again, many at a time.
+    """Computes recorded control periods of an arm again, many in one compiled call.
+
+    Each result is compared with the log, to verify that the run can be reproduced. Control
+    periods are called ticks.
 
     Args:
         site: State of the arm and its controller. The control law must be built in.
@@ -425,7 +429,7 @@ class TickRepeater:
         self._saved = [np.empty_like(array) for array in self._list_arrays()]
 
     def repeat(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> int:
-        """Computes recorded control periods (ticks) again, until a result differs.
+        """Computes recorded control periods (ticks) again, until a result differs from the log.
 
         Args:
             first_tick: Number of the first tick. It must be the next tick of the site.
@@ -518,7 +522,7 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the positions of the numbers of a field, counted in words of eight bytes.
+        """Adds where the numbers of one field are stored, counted in words of eight bytes.
 
         Args:
             dtype: Type of the row, that of the site or that of a link.

@@ -23,7 +23,9 @@ from .vectors import Array
 
 
 class Field(NamedTuple):
-    """Describes a field of a structured array: its shape, unit and meaning, and who writes it.
+    """Description of one field of a structured array: its shape, unit, meaning and writer.
+
+    The data types of the arrays and their documentation are generated from these descriptions.
 
     Attributes:
         shape: Axes, joined by " x ". Each axis is a number, or a name such as "joints" whose
@@ -364,9 +366,9 @@ class ProgressRow(Protocol):
 
 
 class SumsRow(Protocol):
-    """Sums over the records of a simulated arm, from which metrics are computed.
+    """Sums over a simulated run of one arm, from which its metrics are computed at the end.
 
-    A record contains the results of one period of the control loop.
+    For example, the root mean square error follows from the sum of squared errors.
     """
 
     first_environment: Annotated[
@@ -418,7 +420,7 @@ FIELDS: dict[str, dict[str, Field]] = {
 
 
 def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
-    """Computes the shape of a field for an arm with given numbers of joints and coordinates.
+    """Returns the shape of a field for a particular arm, for example (2,) for two joint angles.
 
     Args:
         field: The field, whose axes may be named, for example "joints".
@@ -437,7 +439,10 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
 def row_dtype(
     row: str, lengths: Mapping[str, int], *, chain: bool = False
 ) -> np.dtype[np.void]:
-    """Computes the NumPy data type of an array that stores one kind of row of this module.
+    """Returns the NumPy data type of an array whose elements are described by a class above.
+
+    The classes describe, for example, the state of an arm or of a network link. The length of
+    each vector depends on the arm.
 
     Args:
         row: Name of the kind in `FIELDS`, for example "site" or "link".

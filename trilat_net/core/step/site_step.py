@@ -68,7 +68,7 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class TickParts(NamedTuple):
-    """Parts of a `Site` with which `recorded_ticks` computes many control periods at once.
+    """Internal parts of a `Site` that compute many recorded control periods in one call.
 
     Attributes:
         buffers: Input and output of a tick.
@@ -230,9 +230,9 @@ class Site:
         )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
-        """Applies a change to the running site, for example a new delay model of a link.
+        """Applies a change to an arm's process while it runs, for example a new network delay.
 
-        A change that starts later is added to the planned changes.
+        A change that starts later is stored until its time.
 
         Args:
             command: The change.
@@ -271,7 +271,10 @@ class Site:
         self._links["copies"] = 0
 
     def step(self, tick: TickInput) -> TickRecord:
-        """Computes one period of the control loop.
+        """Computes one period of the control loop: from messages to torque and motion.
+
+        This is the only way in which time advances, in live runs, simulations and replays
+        alike. Therefore the same input always gives the same results.
 
         Args:
             tick: Number of the period and its inputs. The number must follow that of the
@@ -371,7 +374,7 @@ class Site:
         return memory
 
     def _write_measurement(self, measured: PlantState) -> None:
-        """Applies the measured motion of a real arm, in place of a simulated motion.
+        """Stores the measured motion of a real arm, in place of a simulated motion.
 
         Args:
             measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque
@@ -427,17 +430,20 @@ class Site:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the site after the last tick, for example RUN while it follows others."""
+        """What the arm did in the last control period, for example RUN: it followed others."""
         return _MODES[self._mode.item()]
 
     @property
     def life_reason(self) -> LifeReason:
-        """Why the site last changed its mode under the rule `glide`, see `session_life`."""
+        """Why the arm last changed its mode, for example because another arm fell silent.
+
+        Reasons exist only under the rule `glide`, see `session_life`.
+        """
         return LifeReason(self._reason.item())
 
     @property
     def arrays(self) -> SiteArrays:
-        """Arrays with the present state of the site. They must not be changed."""
+        """Arrays with the present state of the arm's process. Callers must not change them."""
         return self._arrays
 
     @property
@@ -456,16 +462,16 @@ class Site:
 
     @property
     def q(self) -> list[float]:
-        """Joint angles at the next tick, rad, one per joint.
+        """Joint angles at the start of the next control period, one per joint, rad.
 
-        The last record has those of its own tick.
+        The last record has those at the start of its own period.
         """
         joints = self.layout.joints
         angles: list[float] = self._site[0]["q"][:joints].tolist()
         return angles
 
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
-        """Applies how a person or program pulls the arm in a control period (live hand).
+        """Applies how a person or program pulls the arm in this control period.
 
         Args:
             vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
@@ -578,7 +584,7 @@ class Site:
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if no delay is simulated on a link: only the real network delays it.
+        """Returns True if only the real network delays a link, and no delay is simulated.
 
         Args:
             peer: Index of the sender at the other end of the link.

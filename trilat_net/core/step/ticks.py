@@ -127,7 +127,9 @@ class LifeOrder(IntEnum):
 
 
 class DominanceRamp(NamedTuple):
-    """Linear change over time of a site's dominance factors, with which it follows other sites.
+    """Gradual change of the weights with which an arm follows the other arms, linear in time.
+
+    The weights are called dominance factors, and belong to one site, the process of an arm.
 
     Attributes:
         start_ns: Start of the change, ns since the start of the session.
@@ -141,9 +143,10 @@ class DominanceRamp(NamedTuple):
 
 
 class CoreChange(NamedTuple):
-    """Change of a running site by a command from outside.
+    """Change that takes effect in an arm's process while it runs, as the control loop reads it.
 
-    A command changes the model of a link or the dominance factors, or gives an order.
+    It changes the model of a network link or the weights with which the arm follows the others,
+    or it gives an order such as stop.
 
     Attributes:
         text: Text in the record, from which all readers derive the same change.
@@ -180,7 +183,10 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """Input of one period of the control loop, for `Site.step`.
+    """Everything from outside that may influence one period of the control loop.
+
+    `Site.step` receives it. Time, messages and measurements come in here, so that the same
+    input always gives the same results.
 
     Attributes:
         k: Number of the period.
@@ -201,10 +207,10 @@ class TickInput(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """Counts of the samples of one link since the start of the site.
+    """Counts of the messages on one network link since the start, such as late and lost ones.
 
-    A link is the directed connection from a peer, and a sample the state that the peer
-    published in one tick.
+    A link leads from another arm's process (peer) to this one. A message is a sample, the state
+    of the peer in one control period.
 
     Attributes:
         accepted: Samples that arrived.
