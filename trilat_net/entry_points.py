@@ -73,7 +73,9 @@ def find_package(group: str, name: str) -> str:
 
 
 def load_entry(group: str, name: str, use: str) -> Any:
-    """Imports a command, function or viewer that an installed package adds to this program.
+    """Imports a command, function or viewer that another installed package adds.
+
+    Packages declare such additions as entry points in their metadata.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.

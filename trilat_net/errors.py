@@ -134,7 +134,9 @@ class UsageError(TrilatError):
 
 
 class WireError(TrilatError):
-    """A payload from another machine that is not a message of this program.
+    """Network message from another machine that is not a valid message of this program.
+
+    The receiver drops and counts it; the sender may be a stranger or another version.
 
     Args:
         reason: Category of the problem, by which refused payloads are counted.

@@ -74,7 +74,7 @@ def require_libraries(*names: str) -> None:
 
 
 def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
-    """Returns the error message that a function needs a library that is not installed.
+    """Returns the error message for a function whose library is not installed.
 
     Args:
         function: Name of the function.
@@ -104,6 +104,9 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Imports a module of an optional package, which may not be installed.
+
+    Without the package, the user gets an error with the command that installs it, in place of a
+    traceback.
 
     Args:
         module: Name of the module.
@@ -488,7 +491,7 @@ def write_whole(
 
 
 def _write_parts(stream: BinaryIO, parts: Iterable[bytes | str]) -> None:
-    """Writes the parts of a file one after the other. Text is encoded as UTF-8."""
+    """Writes the parts of a file one after the other, and encodes text as UTF-8."""
     for part in parts:
         stream.write(part.encode() if isinstance(part, str) else part)
 

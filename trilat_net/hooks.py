@@ -90,5 +90,8 @@ def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], A
 
 
 def _import_function(module: str, name: str) -> Any:
-    """Imports the module of a hook, on the first use of the hook, and returns its function."""
+    """Imports a function that an upper package has registered as a hook.
+
+    It is called when a lower package uses the hook for the first time.
+    """
     return getattr(import_module(module), name)

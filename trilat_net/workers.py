@@ -65,7 +65,9 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 
 def _prepare_worker(parent: int, in_command: bool) -> None:
-    """Prepares a worker process: it ignores Ctrl-C, and ends after its parent process.
+    """Prepares a new worker process, so that only its parent process decides when it ends.
+
+    The worker ignores Ctrl-C, and ends as soon as its parent has ended.
 
     Args:
         parent: Process number of the parent.

@@ -106,7 +106,7 @@ class Adaptive(ControlLaw):
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Converts the gains of this law to the record that the compiled control loop reads.
+        """Converts the gains of this law to the form that the compiled control loop reads.
 
         Args:
             theta: True parameters of the arm. This law does not use them, because it learns

@@ -79,7 +79,7 @@ def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
 
 @leaf
 def _end_effector_motion(lengths: Pair, q: Pair, qd: Pair) -> tuple[float, float, float, float]:
-    """Returns the position (x, y) of the end effector, m, and its velocity along x and y, m/s.
+    """Returns the position (x, y) of the planar arm's end effector, m, and its velocity, m/s.
 
     Args:
         lengths: Lengths of the two links, m.

@@ -134,7 +134,7 @@ class LawSettings(Frozen, frozen=True):
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses gains that contradict each other, and an unsuitable number of arms (sites).
+        """Refuses gains that contradict each other, and an unsuitable number of arms.
 
         Args:
             path: Path of the law's table in the scenario, for errors.
@@ -145,7 +145,9 @@ class LawSettings(Frozen, frozen=True):
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Finds a setting of the law that does not suit the rates of the control loops.
+        """Finds a setting of the law that does not suit the rates of the arms' control loops.
+
+        For example, some laws need equal rates at all arms.
 
         Args:
             rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
@@ -211,7 +213,10 @@ class LawSettings(Frozen, frozen=True):
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates under which gains and delays this control law is stable in a scenario.
+        """Evaluates whether this control law is stable with the gains and delays of a scenario.
+
+        A scenario is the description of an experiment. A law with a known stability condition
+        overrides this method.
 
         Args:
             situation: The site, its peers (the other sites), their laws and the delays between
@@ -281,12 +286,17 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def sends(self) -> SentVectorSpecs:
-        """Vectors that the law sends to its peers besides the motion, by name. Often empty."""
+        """Vectors that the law sends to other arms besides the motion, such as waves, by name.
+
+        Most laws send none.
+        """
         sends = getattr(self.kind, "sends", {})
         return convert_sends(sends, self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
-        """Returns a function that creates the law for one arm (site) before a run.
+        """Returns a function that creates the control law of one arm before a run.
+
+        The law itself is created later, when the facts about the arm are known.
 
         Args:
             sites: Number of sites in the scenario.
@@ -354,7 +364,7 @@ class ControlLaw:
             cls.Settings = _derive_settings(cls, tag)
 
     def __init__(self, facts: LawContext, **gains: Any) -> None:
-        """Creates the law of one arm.
+        """Creates the control law of one arm, with its gains as attributes.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -383,7 +393,9 @@ class ControlLaw:
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Explains to the user why the law cannot be used for the arms of a scenario.
+        """Explains to the user why the law cannot couple the arms of a scenario.
+
+        For example, some laws need exactly one master, which a person moves, and one slave.
 
         Args:
             roles: Role of each site, "master" or "slave".

@@ -22,7 +22,9 @@ from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):
-    """Declaration of a vector that a law sends at every tick, see `core.plug.law_channel`.
+    """What a control law declares about a vector that it sends in every control period.
+
+    The length may depend on the arm, which the class of the law does not know.
 
     Attributes:
         unit: Unit of its numbers, as in "J"; "" for dimensionless numbers.

@@ -194,7 +194,7 @@ class Tanks(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why this law has no linear analysis (`trilat linear`), for the user."""
+        """Explains to the user why `trilat linear` cannot linearise this law."""
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:

@@ -917,7 +917,7 @@ class Tdpa(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why this law has no linear analysis (`trilat linear`), for the user."""
+        """Explains to the user why `trilat linear` cannot linearise this law."""
         return "its controllers act by energies, which are of second order in the motion"
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002

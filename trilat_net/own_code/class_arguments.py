@@ -95,7 +95,7 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
 
 
 def _describe_class(kind: Any, code: str) -> str:
-    """Returns the name of a class, with the file of its `__init__` in parentheses."""
+    """Returns the name of a user's class with the file of its constructor, for errors."""
     file = getattr(getattr(kind.__init__, "__code__", None), "co_filename", "")
     return f"{code} ({file})" if file else code
 

@@ -179,12 +179,12 @@ def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None
 
 
 def _class_of(key: CodeKey) -> str:
-    """Returns the name of the class, without its module."""
+    """Returns the name of a user's class without its module: "Law" for "package.module:Law"."""
     return key.code.partition(":")[2]
 
 
 def _find_store() -> Path:
-    """Returns the path of the file in which permissions are stored."""
+    """Returns the path of the file with the permissions of this user to run code of others."""
     folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(folder, "trilat-net", "laws.json")
 
@@ -208,7 +208,7 @@ def _read_store() -> dict[str, _RememberedFile]:
 
 
 def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Writes the stored permissions."""
+    """Writes all permissions to run code to the user's file, in place of the earlier ones."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
     store = _find_store().resolve()
@@ -260,12 +260,15 @@ def _allow_file(
 
 
 def _compare_hashes(key: CodeKey, sha256: str) -> str:
-    """Returns the beginning of a file's hash, and of the hash that the log states."""
+    """Returns the first digits of a file's hash and of the hash in a log, for a message.
+
+    Different digits show the user that the file is not the version that the log names.
+    """
     return f"its sha256 is {sha256[:16]}, but was {key.sha256[:16]}"
 
 
 class _LoggedUserLaw(NamedTuple):
-    """Control law of a user that a log names, and whether it may run on this computer.
+    """Control law that a log names and that is a user's class, with its permission to run.
 
     Attributes:
         code: Class of the law, for example "package.module:Law".
@@ -289,7 +292,7 @@ class _LoggedUserLaw(NamedTuple):
     other_settings: str = ""
 
     def __str__(self) -> str:
-        """Returns a sentence about the law, with the option that allows it to run."""
+        """Returns a sentence about the control law, with the option that permits it to run."""
         law = f"{self.code} of {', '.join(self.sites)}"
         settings = f" with {self.settings}" if self.settings else ""
         file_state = "is the one that ran"

@@ -103,15 +103,15 @@ class _SiteWithCode(Protocol):
 
     @property
     def control(self) -> Any:
-        """Control law of the site."""
+        """Control law of the arm, possibly a user's class."""
 
     @property
     def hands(self) -> Sequence[Any]:
-        """Operators who move the arm of the site."""
+        """Persons and programs who move the arm. A program may be a user's class."""
 
     @property
     def plant(self) -> Any:
-        """What computes the motion of the arm."""
+        """What computes or measures the motion of the arm, possibly a user's class."""
 
 
 class ScenarioWithCode(Protocol):
@@ -122,7 +122,7 @@ class ScenarioWithCode(Protocol):
 
     @property
     def sites(self) -> Mapping[str, _SiteWithCode]:
-        """The sites, each of which is a process that controls one arm, by name."""
+        """Description of each arm's process (site), by name."""
 
 
 ANY_SETTINGS = "*"
@@ -151,7 +151,9 @@ class CodeKey(NamedTuple):
 
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
-        """Returns the identification under which a user's class may be permitted to run.
+        """Returns the key under which a user's class may be permitted to run.
+
+        The key consists of the class, the hash of its file and its arguments.
 
         Args:
             named: Entry of a scenario that names the class: a control law, an operator or a
@@ -394,7 +396,7 @@ def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
 
 
 def _find_file(code: str, path: str) -> Path:
-    """Returns the file that Python's import finds for the module of a class.
+    """Returns the file from which Python would import the module of a user's class.
 
     Raises:
         ScenarioError: There is no such module, or it is not a file.

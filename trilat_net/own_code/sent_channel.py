@@ -110,7 +110,10 @@ def _find_name_problem(name: str) -> str:
 
 
 def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
-    """Returns the classes at the top level of a file, by name, without running the file.
+    """Returns the classes in a Python file by name, without running the file.
+
+    Only classes at the top level are included. The syntax tree is read, because nobody may have
+    permitted the code yet.
 
     Args:
         source: Content of the file.

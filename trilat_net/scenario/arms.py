@@ -338,7 +338,7 @@ class ArmModel(NamedTuple):
         ]
 
     def end_effector(self, q: Vector) -> list[float]:
-        """Returns the position of the end effector in the pose `q`, in m.
+        """Returns the position of the end effector at the joint angles `q`, m.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -356,14 +356,14 @@ class ArmModel(NamedTuple):
         return list(place_end_effector(self._place_links(q), np.array(self.chain.tip_m)))
 
     def _place_links(self, q: Vector | Array) -> RowArray:
-        """Returns the kernel's rows of a chain, with all links placed in the pose `q`."""
+        """Returns the data of a chain's joints with the poses of its links at the angles `q`."""
         assert self.chain is not None
         rows = build_chain(self.chain.joints)
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return rows
 
     def end_effector_orientation(self, q: Vector) -> tuple[float, float, float]:
-        """Returns the orientation of the end effector in the pose `q`.
+        """Returns the orientation of the end effector at the joint angles `q`.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -877,7 +877,11 @@ def bound_estimates(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float
 def _bound_planar_parameters(
     arm: ArmModel, limit_nm: Vector, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the five parameters of Eq. (24), shape (5,) each."""
+    """Returns lower and upper bounds of the planar arm's five parameters, shape (5,) each.
+
+    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
+    Eq. (24) defines the parameters.
+    """
     T_1, T_2 = np.broadcast_to(limit_nm, 2)
     outer = min(T_1, T_2) / g_m_s2
     inner = T_1 / g_m_s2
@@ -890,7 +894,10 @@ def _bound_planar_parameters(
 def _bound_chain_parameters(
     arm: ArmModel, chain: ChainSetup, limit_nm: float, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each."""
+    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each.
+
+    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
+    """
     joints = arm.counts.joints
     reach_m = sum(float(np.linalg.norm(joint.origin_m)) for joint in chain.joints)
     reach_m += float(np.linalg.norm(chain.tip_m))

@@ -156,7 +156,7 @@ def _read_csv(path: Path) -> list[TracePoint]:
 
 
 def _is_number(cell: str) -> bool:
-    """True if a cell contains a number."""
+    """Returns True if a cell of a table contains a number."""
     try:
         float(cell)
     except ValueError:
@@ -640,7 +640,7 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
 
 
 def _split_cells(line: str, separator: str | None) -> list[str]:
-    """Returns the cells of a line. Without a separator, white space separates them."""
+    """Splits a line of a table into cells, at white space if there is no separator."""
     return [cell.strip() for cell in line.split(separator)]
 
 

@@ -296,7 +296,7 @@ def _describe_real_arms(scenario: Scenario) -> list[str]:
 
 
 def _format_per_joint(values: Any, units: Sequence[str]) -> str:
-    """Returns a quantity of each joint as text, once if it is the same for all joints."""
+    """Formats a quantity that each joint has, and writes it once if all joints agree."""
     texts = [f"{value:g}" for value in np.broadcast_to(values, len(units))]
     return _join_equal(texts, units)
 
@@ -329,7 +329,10 @@ def _describe_links(scenario: Scenario) -> list[str]:
 
 
 def _describe_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about the weights that follow from the matrix of dominance factors."""
+    """Returns lines about what follows from the weights with which arms follow each other.
+
+    The weights form the matrix of dominance factors.
+    """
     beta = scenario.beta
     weights = "none: alpha is reducible, some site's weight is zero"
     if beta is not None:
@@ -383,7 +386,10 @@ def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
 
 
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns each different arm with a URDF file, and the names of the sites that have it."""
+    """Returns each different arm that is read from a URDF file, with the names of its users.
+
+    The users are sites, the processes of the arms. URDF is an XML format for robots.
+    """
     groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:
@@ -572,7 +578,7 @@ _SOME_LINKS = "link "
 
 
 class ScenarioDifference(NamedTuple):
-    """One key in which several experiments differ, as a row of a comparison.
+    """Key with different values in several experiments, as a row of a table that compares them.
 
     Attributes:
         key: Dotted path of the key, without `sites.NAME` for a key of a site.
@@ -587,7 +593,7 @@ class ScenarioDifference(NamedTuple):
 
     @property
     def concerns_link(self) -> bool:
-        """True if the difference is one of links, as in "every link" or "link m1->s"."""
+        """True if the differing key belongs to a network link, such as "link m1->s"."""
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
@@ -596,7 +602,9 @@ class ScenarioDifference(NamedTuple):
 
 
 def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the keys in which several experiments differ, including keys that only some have.
+    """Finds the settings in which several experiments differ.
+
+    Settings that only some of the experiments have are included.
 
     Args:
         scenarios: Descriptions of at least two experiments.
@@ -626,7 +634,7 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
 
 
 def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    """Returns a table without some keys."""
+    """Returns a copy of a table without certain keys."""
     return {key: value for key, value in table.items() if key not in keys}
 
 
@@ -653,7 +661,10 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the differences between links. Links with the same difference share an entry."""
+    """Returns the differences between the network links of several experiments.
+
+    Links with the same difference share an entry.
+    """
     names_by_values: dict[tuple[str, ...], list[str]] = {}
     common_names = list(scenarios[0].links)
     for other in scenarios[1:]:

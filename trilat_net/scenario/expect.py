@@ -36,7 +36,10 @@ ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
 class _RunPart(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Keys of a window that do not depend on the number of joints, see `ExpectWindow`."""
+    """Keys for a part of a run (window) that are the same for every arm, see `ExpectWindow`.
+
+    The other keys name a joint, so they depend on the number of joints.
+    """
 
     from_s: WindowTime
     to_s: WindowTime

@@ -108,7 +108,10 @@ def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) 
 
 
 def _user_law_key(path: str, name: str) -> str:
-    """Returns the path of a key of a user's law. Keys that are not its fields are arguments."""
+    """Returns the complete path of an overridden key that belongs to a user's control law.
+
+    Keys that the scenario itself does not define are arguments of the user's class.
+    """
     is_field = name.split(".")[0] in ("law", *field_names(ImportedLaw))
     return f"{path}.{name}" if is_field else f"{path}.settings.{name}"
 
@@ -251,7 +254,7 @@ def _find_value(tables: TomlTable, key: str) -> Any:
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of a site's control law after the overrides."""
+    """Returns the name of an arm's control law as it will be after the overrides."""
     for path in (f"sites.{site}.control.law", "control.law"):
         if path in overridden:
             return overridden[path]

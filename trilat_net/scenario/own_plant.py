@@ -121,7 +121,7 @@ def _check_bodies(written: Any, path: str) -> Any:
 
 
 def _is_box_size(size: Any) -> bool:
-    """True for a list of three lengths in m that a body may have."""
+    """Returns True for a list of three lengths in m that a body of the scene may have."""
     if not isinstance(size, list | tuple) or len(size) != 3:
         return False
     return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)

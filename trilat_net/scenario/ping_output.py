@@ -100,7 +100,7 @@ class _Answer(NamedTuple):
 
 
 class _Summary(NamedTuple):
-    """Numbers in the summary at the end: sent packets and received answers."""
+    """Counts that `ping` prints at the end of its output: sent packets and received answers."""
 
     sent: int
     received: int
@@ -138,7 +138,7 @@ def read_ping(text: str, every_s: float) -> _PingProbes:
 
 
 def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:
-    """Returns the numbers in a summary. None if the line is not a summary."""
+    """Reads the counts from a line of output, or returns None if it is not the summary line."""
     match = pattern.match(line)
     return None if match is None else _Summary(int(match[1]), int(match[2]))
 
@@ -204,7 +204,7 @@ def _unwrap_number(previous: int, number: int) -> int:
 
 
 def _parse_decimal(text: str) -> float:
-    """Returns a number that may have a decimal comma."""
+    """Converts a text to a number; the decimal separator may be a comma."""
     return float(text.replace(",", "."))
 
 

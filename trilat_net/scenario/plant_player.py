@@ -29,7 +29,7 @@ _POSE_NUMBERS = 7
 
 
 class PlantContext(NamedTuple):
-    """Facts that a user's plant receives when it is created.
+    """Facts about the experiment that a user's arm model (plant) receives when it is created.
 
     >>> class Scene:
     ...     def __init__(self, facts: tn.PlantContext) -> None:
@@ -170,7 +170,10 @@ class PlantPlayer:
         self.state = PlantState(q, qd, tau_x, bodies)
 
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
-        """Returns q, qd and, if the plant returns it, tau_x after one period."""
+        """Calls the user's arm model for one control period, and returns the motion after it.
+
+        The result is q, qd and, if the model measures it, the external torque tau_x.
+        """
         q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
         vectors = [q, qd, *others[:1]]
         return [[float(number) for number in vector] for vector in vectors]
@@ -213,7 +216,7 @@ class PlantPlayer:
             raise self._make_error(tick, describe_exception(error)) from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
-        """Returns the error that reports a problem of the plant in a tick."""
+        """Returns the error that the user's arm model failed in a certain control period."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
 
 

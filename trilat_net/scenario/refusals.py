@@ -121,7 +121,9 @@ def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] =
 def convert_drawn(
     table: TomlTable, kind: type[T], path: str, drawn: Mapping[str, Distribution], seed: int
 ) -> T:
-    """Converts a complete table, in which random numbers have been drawn, to its type.
+    """Converts a complete table of a scenario, with its random numbers drawn, to its type.
+
+    A drawn number that is not valid is reported with its distribution and seed.
 
     Args:
         table: The table.
@@ -218,7 +220,7 @@ def _describe_wrong_value(
 
 
 def _describe_table_for_number(table: TomlTable, kind: Any, location: Location) -> str:
-    """Returns what is wrong with a table in place of a number, such as a wrong distribution."""
+    """Explains what is wrong with a table in place of a number, as a wrong distribution."""
     if is_distribution(table):
         return f"{DISTRIBUTION_FORM}, but is {table}"
     return _describe_wrong_number(table, kind, location)
@@ -324,7 +326,7 @@ def _isolate(table: Any, location: Location, value: Any) -> Any:
 
 
 def _value_at(table: Any, location: Location) -> Any:
-    """Returns the value at a location inside a table."""
+    """Returns the value at a place inside nested tables and lists."""
     value = table
     for part in location:
         value = value[part]
@@ -403,7 +405,7 @@ def _find_extra(kind: Any, location: Location, name: str) -> str | None:
 
 
 def _list_keys(hint: Any) -> tuple[str, ...]:
-    """Returns the keys of a table of a type. Empty if the type is no table."""
+    """Returns the keys that a table of a type may have; none if the type is no table."""
     is_struct = isinstance(hint, type) and issubclass(hint, msgspec.Struct)
     return field_names(hint) if is_struct else ()
 

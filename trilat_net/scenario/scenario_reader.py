@@ -187,7 +187,7 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Checks and completes the description of an experiment, after overrides of its keys.
+        """Converts the text to a complete scenario, after some of its values were replaced.
 
         Args:
             overrides: Texts KEY=VALUE, each of which replaces one value of the description. By

@@ -340,14 +340,14 @@ def _drop_unused_keys(arm: dict[str, Any]) -> None:
 
 
 def _drop_absent_values(table: dict[str, Any]) -> None:
-    """Removes the values that mean the same as a missing key from a table, in place."""
+    """Removes values from a table, in place, that mean the same as leaving their keys out."""
     for key, absent_values in _ABSENT_VALUES.items():
         if key in table and table[key] in absent_values:
             del table[key]
 
 
 def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers on one line, for a match of `_NUMBER_LIST`."""
+    """Returns a list of numbers that TOML text spreads over several lines as one line."""
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 

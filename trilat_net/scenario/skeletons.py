@@ -65,7 +65,7 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes a skeleton and its test, and returns the two files.
+    """Writes a Python file with an incomplete class to start from, and one with its test.
 
     Args:
         kind: "law", "hand" or "plant".
@@ -100,7 +100,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
 
 
 def _is_other_module(module: str, file: Path) -> bool:
-    """True if Python finds a module of this name in another file."""
+    """Returns True if Python would find another file under the name of a new module."""
     spec = find_spec(module)
     if spec is None:
         return False

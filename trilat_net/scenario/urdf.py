@@ -150,7 +150,7 @@ class UrdfChain(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """Orientation and origin of a frame, expressed in another frame."""
+    """Position and orientation of a coordinate frame, expressed in another frame."""
 
     rotation: Matrix = _IDENTITY
     origin_m: Three = _ORIGIN
@@ -310,7 +310,10 @@ def read_urdf(
 def _check_supplied_inertias(
     robot: _Robot, links: Mapping[str, LinkInertia], moved_links: Collection[str]
 ) -> None:
-    """Refuses stated inertias of links that do not exist, or that no joint of the arm moves."""
+    """Refuses inertias in a scenario for links that do not exist or that the arm cannot move.
+
+    They would have no effect, probably because a name is misspelt.
+    """
     for name in links:
         if name not in robot.links:
             hint = suggest_nearest(name, list(robot.links))
@@ -324,7 +327,7 @@ def _check_supplied_inertias(
 
 
 def _key(link: str) -> str:
-    """Returns the path of a link's inertia in a scenario, quoted if TOML requires it."""
+    """Returns the path of a link's inertia in a scenario, quoted where TOML requires it."""
     return f"links.{link}" if re.fullmatch(r"[A-Za-z0-9_-]+", link) else f'links."{link}"'
 
 
@@ -346,17 +349,17 @@ def _quote(text: str) -> str:
 
 
 def _link(name: str) -> str:
-    """Returns how an error message names a link."""
+    """Returns the name of a link as error messages write it."""
     return f"link {_quote(name)}"
 
 
 def _joint(name: str) -> str:
-    """Returns how an error message names a joint."""
+    """Returns the name of a joint as error messages write it."""
     return f"joint {_quote(name)}"
 
 
 def _list_names(names: Sequence[str]) -> str:
-    """Returns the first names of a list as a string, and the number of the others."""
+    """Returns a short text with the first names of a list, and how many others there are."""
     text = ", ".join(map(_quote, names[:_MAX_LISTED_NAMES]))
     more = len(names) - _MAX_LISTED_NAMES
     return f"{text} and {more} more" if more > 0 else text
@@ -772,7 +775,7 @@ def _read_body(
 
 
 def _advise_key(name: str, key: str) -> str:
-    """Returns the advice to state a key of a link's inertia in the scenario."""
+    """Advises the user to state a missing or wrong inertia of a link in the scenario."""
     return f"give {key} in [arm.{_key(name)}]"
 
 
@@ -790,7 +793,7 @@ def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
 
 
 def _note_supplied(name: str, supplied: LinkInertia) -> str:
-    """Returns the note about a link whose mass or inertia the scenario states."""
+    """Returns a note for the user that the scenario replaces the mass or inertia of a link."""
     if supplied.mass_kg == 0.0:
         return f"{_link(name)}: the scenario leaves its mass out"
     keys = ", ".join(supplied.list_given_keys())
@@ -990,7 +993,7 @@ def _parse_number(text: str, attribute: str, subject: str, limit: float) -> floa
 def _read_vector(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> Three:
-    """Returns the three numbers in an attribute of an element, see `_read_number`."""
+    """Reads three numbers from an attribute of an XML element, see `_read_number`."""
     texts = element.get(key, "").split()
     attribute = f"{element.tag} {key}"
     if len(texts) != 3:
@@ -1142,7 +1145,7 @@ def _read_stated_inertial(
 
 
 def _find_mass_problem(inertial: _Inertial) -> str:
-    """Returns the reason why the mass of a link is impossible. Empty if it is possible."""
+    """Returns why no real body can have the mass of a link, or "" if it is possible."""
     if inertial.lacks == "mass":
         return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
@@ -1286,7 +1289,7 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> 
 
 
 def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
-    """Returns the sum of the inertial parameters of bodies in the same frame."""
+    """Returns the mass and inertia of several bodies together, given in the same frame."""
     total = bodies[0]
     # The built-in `sum` rounds differently from Python 3.12 on.
     for body in bodies[1:]:

@@ -388,7 +388,7 @@ def _check_joint_space(scenario: Scenario) -> None:
 
 
 def _check_links(scenario: Scenario) -> None:
-    """Refuses links, and delayed views of users, whose keys contradict each other."""
+    """Refuses network links and delayed views of users with contradictory keys."""
     links = {f"links.{name}": link for name, link in scenario.links.items()}
     views = {
         f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view
@@ -580,7 +580,7 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
 
 def _check_task_poses(scenario: Scenario) -> None:
-    """Checks the start poses of all sites that share the pose of the end effector."""
+    """Checks the start poses of all arms that follow each other's end effectors."""
     for name, model in scenario.arms.items():
         if model.shares_pose:
             _check_task_pose(scenario, name)

@@ -95,7 +95,7 @@ def _list_type(hint: Any, takes_distributions: bool) -> Any:
 
 
 def _split_annotation(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
-    """Returns a type without its annotations, and its annotations."""
+    """Splits the annotation of a field into the type itself and its limits."""
     if get_origin(hint) is Annotated:
         return get_args(hint)[0], hint.__metadata__
     return hint, ()

@@ -393,7 +393,10 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
 
 @leaf
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
-    """Returns the linear and angular momentum I(pi) V of a link about the origin of its frame.
+    """Returns the linear and angular momentum of a link about the origin of its frame.
+
+    It is the product I(pi) V, where V is the spatial velocity of the link and I(pi) its spatial
+    inertia.
 
     Args:
         pi: Inertial parameters of the links: per link its mass m, m times its centre of mass,

@@ -235,7 +235,7 @@ def rotate_by_vector(turn: Three, vector: Three) -> Three:
 
 @leaf
 def length(vector: Three) -> float:
-    """Returns the Euclidean length of a vector, in the unit of its numbers."""
+    """Returns the Euclidean length of a 3D vector, in the unit of its numbers."""
     return math.sqrt(dot(vector, vector))
 
 

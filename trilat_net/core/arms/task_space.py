@@ -211,7 +211,11 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 
 @leaf
 def _divide(number: float, pivot: float) -> float:
-    """Returns a number divided by a pivot of J J', or 0 if the pivot vanishes."""
+    """Returns a number divided by a pivot of a matrix factorisation, or 0 if the pivot is 0.
+
+    A pivot of J J' is 0 for a direction in which the end effector cannot move. The result 0
+    then means no motion in this direction.
+    """
     has_pivot = pivot > TINY
     return choose(has_pivot, number / choose(has_pivot, pivot, 1.0), 0.0)
 

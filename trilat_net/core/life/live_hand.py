@@ -208,7 +208,7 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Reads from a record what a person or program did with the arm in a control period.
+        """Reads how a person or program pulled an arm in one control period, from a log.
 
         Args:
             vector: Field `hand` of the record. It contains the numbers of all fields of this

@@ -291,7 +291,9 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes how each program pulls its arm in the next ticks (control periods).
+        """Computes how each program pulls its arm during the next control periods (ticks).
+
+        Each simulation has one program and one arm, and one call advances all simulations.
 
         Args:
             runs: Number of runs that are advanced, the first ones.

@@ -26,7 +26,9 @@ MAX_RECORD_SENT = 1024
 
 
 class SentVector(NamedTuple):
-    """Vector that a control law sends to other arms at every tick, for example energies.
+    """Vector that a control law sends to other arms in every control period, such as energies.
+
+    It travels in the same network message as the motion of the arm.
 
     Attributes:
         name: Name of the vector, as the law uses it.

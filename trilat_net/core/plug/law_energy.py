@@ -40,7 +40,10 @@ class PeerRecords(NamedTuple):
 
 
 class LawRecords(NamedTuple):
-    """Recorded motion, torques and messages of a site in K ticks, for energy accounts.
+    """Recorded motion, torques and messages of one arm in K control periods.
+
+    From them, a control law computes an account of energies, which shows whether it was
+    passive.
 
     Attributes:
         h_s: The period, s.

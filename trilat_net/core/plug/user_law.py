@@ -237,6 +237,8 @@ def call_law(
 ) -> "LawResults":
     """Calls a user's control law for one control period, and checks its results.
 
+    An exception or an unusable result is reported with the class, the arm and the period.
+
     Args:
         law: The law.
         site: Name of the site.
@@ -319,7 +321,9 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 def describe_failure(
     law: UserLaw, site: str, tick: int | None, error: BaseException
 ) -> LawFailed:
-    """Returns the error by which a site reports that its control law raised an exception.
+    """Converts an exception in a user's control law to an error with the class and the arm.
+
+    The message contains the line of the user's file.
 
     Args:
         law: The law.
@@ -411,6 +415,8 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
 
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     """Restores the state that a control law had after a recorded control period.
+
+    A recorded run can then be continued or checked from that period on.
 
     Args:
         law: The law, which is changed.

@@ -397,6 +397,8 @@ class _LeafCache(FunctionCache):
     def load_inner(self, argument_types: Any, context: Any) -> Any:
         """Loads the LLVM code of a function that another compiled function calls.
 
+        LLVM code is the intermediate form from which the compiler makes machine code.
+
         Args:
             argument_types: Numba's types of the arguments.
             context: Numba's description of the target processor.
@@ -565,7 +567,10 @@ class _LaneLibrary(_LeafLibrary):
 
 
 class _LoopCompiler(_LeafCompiler):
-    """Compiles a function with a long loop, and inlines all functions that it calls."""
+    """Compiles a function with a long loop together with all functions that it calls.
+
+    Calls within the loop would take much of its time. The technique is called inlining.
+    """
 
     library_class = _LaneLibrary
 
@@ -785,7 +790,10 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def _make_unstored(function: Callable[..., Any]) -> Any:
-    """Returns Numba's dispatcher of a function of lanes whose code is not stored on disk."""
+    """Wraps a function for several simulations side by side whose code is not stored on disk.
+
+    It is compiled again in each process.
+    """
     dispatcher: Any = _make_leaf(function, _LaneCompiler)
     dispatcher._cache = NullCache()
     return dispatcher

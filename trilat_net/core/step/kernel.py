@@ -322,7 +322,7 @@ def _advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Simulates the motion of the arm, its angles q and velocities qd, over one control period.
+    """Simulates the motion of the arm, joint angles and velocities, over one control period.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.

@@ -448,7 +448,7 @@ class Site:
 
     @property
     def parts(self) -> "TickParts":
-        """Parts of the site by which `recorded_ticks` computes many control periods at once."""
+        """Internal parts by which `recorded_ticks` computes many control periods at once."""
         return TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,

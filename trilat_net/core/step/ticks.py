@@ -29,7 +29,10 @@ BUCKETS_PER_S = 20
 
 @leaf
 def tick_ns(tick: int, rate_hz: int) -> int:
-    """Returns the nominal time of a tick, ns since the epoch, the common start of the session.
+    """Returns the nominal start of a control period (tick), ns since the start of the session.
+
+    It is exact in integers: tick * 10^9 // rate_hz. For example, tick 3 at 1000 Hz starts at
+    3000000 ns.
 
     Args:
         tick: Number of the tick (control period).
@@ -166,7 +169,7 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Measured state of an arm that the program does not simulate, for example of a real arm.
+    """Measured state of an arm that the program does not simulate itself, such as a real arm.
 
     Attributes:
         q: Joint angles, rad.
@@ -435,7 +438,7 @@ def describe_mode(
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
-    """Writes the sentence that a log contains if an arm moved faster than its limit.
+    """Writes the sentence for the log that an arm moved faster than its speed limit.
 
     Args:
         site: Name of the process that runs the arm.

@@ -131,7 +131,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return {}
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model of the delay, without loss."""
+        """Returns the delay of the link in the form that the compiled simulation reads.
+
+        Losses are not included; `to_core_model` adds them.
+        """
         raise NotImplementedError
 
     def _moments(self) -> tuple[float, float]:
@@ -148,11 +151,11 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return mean_ms + 3.0 * deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem of the delay that involves several keys, or None."""
+        """Returns a contradiction between several keys of the delay, or None."""
         return None
 
     def _describe_delay(self) -> str:
-        """Returns the delay as a short text with its mean and standard deviation."""
+        """Returns a short text for users about the delay, with mean and standard deviation."""
         mean_ms, deviation_ms = self._moments()
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
@@ -350,7 +353,10 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model. Its location is the longest delay, in microseconds."""
+        """Returns the delay in the form that the compiled simulation reads.
+
+        The parameter `location` is the longest delay, in microseconds.
+        """
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:

@@ -69,7 +69,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model: the mean and the half width, in microseconds."""
+        """Returns the mean and the half width in microseconds, for the compiled simulation."""
         return LinkModel(
             kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms
         )
@@ -81,15 +81,15 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return f"uniform {least_ms:.4g} to {most_ms:.4g} ms"
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments. The standard deviation is half_width / sqrt(3)."""
+        """Returns the mean and the standard deviation, half_width / sqrt(3), in ms."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
     def _reach_ms(self) -> float:
-        """Returns the upper end of the distribution, in ms."""
+        """Returns the longest delay, the upper end of the uniform distribution, in ms."""
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the distribution would include negative delays."""
+        """Returns a problem if the half width exceeds the mean, so that delays are negative."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -109,7 +109,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     deviation_ms: Deviation
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model: the mean and the standard deviation, in microseconds."""
+        """Returns the mean and the deviation in microseconds, for the compiled simulation."""
         return LinkModel(
             kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms
         )
@@ -140,7 +140,7 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
     deviation_ms: Deviation
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the two keys, which are the moments."""
+        """Returns the mean and the standard deviation that the author stated, in ms."""
         return self.delay_ms, self.deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
@@ -210,7 +210,7 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
     slow_share: Probability
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model, with times in microseconds."""
+        """Returns the fixed delay and both means in microseconds, for the simulation."""
         return LinkModel(
             kind=DelayKind.HYPER_EXPONENTIAL,
             location=1e3 * self.floor_ms,
@@ -248,7 +248,7 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
     correlation: Correlation
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model: a normal delay with the correlation as weight."""
+        """Returns mean, deviation and correlation of the delay, for the compiled simulation."""
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
@@ -276,15 +276,15 @@ class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model of a link without delay, which is its default."""
+        """Returns the settings of a link without delay, for the compiled simulation."""
         return LinkModel()
 
     def _moments(self) -> tuple[float, float]:
-        """Returns zero for the mean and the standard deviation."""
+        """Returns zero for the mean and for the standard deviation of the delay, in ms."""
         return 0.0, 0.0
 
     def _describe_delay(self) -> str:
-        """Returns the text for links without delay."""
+        """Returns the text that users read about a link without delay."""
         return "no delay"
 
 
@@ -299,11 +299,11 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
     delay_ms: Milliseconds
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model, with the delay in whole microseconds (L4)."""
+        """Returns the delay in whole microseconds, for the compiled simulation."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the delay, and zero for the standard deviation."""
+        """Returns the constant delay as the mean, and zero as the standard deviation, in ms."""
         return self.delay_ms, 0.0
 
     def _describe_delay(self) -> str:
@@ -329,7 +329,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
     phase_rad: Annotated[float, Meta(ge=-1e3, le=1e3)] = 0.0
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model, with times in microseconds."""
+        """Returns the parameters of the sine in microseconds, for the compiled simulation."""
         return LinkModel(
             kind=DelayKind.SINE,
             location=1e3 * self.delay_ms,
@@ -339,15 +339,15 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over whole periods."""
+        """Returns the mean and the standard deviation over whole periods, in ms."""
         return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay, in ms."""
+        """Returns the longest delay, at the crest of the sine, in ms."""
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the delay would become negative."""
+        """Returns a problem if the amplitude exceeds the mean, so that delays are negative."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -375,7 +375,10 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return parse_trace(self.trace)
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model. The points themselves are in a separate array."""
+        """Returns the settings of a recorded delay, for the compiled simulation.
+
+        The recorded points themselves are in a separate array, see `points`.
+        """
         return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
 
     def _moments(self) -> tuple[float, float]:
@@ -398,11 +401,11 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return mean_us / 1e3, math.sqrt(variance) / 1e3
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay of the table, in ms."""
+        """Returns the longest delay in the recorded table, in ms."""
         return float(self.points[:, 1].max()) / 1e3
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the text does not contain a table."""
+        """Returns a problem if the text of the recorded delays cannot be read as a table."""
         try:
             parse_trace(self.trace)
         except ValueError as error:
@@ -418,11 +421,11 @@ class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model."""
+        """Returns the settings of a link on which no delay is simulated."""
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN, because the delay of the real network is not known beforehand."""
+        """Returns NaN twice, because the delay of the real network is not known beforehand."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:

@@ -69,7 +69,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the actor as the record from which the kernel computes its torque."""
+        """Returns the operator or environment as the compiled simulation reads it."""
         raise NotImplementedError
 
     @property
@@ -189,7 +189,10 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
-        """Returns the actor for the kernel, which calls the compiled `act`."""
+        """Returns the operator or environment as the compiled simulation reads it.
+
+        The simulation calls its compiled method `act`.
+        """
         kind = TorqueKind.OWN_TIP if self.at_tip else TorqueKind.OWN_JOINTS
         return TorqueSource(kind, self.start_s, self.end_s, sampled=self.sampled, model=self)
 

@@ -360,7 +360,7 @@ class HandPlayer:
         self.hand.release(k)
 
     def _describe_change(self, k: int, change: str) -> str:
-        """Returns a sentence about a change in tick `k`, such as taking hold of the arm."""
+        """Returns a sentence about the program, such as that it takes hold of the arm."""
         t_s = tick_ns(k, self._rate_hz) / NS_PER_S
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
