@@ -149,9 +149,10 @@ class WireError(TrilatError):
 
 
 class SessionError(TrilatError):
-    """A session that cannot start.
+    """A live session of several arms' processes that cannot start.
 
-    For example, a site is missing or has another scenario, or the session is running already.
+    For example, a process is missing or runs another experiment, or the session is running
+    already.
     """
 
     exit_code = 2
@@ -176,9 +177,9 @@ class LogRefused(LogError):  # noqa: N818 - it names an outcome
 
 
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
-    """A run that cannot be executed again from its log.
+    """A run that cannot be computed again from its log.
 
-    The message gives the reason, for example that the log lacks the inputs of a site.
+    The message gives the reason, for example that the log lacks what an arm received.
     """
 
 
@@ -226,7 +227,7 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Returns what pickle needs to rebuild the error, with its site, code and tick.
+        """Returns what pickle needs to rebuild the error with all its facts.
 
         Worker processes report errors to the process that started them by pickle.
         """

@@ -129,12 +129,12 @@ class StabilityCondition(NamedTuple):
 
 
 def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of a dominance matrix, if the matrix is reversible.
+    """Returns the least eigenvalue of a dominance matrix, or None if it is not reversible.
 
-    Row i of the matrix alpha contains the weights with which site i follows the other sites.
-    The matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
-    Then all eigenvalues are real. The negative of the least one is a lower bound of d / (K T),
-    where d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
+    Row i of the matrix alpha contains the weights with which arm i follows the others. The
+    matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji. Then
+    all eigenvalues are real. The negative of the least one is a lower bound of d / (K T), where
+    d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
 
     Args:
         alpha: Dominance matrix, shape (N, N).
@@ -151,12 +151,12 @@ def find_least_reversible(alpha: Array) -> float | None:
 def judge_position_exchange(
     situation: LawSituation, stiffness: str, damping: str
 ) -> StabilityCondition:
-    """Returns the stability condition of P+d, a spring to the other arms and a damper.
+    """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
 
-    The condition holds for arms of any mass. For two sites, it is due to Nuno, Basanez, Ortega
-    and Spong, IJRR 28, 2009. More than two sites need reversible dominance factors, see
-    `find_least_reversible`, and the same stiffness K, damping d and delay T at all sites
-    (docs/theory/damping-conditions.md, 13).
+    The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
+    due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two need the same stiffness
+    K, damping d and delay T at all arms, and reversible weights with which they follow each
+    other, see `find_least_reversible` (docs/theory/damping-conditions.md, 13).
 
     A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
     and T increased by h / 2, for arms whose least inertia is above d h / 2

@@ -130,7 +130,7 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def tag(self) -> str:
-        """Name by which a scenario selects the law, for example "p_d"."""
+        """Name by which the description of an experiment selects the law, for example "p_d"."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
@@ -158,10 +158,10 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
-        """Converts the gains of the law to the record that the simulation kernel reads.
+        """Converts the gains of the law to the form that the compiled control loop reads.
 
-        The simulation kernel is the compiled code of the control loop. The default record
-        (`Law.USER`) tells the kernel that the class of the law computes the torque.
+        By default (`Law.USER`), they tell the loop that the Python class of the law computes
+        the torque.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),

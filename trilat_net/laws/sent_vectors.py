@@ -43,10 +43,9 @@ SentVectorSpecs = dict[str, _SentVectorSpec]
 
 
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
-    """Converts the class variable `sends` of a control law to checked specifications.
+    """Checks what a control law declares to send to other arms, and converts it.
 
-    The variable `sends` declares the vectors that the law sends to the other sites, each with
-    its name, unit and length.
+    The class variable `sends` declares vectors, each with its name, unit and length.
 
     Args:
         sends: Value of the class variable.

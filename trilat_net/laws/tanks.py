@@ -198,12 +198,12 @@ class Tanks(EnergyLaw):
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether the energy tanks keep the session passive.
+        """Evaluates whether the energy tanks keep the coupled arms passive.
 
-        A tank is the amount of energy that the controller of an arm may still spend. In each
-        control period, it sends a fixed part of its content to the other arms. The condition is
-        met if this part is at most 1. Then the session is passive, provided that operators and
-        environments are passive.
+        Passive means that they never give more energy than they received. A tank is the amount
+        of energy that the controller of an arm may still spend. In each control period, it
+        sends a fixed part of its content to the other arms. The condition is met if this part
+        is at most 1, provided that persons and environments are passive.
 
         Args:
             situation: This arm, with the rate of its control loop.

@@ -805,10 +805,10 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)  # inverse of the inertia matrix, row by row
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and sends torques and energies to the peers.
+        """Computes the torque of a control period, and sends torques and energies to other arms.
 
-        The site first acts as a follower, then as a leader. The torque that the site feels as a
-        leader is reduced if the torque of a joint would otherwise exceed its limit.
+        The arm first acts as a follower, then as a leader. The torque that it feels as a leader
+        is reduced if the torque of a joint would otherwise exceed its limit.
 
         Args:
             now: Inputs and outputs of the law in this tick.

@@ -101,7 +101,7 @@ def _describe_class(kind: Any, code: str) -> str:
 
 
 def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
-    """Checks that a value in a scenario has the type of an argument of a user's class.
+    """Checks that a value has the type which a user's class expects for an argument.
 
     The type is that of the annotation. Without an annotation, it is the type of the default,
     and only a text in place of a number, or the reverse, is refused: the class may accept lists

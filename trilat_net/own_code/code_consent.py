@@ -47,7 +47,7 @@ LawFiles = str | Path | Sequence[str | Path]
 
 
 def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[NamedCode]:
-    """Returns the users' classes that scenarios name, and that would run with them.
+    """Returns the users' Python classes that experiments name, and that would run with them.
 
     These are control laws, operators (programs that move an arm) and plants (programs that
     compute the motion of an arm).
@@ -70,10 +70,10 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: ScenarioWithCode | None = None,
 ) -> AnyScenario:
-    """Allows the code that a scenario names to run, because a user of this process named it.
+    """Permits users' classes to run, because a user of this process has named them.
 
-    The program runs users' classes only with permission, since a scenario from elsewhere may
-    name harmful code.
+    Code that nobody has named or permitted is refused, since the description of an experiment
+    that comes from elsewhere may name harmful code.
 
     Args:
         scenario: Scenario that names the code.
@@ -330,10 +330,10 @@ def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
 
 
 def may_run_user_laws(scenario: ScenarioWithCode) -> bool:
-    """Returns True if every control law in a scenario that is a user's class may run.
+    """Returns True if every control law in an experiment that is a user's class may run.
 
-    Whoever permitted the laws of a log also permitted what repeats its run: twins, roots and
-    the energies that the laws declare.
+    Whoever permitted the laws of a log also permitted what computes its run again, for example
+    copies of the run that start slightly displaced (twins).
 
     Args:
         scenario: Scenario of a log.

@@ -356,7 +356,7 @@ class ArmModel(NamedTuple):
         return list(place_end_effector(self._place_links(q), np.array(self.chain.tip_m)))
 
     def _place_links(self, q: Vector | Array) -> RowArray:
-        """Returns the data of a chain's joints with the poses of its links at the angles `q`."""
+        """Returns the data of a chain's joints, with all links placed at the angles `q`."""
         assert self.chain is not None
         rows = build_chain(self.chain.joints)
         place_joints(rows, np.asarray(q, dtype=np.float64))

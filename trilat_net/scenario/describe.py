@@ -58,12 +58,12 @@ IRREVERSIBLE_SHARES = (
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """True if the dominance factors of a scenario are irreversible.
+    """Returns True if the weights with which arms follow each other are irreversible.
 
-    The dominance factor alpha_ij is the weight with which site i follows site j. The factors
-    are reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric,
-    where I is the identity matrix. Some stability conditions require this. The result is False
-    if a control law exchanges more than positions or does not compensate gravity, because the
+    The weight alpha_ij (dominance factor) states how much arm i follows arm j. The weights are
+    reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric, where I
+    is the identity matrix. Some stability conditions require this. The result is False if a
+    control law exchanges more than positions or does not compensate gravity, because the
     condition does not apply then.
     """
     laws = [spec.control for spec in scenario.sites.values()]
@@ -99,9 +99,10 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
 
 
 def _find_hold_time(scenario: Scenario) -> float:
-    """Returns the time for which a torque is held, in s.
+    """Returns for how long the torque of an arm is held constant, in s.
 
-    The time is 0 if the scheme is not digital, and NaN if the tick rates of the sites differ.
+    This is the control period for the integration scheme "digital", and 0 for other schemes. It
+    is NaN if the control loops of the arms have different rates.
     """
     if scenario.scheme != "digital":
         return 0.0
@@ -148,10 +149,10 @@ _TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
 
 
 def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each site, its control law, and the facts on which its stability depends.
+    """Yields each arm with its control law and the facts on which its stability depends.
 
-    The facts, such as delays, dominance factors and tick rates, are the input of the stability
-    condition that a law may have.
+    The facts are delays, the rates of the control loops, and the weights with which the arms
+    follow each other. A law with a stability condition evaluates it from them.
     """
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
@@ -490,10 +491,10 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
 
 
 def _describe_silences(scenario: Scenario) -> list[str]:
-    """Returns lines about how often sites will have to wait for late samples of their peers.
+    """Returns lines about how often arms will have to wait for late messages from others.
 
-    This concerns sites with the stale rule "glide". The number of waits is computed with the
-    delays and losses that the links will draw in the run.
+    Only arms under the rule "glide" wait: they come to rest meanwhile. The number is computed
+    with the delays and losses that the network links will draw in the run.
     """
     lines = []
     for name, spec in scenario.sites.items():

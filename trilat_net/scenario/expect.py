@@ -265,13 +265,13 @@ END_WINDOW_S = 1.0
 class Expect(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Conditions that every run of a scenario must satisfy, for every random seed.
+    """Conditions that every run of an experiment must satisfy, for every random seed.
 
-    `trilat test` checks them. The synchronisation error of a site is e = q_i - q_id, Eq. (9):
-    the difference between its joint angles q_i and its reference q_id. |e| is taken for each
-    joint. "Largest" and "smallest" refer to all sites (or links), all joints and all ticks of
-    the run. A run that diverged ends at that tick. Its quantities are those of the part before,
-    and the run fails unless `stable = false` is expected.
+    The command `trilat test` checks them. The error of an arm is e = q_i - q_id, Eq. (9): its
+    joint angles q_i minus the position q_id that it should follow. |e| is taken for each joint.
+    "Largest" and "smallest" refer to all arms (or network links), all joints and all control
+    periods. If an arm diverges, the run ends there. Only the part before counts, and the run
+    fails unless `stable = false` is expected.
 
     Attributes:
         stable: True if the run must be stable, False if it must be unstable. A run whose

@@ -26,9 +26,9 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """Lengths of the vectors of a site in a scenario, for example 6 gains for 6 joints.
+    """Lengths of the vectors that belong to one arm, for example 6 gains for 6 joints.
 
-    A scenario may state one number where a vector is needed. The counts say how long the vector
+    An author may state one number where a vector is needed. The counts say how long the vector
     becomes, and check vectors that are given in full.
 
     Attributes:

@@ -126,11 +126,11 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 def complete_timeline(
     written: Sequence[WrittenChange], links: TomlTable, site_names: list[str]
 ) -> list[TomlTable]:
-    """Returns the planned changes of a scenario, each complete in itself.
+    """Returns the planned changes of an experiment, each complete in itself.
 
-    A change affects a link or the dominance factors of a site. An author may state only those
-    keys of a link that change. In the result, each change states the whole link: the other keys
-    have the values that the earlier changes left.
+    A change affects a network link, or the weights with which an arm follows the others. An
+    author may state only those settings of a link that change. In the result, each change
+    states all settings: the others have the values that the earlier changes left.
 
     Args:
         written: Changes as their author wrote them.

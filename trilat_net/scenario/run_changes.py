@@ -31,12 +31,10 @@ from .written_tables import WrittenChange
 
 
 class LinkTables(dict[str, dict[str, Any]]):
-    """Current settings of every link during a run, by the name of the link.
+    """Present settings of every network link during a run, by the name of the link.
 
-    A link is the directed connection between two sites, and its settings are a table of a
-    scenario. They change when a change of the link takes effect. `advance_to` applies the
-    changes of the timeline; a caller that accepts a requested change stores the new table
-    itself.
+    The settings, such as the delay, change at planned times, which `advance_to` applies. A
+    caller that accepts a change requested by a user stores the new settings itself.
 
     Args:
         links: Links at the start of the run, by name.

@@ -36,12 +36,12 @@ _BLOCK = 8192
 
 
 class LinkSchedule:
-    """Computes when the samples of a link should arrive at the receiver.
+    """Computes when each message on a simulated network link should arrive at the receiver.
 
-    A sample is the state that a site publishes in one tick. The times follow from the delays
-    and losses that the scenario states. They are computed by the same function as during a run.
-    It reads a row of data that describes the link with all its models and outages. A model
-    applies to samples that are sent at its first stamp or later.
+    Every arm's process sends its state (a sample) once per control period. The arrival times
+    follow from the delays and losses in the description of the experiment, and are computed by
+    the same function as during a run. Each model of delay applies to messages sent at its first
+    time or later.
 
     Args:
         setup: Setup of the link, as the kernel reads it.
@@ -147,10 +147,10 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 def draw_used_samples(
     link: LinkBase, key: int, receiver_hz: int, sender_hz: int, duration_s: float
 ) -> IntArray:
-    """Computes which sample of a peer a site uses in each of its ticks.
+    """Computes which message of another arm is in use in each control period of an arm.
 
-    A peer is another site that sends its state once per tick (a sample). Other links of the
-    site are not considered.
+    Messages are delayed and lost by the network link between the two arms; other links of the
+    arm are not considered. A message is called a sample.
 
     Args:
         link: Link over which the samples arrive.
@@ -197,9 +197,9 @@ def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
 
 
 def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
-    """Counts how often a site receives nothing new from a peer for longer than a limit.
+    """Counts how often an arm receives nothing new from another arm for longer than a limit.
 
-    The time before the first sample does not count.
+    The time before the first message does not count.
 
     Args:
         used: Number of the sample in use in every tick. -1 before the first sample.

@@ -416,9 +416,9 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
 
 
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns a function that extracts the names of the sites from the text of a scenario.
+    """Returns a function that extracts the names of the arms from the text of an experiment.
 
-    The text may come from a log or another computer. Therefore the text is not trusted, see
+    The text may come from a log or another computer. Therefore it is not trusted, see
     `parse_embedded`.
 
     Args:

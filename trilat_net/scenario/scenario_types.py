@@ -106,10 +106,10 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> StaleRule:
-        """Reaction to missing messages of another site, as a record for the control loop.
+        """What to do if messages of another arm are missing, as the control loop reads it.
 
-        The scenario states times in ms, and the record in whole ns, because the kernel computes
-        with integers.
+        Times are converted from ms to whole ns, because the compiled code computes with
+        integers.
         """
         if self.action == "glide":
             return StaleRule(
@@ -179,10 +179,9 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> MotionLimits:
-        """Limits of joint angles, reference speed and torque rate, as a record for the kernel.
+        """Limits of angles, reference speed and torque rate, as the control loop reads them.
 
-        A limit that the author of the scenario left out is infinite, so that the kernel needs
-        no special case.
+        A limit that the author left out is infinite, so that the loop needs no special case.
         """
         return MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -261,11 +260,11 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):
-    """Change of a link or of dominance factors, or a command to a site.
+    """Change during a run: of a network link, of weights, or a command to one arm's process.
 
-    A scenario plans changes in its timeline, and users request further ones during a run.
-    Exactly one of `link`, `dominance` and `site` is not empty, and says what is changed. Only
-    the changes in records of a run have `site`.
+    The weights (dominance factors) state how much an arm follows the others. A scenario plans
+    changes, and users request further ones. Exactly one of `link`, `dominance` and `site` is
+    not empty, and says what is changed. Commands (`site`) occur only in the log of a run.
     """
 
     @property
@@ -510,11 +509,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
-        """Chooses a colour for each site, for figures.
+        """Chooses a colour for each arm, for figures.
 
-        The slave gets a fixed colour, so that it looks the same in the figures of all
-        scenarios. Until a slave has been met, this colour is reserved for it. The other sites
-        get the first free colours.
+        The slave, the arm that works at the environment, gets a fixed colour, so that it looks
+        the same in all figures. This colour is reserved until a slave has been met. The other
+        arms get the first free colours.
 
         Args:
             colours: Number of colours of the palette.
@@ -551,10 +550,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return max(1, round(self.duration_s * self.sites[site].rate_hz))
 
     def peers(self, site: str) -> tuple[str, ...]:
-        """Returns the names of all other sites, in the order of the scenario.
+        """Returns the names of all arms but one, in the order of the scenario.
 
-        Arrays with an entry per peer, such as the ages of samples, have this order. A peer is
-        included even if the site does not follow it.
+        They are called the peers of this arm's process (site). Arrays with an entry per peer
+        have this order. An arm that is not followed is included.
 
         Args:
             site: Name of the site whose peers are returned.
@@ -637,17 +636,17 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def sites_may_return(self) -> bool:
-        """True if sites may leave a session and return while it runs.
+        """True if the process of an arm may leave a live session and return to it.
 
-        This requires the stale rule "glide" at every site, see `OnStale`. The remaining sites
-        then wait for the site that left, and align with it again when it returns.
+        This requires the rule "glide" at every arm, see `OnStale`: the other arms come to rest,
+        and follow the returning arm smoothly.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
-        """Returns the seed with which a user's code at a site should draw random numbers.
+        """Returns the seed with which a user's code at one arm should draw random numbers.
 
-        It depends on the seed of the scenario and the name of the site, so that sites with the
+        It depends on the seed of the experiment and the name of the arm, so that arms with the
         same code draw different numbers.
 
         Args:
@@ -787,10 +786,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> RestGains:
-        """Returns the gains of the controller that brings a site's arm to rest.
+        """Returns the gains of the controller that brings an arm to rest.
 
-        It acts, for example, when a peer is silent. The gains depend on the arm, on the limit
-        of its torque, on the tick rate and on the damping that the control law already has.
+        It acts, for example, when another arm has fallen silent. The gains depend on the
+        inertia of the arm, its largest torque, the control period, and the damping of the
+        control law.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -844,10 +844,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the sites that a site follows, as an integer with bit n set for site n.
+        """Returns which arms an arm follows, as an integer with bit n set for arm n.
 
-        For example, 0b101 for the first and the third site. The kernel needs this compact
-        format.
+        For example, 0b101 stands for the first and the third arm. The compiled code needs this
+        compact form.
         """
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
@@ -881,9 +881,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the changes of a site's dominance factors that the scenario plans.
+        """Returns the planned changes of the weights with which one arm follows the others.
 
-        A dominance factor is the weight with which the site follows a peer.
+        The weights are called dominance factors, and change gradually (ramps).
 
         Args:
             site: Name of the site.

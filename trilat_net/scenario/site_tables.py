@@ -292,10 +292,10 @@ def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
 
 
 def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
-    """Draws the numbers of a site that are given as distributions, in place.
+    """Replaces random distributions in the table of one arm by drawn numbers, in place.
 
-    These are the start, the limits, the rules for stale samples, the task and the gains of the
-    control law. The numbers of the arm have been drawn before.
+    These are the start pose, the limits, the rules for silent arms, the task and the gains of
+    the control law. The numbers of the arm's model have been drawn before.
     """
     start = {key: site[key] for key in ("q0_rad", "qd0_rad_s")}
     site |= draws.draw_numbers(start, path)

@@ -168,13 +168,12 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or whose reference could jump.
+    """Refuses real robots that lack limits, or that a jump of the reference could move suddenly.
 
-    The stale rule of a site says how it reacts if the samples of other sites are late or
-    missing. Only under the rule "glide" does the reference never jump.
-
-    The check is made before a session, and not for every scenario, because the scenarios in
-    logs of earlier versions may lack these keys.
+    The reference is the position that an arm follows. It could jump when another arm falls
+    silent or is heard again, except under the rule "glide". The check is made before a session
+    and not for every scenario, because the scenarios in logs of earlier versions may lack these
+    keys.
 
     Args:
         scenario: Description of the experiment.
@@ -445,10 +444,10 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses law vectors that a site receives under one name but with different lengths.
+    """Refuses vectors that an arm receives from several laws under one name, unequally long.
 
-    A control law may send additional vectors to the peers, each with a name. A site stores the
-    vectors of all its peers in one array per name, so their lengths must agree.
+    A control law may send additional vectors to the other arms, each with a name. A receiver
+    stores those of one name in one array, so their lengths must agree.
     """
     for site in scenario.names:
         first_senders: dict[str, tuple[str, int]] = {}
@@ -465,11 +464,11 @@ def _check_received(scenario: Scenario) -> None:
 
 
 def _check_energy_laws(scenario: Scenario) -> None:
-    """Refuses scenarios in which only some sites have a law that keeps account of energy.
+    """Refuses scenarios in which only some arms have a law that keeps an account of energy.
 
-    Such a law proves passivity by counting the energy that enters and leaves the links. It
-    works only if both ends of each link count. It may have further conditions on the
-    integration scheme and the tick rates.
+    Such a law proves stability by counting the energy that enters and leaves each network link,
+    which works only if both ends count. It may have further conditions on the integration
+    scheme and the rates of the control loops.
     """
     laws = {name: site.control for name, site in scenario.sites.items()}
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
@@ -589,9 +588,9 @@ def _check_task_poses(scenario: Scenario) -> None:
 def _check_task_pose(scenario: Scenario, name: str) -> None:
     """Refuses a start pose from which the end effector cannot move along all followed axes.
 
-    The rows of the Jacobian J belong to the axes that the site follows. A row of zeros is an
-    axis along which no joint moves the end effector. If J does not have full row rank, the pose
-    is singular: the end effector cannot move along some combination of the axes.
+    The Jacobian J of the end effector has a row per followed axis. A row of zeros is an axis
+    along which no joint moves the end effector. If J does not have full row rank, the pose is
+    singular: the end effector cannot move along some combination of the axes.
 
     Args:
         scenario: The scenario.
@@ -712,10 +711,11 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:
-    """Refuses links of a site whose samples in transit would need too much memory.
+    """Refuses network links on which more messages would wait than memory permits.
 
-    A sample is in transit from its sending until its delay has passed. The memory grows with
-    the delay, the tick rate and the number of sites. `MAX_LINKS_BYTES` is the limit.
+    A message waits at the receiver until its simulated delay has passed. The memory grows with
+    the delay, the rate of the control loop and the number of arms. `MAX_LINKS_BYTES` is the
+    limit.
 
     Args:
         scenario: Description of the experiment, with its links and tick rates.
@@ -736,11 +736,11 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses stale rules under which a site would wait for its peers during the whole run.
+    """Refuses time limits for silent arms that would be exceeded in normal operation.
 
-    The stale rule of a site says when the samples of a peer are too old, and what happens then.
-    The tick period of a peer alone must not make it count as silent, and the fixed delay of a
-    link alone must not make its samples too old.
+    An arm counts as silent if its last message is too old. The period between two messages, and
+    the fixed delay of the network link, must be below the limit. Otherwise the receiver would
+    wait during the whole run.
 
     Args:
         scenario: Description of the experiment.

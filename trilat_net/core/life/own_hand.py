@@ -211,9 +211,10 @@ class OwnHand:
         )
 
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
-        """Returns what the program may know about the peers, the other arms.
+        """Returns what the user's program may know about the other arms.
 
-        It sees the samples (states of the peers) that this site used at the previous tick.
+        It sees the states of the other arms that this arm used in the previous control period,
+        after their network delay.
 
         Args:
             k: Number of the tick (control period) of the decision.

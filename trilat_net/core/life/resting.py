@@ -205,9 +205,10 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Slows down the reference that brings the joints to rest, by one or more periods.
+    """Slows down the motion that brings the joints of an arm to rest, by some control periods.
 
-    The rules are at the top of this module.
+    The joints follow this motion, which is called the rest reference. Its rules are at the top
+    of this module.
 
     Args:
         t_ns: Time of the present period of the control loop, ns since the start of the session.

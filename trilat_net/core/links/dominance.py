@@ -155,9 +155,10 @@ end.
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
-    """Returns the dominance factor at a time during a linear change from `before` to `after`.
+    """Returns a weight at time t during its linear change from `before` to `after`.
 
-    The result is `after` once the change has ended.
+    The weight (dominance factor) states how much an arm follows another. It is `after` once the
+    change has ended.
 
     Args:
         t_ns: Time t, ns since the start of the session.
@@ -174,11 +175,11 @@ def _interpolate(
 
 @leaf
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
-    """Computes the dominance factors and their derivatives at time t, for each link.
+    """Computes the weights with which an arm follows the others, and their rates, at time t.
 
-    A dominance factor is the weight with which the site follows a peer, another site. It
-    changes by ramps, linear changes over time. A ramp starts at the factors that the previous
-    ramp has at that time, complete or not.
+    The weights are called dominance factors, one per network link. They change by ramps, which
+    are linear in time. A ramp starts at the factors that the previous ramp has at that time,
+    complete or not.
 
     Args:
         t_ns: The time, ns since the epoch, the common start of the session.

@@ -34,9 +34,9 @@ from .delay import MAX_DELAY_US, DelayKind
 
 @cache
 def link_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the row that stores the state of a link, see `LinkRow`.
+    """Returns the NumPy structured data type for the state of a network link, see `LinkRow`.
 
-    A link is the connection from another arm. An arm has one row per link, in scenario order.
+    A link is the one-way connection from another arm. There is one array element per link.
 
     Args:
         shared: Number of coordinates that sites share, the length of the row's vectors.
@@ -194,9 +194,9 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 
 @leaf
 def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
-    """Returns True if a sample claims to have been sent more than AHEAD_LIMIT_S in the future.
+    """Returns True if a message claims to come from more than AHEAD_LIMIT_S in the future.
 
-    Such a sample is refused, because it would have to wait too long.
+    It is refused, because it would have to wait too long. The sender's clock may be wrong.
 
     Args:
         k: Present tick of the receiver.
@@ -255,11 +255,11 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Stores a sample that arrived, until its simulated delay has passed.
+    """Stores a message that arrived from another arm, until its simulated delay has passed.
 
-    A sample is the state of a peer, the process of another arm. A sample that arrives after its
-    delivery time is used in the present tick, unless a newer sample is in use. Samples that
-    cannot be used are counted as refused, lost or duplicate.
+    A message (sample) is the state of the other arm. If it arrives after its delivery time, it
+    is used in the present control period, unless a newer one is in use. Messages that cannot be
+    used are counted as refused, lost or duplicate.
 
     Args:
         k: Present tick, the number of the receiver's control period.

@@ -130,10 +130,10 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Computes the torque of one tick by a compiled law (stage 6 of a tick).
+    """Computes the torque of an arm in one control period by a user's compiled law.
 
-    The row's field `asked` is 1 while the law runs. An exception that is raised meanwhile comes
-    from the law.
+    The field `asked` of the arm's state is 1 while the law runs, so that an exception can be
+    attributed to the law.
 
     Args:
         k: Number of the tick (control period).
@@ -183,10 +183,10 @@ class LawForm(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the data type with which a row of floats is read as vectors with names.
+    """Returns the NumPy data type that gives the numbers of an array the names of vectors.
 
-    A compiled law thus reads the vectors that other laws sent as fields, such as `received.F`.
-    The result is None if there are no vectors.
+    A compiled law thus reads vectors that other laws sent as fields, such as `received.F`. The
+    result is None if there are no vectors.
 
     Args:
         vectors: The vectors, one after another in the row.

@@ -109,10 +109,10 @@ class LawChannel(NamedTuple):
 
     @property
     def received_size(self) -> int:
-        """Count of the numbers that one peer receives from the law with each sample.
+        """Count of the numbers that one other arm receives from the law with each message.
 
-        These are the vectors for all peers and one vector of each kind that is for a single
-        peer.
+        These are the vectors for all receivers, and one vector of each kind that has a value of
+        its own for each receiver.
         """
         return sum(vector.length for vector in self.vectors)
 

@@ -67,12 +67,11 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Account of the energy that a control law gave, took, stored and dissipated in K ticks.
+    """Account of the energy that a control law gave, took, stored and dissipated.
 
-    All energies are in J and have the shape (K,) or (K, parts).
-
-    Flows are sums since the beginning. Each part, for instance that of a joint, must not be
-    below zero by itself.
+    It has K control periods. All energies are in J and have the shape (K,) or (K, parts). Flows
+    are sums since the beginning. Each part, for instance that of a joint, must not be below
+    zero by itself.
 
     Attributes:
         gave: Per peer, the energy that was sent to it.

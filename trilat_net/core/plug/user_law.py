@@ -25,7 +25,7 @@ from ..step.vectors import Vector
 
 
 class LawContext(NamedTuple):
-    """Facts about the arm and its peers that a control law receives when it is created.
+    """Facts about the arm and the other arms that a control law receives when it is created.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
@@ -338,10 +338,10 @@ def describe_failure(
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    """Yields the numbers of a value in order, for the memory of a law in the record.
+    """Yields the numbers of an attribute of a control law as floats, to store them in the log.
 
-    A number yields itself; nested lists yield their numbers row by row: [[1, 2], [3]] yields 1,
-    2 and 3, as floats.
+    A number yields itself; nested lists yield their numbers in order: [[1, 2], [3]] yields 1, 2
+    and 3.
     """
     if isinstance(value, Real):
         yield float(value)
@@ -373,10 +373,11 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
 
 
 def list_remembered(law: Any) -> tuple[str, ...]:
-    """Returns the names of the attributes that a law keeps from tick to tick.
+    """Returns the names of the attributes that a law keeps from one control period to the next.
 
-    The law's class lists them in `remembers`, for example `remembers = ("x",)`. The record of
-    each tick contains their values. Empty for a law without memory.
+    The law's class lists them in `remembers`, for example `remembers = ("x",)`. The log
+    contains their values, so that a run can be repeated. The result is empty for a law without
+    memory.
     """
     return tuple(getattr(law, "remembers", ()))
 

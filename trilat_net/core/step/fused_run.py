@@ -223,12 +223,12 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Repeats what a person did with the arm of a site in a tick of a recorded run.
+    """Repeats what a person did with an arm in one control period of a recorded run.
 
-    A live hand is a person or program that moves the arm during the run. A simulated spring
-    pulls the arm to the target of the hand. The grip, the target and the target one second
-    later are written into the row of the live hand. Nothing happens if the site has no live
-    hand, or after the end of the recorded run.
+    A person or program that moves the arm during the run is called a live hand. It is simulated
+    by a spring, which pulls the arm to a target. The grip (a factor of the force), the target,
+    and the target one second later are written into the data of the live hand. Nothing happens
+    without a live hand, or after the end of the recorded run.
 
     Args:
         i: Index of the site.
@@ -388,7 +388,7 @@ def update_sums(
     row: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the effort of an arm's motors, and the work of its environments, by a record.
+    """Adds a control period to the sums of an arm's motor effort and its environments' work.
 
     The effort is the sum of the squared torques beyond gravity. The work in a control period is
     the torque times the change of the joint angles q. The torque that varies during the period

@@ -626,8 +626,9 @@ class _Leaf(CPUDispatcher):
     def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
         """Returns the Python function to compile for given types of arguments. Numba calls it.
 
-        This is the leaf itself, unless an argument is a row in lanes (several runs side by
-        side) and the leaf has an implementation of its own for lanes, see `set_lane_form`.
+        This is the function (leaf) itself, unless the arguments belong to several simulations
+        side by side (lanes) and the function has another implementation for these, see
+        `set_lane_form`.
         """
         if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)

@@ -248,11 +248,11 @@ def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _write_record(s: SiteRow, row: Array) -> None:
-    """Writes the results of the tick into its record (stage 7), as one vector of numbers.
+    """Writes the results of a control period as one vector of numbers, for the log.
 
     The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and
-    in task space the motion of the end effector. A number that is not finite becomes 0, and the
-    site enters the mode DIVERGED.
+    the motion of the end effector if arms follow each other's end effectors. A number that is
+    not finite becomes 0, and the arm enters the mode DIVERGED.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -371,7 +371,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
 @leaf
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
-    """Stores the torque and Y' r of this tick, which the next tick needs (end of stage 8).
+    """Stores the torque and the adaptation rate Y' r of this control period for the next one.
 
     Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
     estimate itself is advanced here.
@@ -514,9 +514,9 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 @leaf
 def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
-    """Ends stage 3: stops the reference while peers are silent, and limits its speed.
+    """Stops the reference while other arms are silent, and limits its speed.
 
-    The reference is the position that the arm follows. It stops if no samples come from the
+    The reference is the position that the arm follows. It stops if no messages come from the
     other arms for too long.
 
     Args:
@@ -677,8 +677,8 @@ def act_stages(
 ) -> None:
     """Computes the part of a control period that follows the control law.
 
-    The torque is limited, the record is written, and the arm moves to the next period (stages 6
-    to 8). See `emit_stage` for a joint that is faster than its limit.
+    The torque is limited, the results are written for the log, and the arm moves to the next
+    period (stages 6 to 8). See `emit_stage` for a joint that is faster than its limit.
 
     Args:
         k: Number of the tick, a period of the control loop.

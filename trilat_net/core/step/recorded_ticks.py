@@ -77,10 +77,10 @@ def _update_checksum(crc: int, word: int) -> int:
 
 
 class RecordedRows(NamedTuple):
-    """Records of consecutive ticks of a site, as numbers for the compiled loop.
+    """Results of consecutive control periods of an arm from a log, as arrays for compiled code.
 
-    K is the number of records, P the number of peers, m the number of coordinates that the
-    sites share, n the number of joints. A word is the bits of a floating-point number as an
+    K is the number of periods, P the number of other arms, m the number of coordinates that the
+    arms share, n the number of joints. A word is the bits of a floating-point number as an
     integer.
 
     Attributes:
@@ -175,11 +175,12 @@ def _has_room(
     rules: Any,
     rooms: IntArray,
 ) -> bool:
-    """Returns True if the samples that arrived in a tick fit into the buffers of their links.
+    """Returns True if the messages that arrived in a control period fit into their buffers.
 
-    Each link has such a ring buffer (calendar), with one entry (page) per tick. Compiled code
-    cannot enlarge the buffers. If a sample does not fit, the loop ends, and `Site.step`
-    executes the tick. The rule is that of `CalendarSizer.make_room`.
+    Messages wait in a ring buffer per network link until their simulated delay has passed, with
+    one entry (page) per control period. Compiled code cannot enlarge the buffers. If a message
+    does not fit, the compiled loop ends, and `Site.step` computes the period. The rule is that
+    of `CalendarSizer.make_room`.
 
     Args:
         k: Number of the tick (control period).
@@ -210,10 +211,10 @@ def _has_room(
 def _put_arrivals(
     first: int, last: int, arrivals: IntArray, samples: IntArray, rules: Any, views: Any
 ) -> int:
-    """Writes the samples that arrived in a tick into its input buffers, as `Site.step` does.
+    """Writes the messages that arrived in a control period into the input buffers.
 
-    A sample is the state that another arm sent, and a tick a control period. The checksum of
-    the samples is computed at the same time, to compare it with the record.
+    A message (sample) is the state that another arm sent. The checksum of the messages is
+    computed at the same time, to compare it with the log.
 
     Args:
         first: Index of the first arrival of the tick.
@@ -473,9 +474,10 @@ class TickRepeater:
         return [array for array in changed if array is not None]
 
     def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
-        """Calls the compiled loop for the kind of arm, see `_run_recorded_ticks`.
+        """Calls the compiled loop over recorded control periods, for the kind of arm.
 
-        The loop and the object that enlarges the buffers exchange which samples fit into them.
+        The loop and `CalendarSizer`, which enlarges the buffers of waiting messages, tell each
+        other which messages fit into them.
         """
         site = self._site
         self._views.rooms[:] = self._parts.calendar_sizer.list_rooms()
@@ -516,10 +518,11 @@ def _view_words(array: NDArray[Any]) -> IntArray:
 
 
 def _list_memory_sources(site: Site) -> IntArray:
-    """Returns where the site stores the numbers that a record has in its field `mem`.
+    """Finds where an arm's process stores the numbers that the next control period needs.
 
-    These are the numbers that the next tick needs and no other field records. The order is that
-    of `Site.restore_state`, and `SiteViews.memory` describes the three columns of the result.
+    A record of the log contains them in its field `mem`, unless another field has them. The
+    order is that of `Site.restore_state`, and `SiteViews.memory` describes the three columns of
+    the result.
     """
     sources: list[tuple[int, int, int]] = []
     parts = site.parts

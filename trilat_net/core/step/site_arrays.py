@@ -329,9 +329,9 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
 
 def _count_kept_dues(setup: SiteSetup) -> int:
-    """Returns for how many samples a link stores when they are to be delivered.
+    """Returns for how many messages a link stores when they are to be delivered.
 
-    A delivery time (due time) is stored for as long as its sample may still arrive, late or as
+    A delivery time (due time) is stored for as long as its message may still arrive, late or as
     a duplicate. The longest possible delay, and the largest time by which the sender's clock
     may be ahead of the receiver's, bound this time.
 

@@ -82,10 +82,9 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """Rule of a site for a stale peer, from which no new sample has come for too long.
+    """What an arm does if no new message has come from another arm for too long.
 
-    A site is a process that runs one arm, and a peer is another site that it follows. A sample
-    is the state that a peer sends in each period of its control loop.
+    The other arm is called a stale peer. The process that runs an arm is called a site.
 
     Attributes:
         action: What the site does while a peer is stale.
@@ -395,7 +394,7 @@ class SiteSetup(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """Lengths of the vectors in the site's row, for example one number per joint.
+        """Lengths of the vectors in the state of this arm, for example one number per joint.
 
         Each body of the simulated scene adds seven numbers, its pose.
         """

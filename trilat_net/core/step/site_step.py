@@ -93,10 +93,10 @@ class TickParts(NamedTuple):
 
 
 class Site:
-    """State of one arm with its controller and with the network links over which it receives.
+    """One arm with its controller, and with the network links over which it receives.
 
-    The process of a site creates this object and calls `step` once per tick. The simulation
-    in virtual time does the same for each site.
+    The process of an arm (site) creates this object and calls `step` once per control period. A
+    simulation in virtual time does the same for each arm.
 
     Args:
         setup: Setup of the site.
@@ -335,9 +335,9 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Computes a whole control period: from the received samples to the record and motion.
+        """Computes a whole control period: from received messages to the results and motion.
 
-        Without a user's control law, one compiled function runs all eight stages (`kernel`
+        Without a user's control law, one compiled function computes all eight stages (`kernel`
         lists them). A user's law is called between two compiled functions, one for the stages
         before the torque and one for those after it.
 
@@ -555,9 +555,9 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns how many messages (samples) arrived, came late or were lost, for each link.
+        """Returns how many messages arrived, came late or were lost, for each network link.
 
-        The links are in scenario order. `LinkCounts` explains the counts.
+        The links are in the order of the scenario. `LinkCounts` explains the counts.
         """
         counts = []
         for link in self._links:

@@ -268,9 +268,9 @@ def find_life_reason(output: TickRecord) -> LifeReason:
 
 
 class LifeAlarm(NamedTuple):
-    """Alarm that tells people why a site does not follow its peers, and what they can do.
+    """Alarm for people: why an arm does not follow the others, and what they can do.
 
-    `LifeAlarm.find` creates it. Pages and terminals show it as long as the site is in this
+    `LifeAlarm.find` creates it. Pages and terminals show it as long as the arm stays in this
     mode.
 
     Attributes:

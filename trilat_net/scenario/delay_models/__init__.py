@@ -171,10 +171,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @property
     def random(self) -> bool:
-        """True if the delay, the losses or the duplicates of the link are drawn at random.
+        """True if the network link draws its delays, losses or duplicates at random.
 
-        Then another seed of the scenario gives another run. Losses are drawn only if some
-        samples are lost, but not all.
+        Another seed then gives another run. Losses are random only if some messages are lost,
+        but not all.
         """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
@@ -328,12 +328,12 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
     """
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one sample, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
 
-        A sample is the state that a site publishes in one tick. This method is compiled. It may
-        use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
-        numbers must come from `core.delay.draw_pair`: they are a function of the key of the
-        link and an index, so that a repeated run draws the same numbers (L4).
+        The method is compiled. It may use `now.sample`, the number of the message, and
+        `now.stamp_ns`, its sending time. Random numbers must come from `core.delay.draw_pair`:
+        they are a function of the key of the link and an index, so that a repeated run draws
+        the same numbers (L4).
 
         Args:
             now: The sample, and the place for the result.

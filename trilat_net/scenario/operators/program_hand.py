@@ -169,9 +169,9 @@ class HandSite(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Text by which a site recognises the messages of this program.
+        """Text by which an arm's process recognises the messages of this program.
 
-        It consists of the class of the program and the hash of the scenario, for example
+        It consists of the class of the program and the hash of the experiment, for example
         "my_policy:Reach 5cfbf3f16ec0c567". Both are cut to fit into a message.
         """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
@@ -329,10 +329,10 @@ class HandPlayer:
         return self.hand.build_view(k, arrays, self._layout)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Calls the program in tick `k`, and schedules the action that it returns.
+        """Calls the program that moves the arm, and schedules the action that it returns.
 
-        The program receives what it observes in this tick. Its action applies later, after the
-        delay that the scenario states.
+        The program receives what it observes in this control period. Its action applies later,
+        after the delay that its settings state.
 
         Args:
             k: Number of the tick.
