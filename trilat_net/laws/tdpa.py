@@ -805,7 +805,7 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)  # inverse of the inertia matrix, row by row
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of a control period, and sends torques and energies to other arms.
+        """Computes the torque of a control period, and sends torques and energies to others.
 
         The arm first acts as a follower, then as a leader. The torque that it feels as a leader
         is reduced if the torque of a joint would otherwise exceed its limit.

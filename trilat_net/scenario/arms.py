@@ -403,10 +403,10 @@ class ArmModel(NamedTuple):
         return HandReach(joints[0].origin_m, inner_m, outer_m)
 
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
-        """Returns the range of each joint that its mechanical stops and position limits permit.
+        """Returns the range in which each joint of the arm may move.
 
-        The stops belong to the arm, and the limits to the scenario. The narrower of both
-        counts.
+        The mechanical stops of the arm and the position limits of the experiment both bound it;
+        the narrower of both counts.
 
         Args:
             limits: Position limits of the site that runs the arm.
@@ -421,10 +421,7 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the sites share the position or pose of their end effectors (task space).
-
-        Otherwise they share their joint angles.
-        """
+        """True if the arms follow each other's end effectors, and not each other's joints."""
         return self.chain is not None and self.chain.task is not None
 
     @property
@@ -438,11 +435,10 @@ class ArmModel(NamedTuple):
         return () if task is None else task.axes
 
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
-        """Returns the coordinates that a site publishes for its peers in the pose `q`.
+        """Returns the coordinates that an arm sends to the others in the pose `q`.
 
-        These are the joint angles, or the position of the end effector multiplied by the scale
-        of the task. If the sites share poses, the orientation as a rotation vector in rad
-        follows.
+        These are the joint angles, or the position of the end effector multiplied by a scale.
+        If whole poses are sent, the orientation as a rotation vector in rad follows.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -457,7 +453,8 @@ class ArmModel(NamedTuple):
     def task_jacobian(self, q: Vector) -> Array:
         """Returns the Jacobian J that converts joint velocities to task velocities: xd = J qd.
 
-        Task coordinates are those that sites share if their end effectors follow each other.
+        Task coordinates describe the end effector, if the arms follow each other's end
+        effectors.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -680,7 +677,7 @@ def _read_cached(
 def _place_base(
     arm: Arm, joints: tuple[ChainJoint, ...], gravity: Three
 ) -> tuple[tuple[ChainJoint, ...], Three]:
-    """Expresses the joints of a chain, and gravity, in the frame that all sites share.
+    """Expresses the joints of an arm, and gravity, in a frame that is common to all arms.
 
     The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll). Only the first joint changes,
     because the others are expressed in the frame of the joint before them.

@@ -192,11 +192,11 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns a delay trace as the string that a scenario contains.
+    """Returns recorded delays as the text by which an experiment contains them.
 
-    A delay trace is a table of send times and the delay that each message had. The form of the
-    text is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the
-    delay of a lost message. Times count from the first point.
+    The recording is a table of sending times and delays. The form of the text is "t_us
+    delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the delay of a lost
+    message. Times count from the first point.
 
     Args:
         points: Send time in s and delay in ms of each message. A lost message has an infinite
@@ -303,9 +303,9 @@ _DELAY_NAMES = ("delay", "rtt", "latency")
 
 @dataclass(frozen=True, repr=False)
 class MeasuredTrace(Result):
-    """Delays of a real network, imported from the output of a measurement.
+    """Delays of a real network, imported from the output of a measuring program.
 
-    `import_trace` returns it. A link of a scenario can then have the same delays.
+    `import_trace` returns them. A simulated network link can then repeat the same delays.
 
     Attributes:
         points: Send time of each message since the first one in s, and its delay in ms. The

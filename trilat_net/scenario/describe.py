@@ -73,9 +73,10 @@ def lacks_detailed_balance(scenario: Scenario) -> bool:
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link in s, as `LawSituation.delay_s` contains it.
+    """Returns the delay of every network link in s, for the stability conditions.
 
-    A constant delay is rounded up to whole ticks of the receiver. The other delays are NaN.
+    A constant delay is rounded up to whole control periods of the receiver. Delays that vary
+    are NaN.
 
     Args:
         links: Links by name.
@@ -430,7 +431,10 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
 
 
 def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences about the joints of a site that start beyond a stop in their file."""
+    """Returns sentences about joints of an arm that start beyond a stop of the URDF file.
+
+    A real arm at rest may stand a little beyond the nominal position of a stop.
+    """
     spec = scenario.sites[name]
     units = scenario.arms[name].joint_units("rad")
     joints = read_arm(spec.arm, scenario.urdf).joints
@@ -446,7 +450,10 @@ def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences about the joints of a site that start beyond a position limit."""
+    """Returns sentences about joints of an arm that start beyond a position limit.
+
+    The limit is moved for the run, so that the arm does not stop at once.
+    """
     spec = scenario.sites[name]
     model = scenario.arms[name]
     units = model.joint_units("rad")
@@ -470,7 +477,7 @@ def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
-    """Returns lines about the sites that share the position or pose of their end effectors."""
+    """Returns lines about the arms that follow each other's end effectors, not joints."""
     lines = []
     for name, model in scenario.arms.items():
         if not model.shares_pose:
@@ -527,9 +534,9 @@ def _describe_silences(scenario: Scenario) -> list[str]:
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns lines about how arms with the stale rule "glide" come to rest.
+    """Returns lines about how arms come to rest while another arm is silent (rule "glide").
 
-    Sites with the same text share a line.
+    Arms with the same text share a line.
     """
     owners: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():

@@ -62,11 +62,11 @@ else:
 
 
 class ExpectWindow(_JointPart, frozen=True, kw_only=True):
-    """Expectations of a part of a run, which a test of the scenario checks.
+    """Expected ranges of quantities in a part of a run, which a test checks.
 
     For each quantity, the smallest and the largest permitted value may be stated. The force of
     the walls is computed from the logged state. It is the force along the normal, added up over
-    the walls of the scenario. If a run ends before the window ends, the quantities are not
+    the walls of the experiment. If a run ends before the window ends, the quantities are not
     measured, and the expectations count as not satisfied.
 
     Attributes:
@@ -329,7 +329,7 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if the scenario states at least one condition that its runs must satisfy.
+        """True if the experiment states at least one condition that its runs must satisfy.
 
         A tolerance alone only says how precisely other conditions are judged, and does not
         count.
@@ -339,10 +339,10 @@ class Expect(
 
 
 def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy the expectations of a scenario.
+    """Returns the reason why no run could satisfy the expectations of an experiment.
 
     For example, an expected end pose must have as many angles as the arm has joints. The
-    problem is reported when the scenario is loaded, and not after a long run.
+    problem is reported when the experiment is loaded, and not after a long run.
 
     Args:
         expect: The expectations.

@@ -95,7 +95,7 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 @lru_cache(maxsize=256)
 def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """Returns the fields of the type of a scenario's table, for example of `Arm`.
+    """Returns the fields of a type that describes a table of a scenario file, such as `Arm`.
 
     The result is cached, because `msgspec.structs.fields` evaluates the annotations of the type
     anew in each call, and a scenario has many tables of the same type.
@@ -172,7 +172,7 @@ def find_count_problem(
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Returns True if a value of a scenario is a number.
+    """Returns True if a value from a scenario file is a number.
 
     The values true and false are not numbers, although they are integers in Python.
 
@@ -183,9 +183,9 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 
 def is_distribution(value: Any) -> bool:
-    """Returns True if a value of a scenario is a distribution in place of a number.
+    """Returns True if a value from a scenario file is a random distribution.
 
-    Each run draws the number from the distribution, for example `{ uniform = [1, 2] }`.
+    Each run draws a number from it, for example from `{ uniform = [1, 2] }`.
 
     Args:
         value: A value as it was read from TOML.
@@ -287,10 +287,9 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Checks that all numbers of a scenario's value are finite and fit into 64 bits.
+    """Checks that all numbers in a value from a scenario file are finite and fit into 64 bits.
 
-    Numbers that are infinite, NaN, or integers of more than 64 bits are refused. Tables and
-    lists are checked with everything that they contain.
+    Tables and lists are checked with everything that they contain.
 
     Args:
         value: A value of a scenario.

@@ -46,7 +46,7 @@ else:
 
 
 def identify_law(law: Any) -> str:
-    """Returns the name with which a scenario names a control law.
+    """Returns the name by which a scenario file selects a control law.
 
     The name of a user's law consists of its module and class, for example "package.module:Law".
 

@@ -163,7 +163,7 @@ def join_path(path: str, location: Location) -> str:
 
 
 def describe_wrong_type(value: Any, expected: str) -> str:
-    """Returns what is wrong with a value of a scenario that has another type than expected.
+    """Explains what is wrong with a value from a scenario file that has the wrong type.
 
     Args:
         value: The value as it was read from TOML.
@@ -416,7 +416,7 @@ def _list_choices(hint: Any) -> tuple[str, ...]:
 
 
 def _is_list_of_tables(hint: Any) -> bool:
-    """True for the type of a list of tables, as of operators or planned changes."""
+    """Returns True if a type is a list of tables, such as the list of planned changes."""
     base = _strip_annotation(hint)
     if get_origin(base) not in (list, tuple):
         return False

@@ -118,10 +118,9 @@ def find_owner(change: Change) -> str:
 def make_site_order(
     scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
 ) -> Change:
-    """Converts a command to a site, such as stop, to a change that can be sent and recorded.
+    """Converts a command to an arm's process, such as stop, to a change of the run.
 
-    A site is the process that runs one arm. Commands use the same record as changes of the
-    network or of the weights with which sites follow each other.
+    In this form it can be sent and logged like a change of the network.
 
     Args:
         scenario: Description of the experiment.
@@ -202,7 +201,7 @@ def find_requester(sentence: str) -> str:
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
-    """Converts a change during a run to the record that the compiled control loop reads.
+    """Converts a change during a run to the form that the compiled control loop reads.
 
     Args:
         scenario: Description of the experiment.
@@ -225,9 +224,9 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Converts the text of a change in a record to the form of the simulation kernel.
+    """Converts the text of a change in a log to the form that the compiled control loop reads.
 
-    The record may come from an untrusted log, so the change is checked completely.
+    The log may come from a stranger, so the change is checked completely.
 
     Args:
         scenario: Scenario of the run.

@@ -79,9 +79,9 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Computes when the next samples of the link are due at the receiver.
+        """Computes when the next messages of the link are due at the receiver.
 
-        The first of these samples is the one after the last sample of the previous call.
+        The first of these messages is the one after the last message of the previous call.
 
         Args:
             end: Number of the sample after the last one.

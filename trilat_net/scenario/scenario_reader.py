@@ -390,11 +390,11 @@ def _refuse_long_keys(text: str) -> None:
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:
-    """Converts the text of a scenario from a log or another process to a scenario.
+    """Converts the text of an experiment from a log or another process to a scenario.
 
-    Such a text is not trusted. A table for all links could repeat a long trace of delays for
-    every link. A short text would then fill the memory. Therefore the traces of all links
-    together may not be longer than the text.
+    Such a text is not trusted. A table for all links could repeat a long recording of delays
+    for every link. A short text would then fill the memory. Therefore the recordings of all
+    links together may not be longer than the text.
 
     Args:
         text: TOML text of a resolved scenario, which names no files.

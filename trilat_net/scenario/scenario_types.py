@@ -71,10 +71,9 @@ from .own_plant import OwnPlant
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """Stale rule of a site: its reaction if the samples of a peer are too old or missing.
+    """What an arm does if the messages of another arm are too old or missing.
 
-    A peer is another site whose states this site receives. A sample is the state that a site
-    publishes in one tick of its control loop.
+    Every arm's process (site) sends its state, a sample, in each period of its control loop.
 
     Attributes:
         action: What the site does. "use": It goes on with the old sample. "hold": It keeps its
@@ -269,10 +268,9 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
 
     @property
     def start_ns(self) -> int:
-        """Time at which the change takes effect, in ns after the epoch.
+        """Time at which the change takes effect, in ns after the common start of the session.
 
-        The epoch is the common start time of the sites. Times of the simulation are integers,
-        so that they are the same on every machine.
+        Times of the simulation are integers, so that they are the same on every machine.
         """
         return round(self.at_s * 1e9)
 
@@ -408,9 +406,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file.
+        """Names of the arms, such as ("m1", "m2", "s"), in the order of the scenario file.
 
-        Arrays with an entry per site, such as `alpha`, have this order.
+        An arm with its process is called a site. Arrays with an entry per site have this order.
         """
         return tuple(self.sites)
 
@@ -449,10 +447,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
-        """Control law of every site with its gains, in the order of the sites.
+        """Control law of every arm with its gains, in the order of the arms.
 
-        Some laws have gains that follow from the dominance factors at the start, the weights
-        with which a site follows its peers. Here these gains are filled in.
+        Some laws have gains that follow from the weights with which the arms follow each other
+        at the start. Here these gains are filled in.
         """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
@@ -589,9 +587,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def measured(self) -> bool:
-        """True if at least one link has no artificial delay, but that of the real network.
+        """True if at least one network link is delayed only by the real network.
 
-        Such a scenario can only run live.
+        Such an experiment cannot be simulated.
         """
         return any(link.measured for link in self._all_links())
 
@@ -605,10 +603,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the slave, the site whose arm works at the environment.
+        """Name of the slave, the arm that works at the environment.
 
-        If several sites have the role "slave", it is the first of them. If none has, it is the
-        last site of the scenario.
+        If several arms have the role "slave", it is the first of them. If none has, it is the
+        last arm of the experiment.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
@@ -655,10 +653,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns the layout of the numbers that the control law of a site sends to its peers.
+        """Returns which numbers the control law of an arm sends to the others, in their order.
 
-        Most laws send nothing but the state of the arm, and have an empty layout. A law that
-        sends waves, for example, has a vector for them.
+        Most laws send nothing but the state of the arm. A law that sends waves, for example,
+        has a vector for them.
 
         Args:
             site: Name of the site.
@@ -741,11 +739,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def motion_limits(self, site: str) -> MotionLimits:
-        """Returns the limits of a site's motion during a run.
+        """Returns the limits of an arm's motion during a run.
 
         A joint may start a little beyond `q_min_rad` or `q_max_rad`, up to a margin. For such a
         joint, the limit on that side is moved outward by the margin for the whole run, so that
-        the site does not stop at once.
+        the arm does not stop at once.
 
         Args:
             site: Name of the site.
@@ -852,9 +850,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of each joint of a site, in rad/s.
+        """Returns the largest speed of each joint of an arm, in rad/s.
 
-        Empty if the sites do not share joint angles.
+        The result is empty if the arms follow each other's end effectors.
         """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints

@@ -272,11 +272,12 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 
 
 def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
-    """Returns the limits of a site that apply if its author states none.
+    """Returns the limits of an arm that apply if its author states none.
 
     The efforts and speeds of a chain's joints come from its URDF file. A joint for which the
-    file states no positive finite limit has the default of `Limits`. A simulated arm with the
-    stale rule "glide" also has a limit on the torque's rate of change.
+    file states no positive finite limit has the default of `Limits`. A simulated arm that comes
+    to rest while others are silent (rule "glide") also has a limit on the torque's rate of
+    change.
     """
     limits: TomlTable = {}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":

@@ -1117,9 +1117,10 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
 def _read_stated_inertial(
     inertial: Element, name: str, supplied: LinkInertia
 ) -> tuple[float | None, _Pose, Matrix | None]:
-    """Returns the mass, the frame and the tensor of an <inertial> element.
+    """Reads the mass, the frame and the inertia tensor from an XML element <inertial>.
 
-    Parts that the scenario replaces are not read. Therefore errors in such parts do not matter.
+    Parts that the experiment replaces are not read. Therefore errors in such parts do not
+    matter.
 
     Args:
         inertial: The element.

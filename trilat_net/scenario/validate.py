@@ -50,7 +50,7 @@ RANK_TOLERANCE = 1e-6
 
 
 def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
-    """Returns the settings with which a scenario runs with simulated arms only.
+    """Returns the settings that must change to run an experiment with simulated arms only.
 
     The masses of a simulated arm are known, and only a real arm has a dead-man switch.
 
@@ -72,9 +72,10 @@ def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
 
 
 def write_simulated_options(scenario: Scenario) -> str:
-    """Returns the options `--set` with which a command runs with simulated arms only.
+    """Returns the command-line options that run an experiment with simulated arms only.
 
-    Error messages suggest them when a scenario with real arms cannot be simulated.
+    Error messages suggest these options `--set` when an experiment with real arms cannot be
+    simulated.
 
     Args:
         scenario: Description of the experiment.
@@ -87,10 +88,10 @@ def write_simulated_options(scenario: Scenario) -> str:
 
 
 def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> None:
-    """Refuses scenarios with arms that the program does not simulate itself.
+    """Refuses experiments with arms that the program does not simulate itself.
 
-    Such an arm is either a real robot outside of the program, or a user's class that computes
-    the motion.
+    Such an arm is either a real robot outside of the program, or a user's class computes its
+    motion.
 
     Args:
         scenario: Description of the experiment.
@@ -168,7 +169,7 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or that a jump of the reference could move suddenly.
+    """Refuses real robots that lack limits, or that a jump of the reference could move.
 
     The reference is the position that an arm follows. It could jump when another arm falls
     silent or is heard again, except under the rule "glide". The check is made before a session
@@ -408,9 +409,9 @@ def _check_links(scenario: Scenario) -> None:
 def _check_damping(scenario: Scenario) -> None:
     """Refuses damping gains that are too large for the inertia of a light joint of a chain.
 
-    A sampled damping torque -K qd is held for one tick of duration h. A single joint of inertia
-    M then oscillates from tick to tick if K h / M >= 1 with the second-order scheme, or K h / M
-    >= 2 with the digital scheme. For several joints, the largest eigenvalue of K M^-1 takes the
+    A damping torque -K qd is held for one control period h. A single joint of inertia M then
+    oscillates from period to period if K h / M >= 1 with the second-order scheme, or K h / M >=
+    2 with the digital scheme. For several joints, the largest eigenvalue of K M^-1 takes the
     place of K / M. It is computed for the start pose.
     """
     for name, model in scenario.arms.items():
@@ -638,10 +639,10 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
 
 
 def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
+    """Returns why a row of the dominance matrix is not valid, Eq. (7), or None if it is.
 
-    The row contains the weights with which one site follows the others. They must lie between 0
-    and 1 and sum to 1, and the site must not follow itself.
+    The row contains the weights with which one arm follows the others. They must lie between 0
+    and 1 and sum to 1, and the arm must not follow itself.
 
     Args:
         row: Dominance factors of one site, shape (N,).
@@ -677,11 +678,11 @@ def _check_actors(
 
 
 def _check_hands(site: SiteSpec, path: str) -> None:
-    """Refuses operators of a site that cannot exist, or that would act between its ticks.
+    """Refuses persons and programs who cannot move an arm as the experiment states.
 
     An arm has at most one live operator: a person, or a program in the session, who moves the
-    arm during the run. The program must simulate this arm. An operator that is a user's program
-    acts every n-th tick, so its rate must divide the tick rate of the site.
+    arm during the run. The program must simulate this arm. A user's program acts in every n-th
+    control period, so its rate must divide the rate of the control loop.
 
     Args:
         site: The site.
@@ -802,10 +803,11 @@ def _check_lost(scenario: Scenario) -> None:
 
 
 def _can_lose_master(scenario: Scenario, name: str) -> bool:
-    """True if a site can go on after some master that it follows has become silent.
+    """Returns True if an arm can go on after some master that it follows has fallen silent.
 
-    The site must follow another site as well. The remaining sites must all reach each other
-    along nonzero dominance factors: their dominance matrix must be irreducible.
+    A master is an arm that a person moves. The arm must follow another arm as well. The
+    remaining arms must all follow each other, directly or through others (irreducible matrix of
+    weights).
 
     Args:
         scenario: The scenario.

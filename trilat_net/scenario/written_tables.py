@@ -87,10 +87,10 @@ _USER_LAW = "own"
 
 
 class WrittenSite(Frozen, frozen=True, kw_only=True):
-    """Table of a site as an author may write it, see `scenario_types.SiteSpec`.
+    """Table of one arm as an author may write it.
 
-    The keys of `control`, `view` and of the tables in the lists depend on the kind that the
-    table names.
+    The complete form is `scenario_types.SiteSpec`. The keys of `control`, `view` and of the
+    tables in the lists depend on the kind that the table names.
     """
 
     role: Literal["master", "slave"] | UnsetType = UNSET
@@ -109,9 +109,10 @@ class WrittenSite(Frozen, frozen=True, kw_only=True):
 
 
 class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
-    """Planned change of a link or of dominance factors as an author may write it.
+    """Planned change of a network link, or of weights, as an author may write it.
 
-    The keys of `to` depend on what is changed, see `scenario_types.Change`.
+    The weights (dominance factors) state how much an arm follows the others. The keys of `to`
+    depend on what is changed, see `scenario_types.Change`.
     """
 
     at_s: Annotated[float, Meta(extra={"must_be": "a time in s"})]

@@ -198,9 +198,9 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the delay and losses of a link to the record of the compiled simulation.
+        """Converts the delay and losses of a link to numbers for the compiled simulation.
 
-        The compiled simulation draws the random delays and losses from this record.
+        The simulation draws the random delays and losses from them.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after

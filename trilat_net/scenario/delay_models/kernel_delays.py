@@ -195,7 +195,7 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
     """Fixed delay plus a random part from one of two exponential distributions.
 
-    Mobile networks have such delays: most samples are fast, and some wait much longer.
+    Mobile networks have such delays: most messages are fast, and some wait much longer.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
@@ -414,9 +414,9 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """Link of a live session to which the program adds no delay.
+    """Network link of a live session to which the program adds no artificial delay.
 
-    The receiver uses a sample as soon as it has arrived over the real network. A simulation
+    The receiver uses a message as soon as it has arrived over the real network. A simulation
     cannot know these arrivals.
     """
 

@@ -15,13 +15,13 @@ from . import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
-    """Delay of a network of low-orbit satellites.
+    """Delay of a network of low-orbit satellites, such as Starlink.
 
     Such networks assign terminals to satellites again every 15 s, all terminals at once. Delay
     and jitter change abruptly at these times: Mohan et al., "A Multifaceted Look at Starlink
     Performance", WWW (2024). The model is the sum of a fixed delay, an exponential random part
     that is drawn once per interval, and an exponential random part that is drawn for every
-    sample.
+    message.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
@@ -36,7 +36,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     slot_s: Annotated[float, Meta(gt=0.0, le=1e4)] = 15.0
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one sample, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
 
         It is the sum of the fixed part and two random parts. If x is uniform between 0 and 1,
         then -log(x) has an exponential distribution with mean 1.

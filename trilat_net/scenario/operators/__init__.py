@@ -57,10 +57,10 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """Base of all operators and environments, which exert torques or forces on an arm.
+    """Base of all operators (models of persons) and environments, which push an arm.
 
-    A subclass describes one kind by its keys in a scenario, and converts them to a record for
-    the compiled simulation. A file of this folder with such a class adds a kind.
+    A subclass describes one kind by its keys in a scenario file, and converts them to numbers
+    for the compiled simulation. A file of this folder with such a class adds a kind.
     """
 
     group: ClassVar[str] = "hands"
@@ -74,10 +74,9 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
     @property
     def actor(self) -> TorqueSource:
-        """Operator or environment, as a record for the compiled simulation.
+        """Operator or environment as numbers, from which compiled code computes its torque.
 
-        The kernel cannot use Python objects. From this record of numbers, it computes the
-        torque on the arm in every tick.
+        The compiled code cannot use Python objects.
         """
         return self._source()
 

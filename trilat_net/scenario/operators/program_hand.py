@@ -154,7 +154,7 @@ class HandSite(NamedTuple):
     def program(self) -> str:
         """Name of the class that operates the arm, for example "my_policy:Reach".
 
-        If the scenario does not name a class, it is "a program".
+        If no class is named, it is "a program".
         """
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
@@ -206,10 +206,10 @@ class HandSite(NamedTuple):
         return self.spec.make_rules(tick_rate_hz, self.scenario.arms[self.name])
 
     def make_hand(self) -> OwnHand:
-        """Creates the object that calls the program and applies its actions at the right ticks.
+        """Creates the object that calls the program and applies its actions at the right times.
 
         The program is called `rate_hz` times a second. An action takes effect `delay_s` after
-        the observation on which it rests, rounded up to a whole tick.
+        the observation on which it rests, rounded up to a whole control period.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
@@ -220,7 +220,7 @@ class HandSite(NamedTuple):
 
     @classmethod
     def find(cls, scenario: "Scenario", site: str) -> "HandSite | None":
-        """Finds the program that operates the arm of a site, if the scenario has one.
+        """Finds the program that moves an arm in place of a person, if the arm has one.
 
         Args:
             scenario: Description of the experiment.
@@ -320,7 +320,7 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what the program observes in tick `k`, for example the states of the arms.
+        """Returns what the program observes in control period k, such as the arms' states.
 
         Args:
             k: Number of the tick.
