@@ -283,9 +283,9 @@ class Layout(NamedTuple):
 
     @property
     def floats(self) -> int:
-        """Number of floating-point values in a record, without the values that are inputs.
+        """Count of the floats that an arm's process computes in one period of the control loop.
 
-        A record contains the inputs and results of one period of the control loop.
+        They form a record of the log. Floats that are inputs of the period are not counted.
         """
         shared_vectors = 5 if self.task else 2
         return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent

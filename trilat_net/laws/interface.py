@@ -44,7 +44,7 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """Facts about one arm whose gains are tuned, for the method `write_control` of a law.
+    """Facts about one arm, from which a law writes its settings after gains were tuned.
 
     The method `write_control` of a law receives them.
 
@@ -67,10 +67,10 @@ class TuningSite(NamedTuple):
 
 
 class TuningRun(NamedTuple):
-    """Motion of all arms in a run for which gains are tuned, for `target_motion` of a law.
+    """Motion of all arms in a trial run, from which a law computes how they should have moved.
 
-    The method `target_motion` of a law receives it. The run has N sites, n joints per arm, and
-    K times at equal distances.
+    The method `target_motion` of a law receives it, while gains are tuned. The run has N arms,
+    n joints per arm, and K times at equal distances.
 
     Attributes:
         laws: Settings of the law of each arm.

@@ -93,12 +93,12 @@ class Tanks(EnergyLaw):
         self.carried = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and sends an energy packet to each peer.
+        """Computes the torque of a control period, and sends energy packets to the other arms.
 
-        The steps of a tick are: book the work of the previous period and the packets that have
-        arrived; send packets; compute the torque of the transparency layer, the springs that
-        couple the sites; reduce it to the energy in the tank, and add damping while the tank is
-        below its level.
+        First, the work of the previous period and the received packets are booked, and packets
+        are sent. Then the torque of the springs that couple the arms is computed, and reduced
+        to what the energy in the tank pays for. Damping is added while the tank is below its
+        level.
 
         Args:
             now: Inputs and outputs of the law in this tick.

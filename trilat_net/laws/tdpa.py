@@ -695,13 +695,13 @@ def _follow_peers(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Couples arms, and limits the energy that each end of a coupling takes out.
+    """Couples arms so that no end of a coupling takes out more energy than was put in.
 
-    A spring K and a damper B move each site towards the integral of the velocities of its peers
-    (the arms that it follows), weighted by the dominance factors, and the peers feel the torque
-    of K and B. With K = 0 and B = 0 a site only leads.
+    The method is time-domain passivity control. A spring K and a damper B move each arm towards
+    the integral of the velocities of the arms that it follows, weighted by the dominance
+    factors, and these arms feel the torque of K and B. With K = 0 and B = 0 an arm only leads.
 
-    Source: Ryu, Artigas and Preusche (2010); for several sites Panzirsch and others (2012).
+    Source: Ryu, Artigas and Preusche (2010); for several arms Panzirsch and others (2012).
 
     Attributes:
         K: Spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.

@@ -190,10 +190,10 @@ def _find_store() -> Path:
 
 
 def _read_store() -> dict[str, _RememberedFile]:
-    """Returns the stored permissions, by the hash of the file.
+    """Returns the permissions to run code that this user has stored, by the hash of the file.
 
-    If there is no store, or it cannot be read, there are no permissions. Earlier versions of
-    the program stored only the path of a file; such an entry permits nothing.
+    If nothing was stored, or the file cannot be read, there are no permissions. Earlier
+    versions of the program stored only the path of a file; such an entry permits nothing.
     """
     # A RuntimeError is raised if the user has no home folder.
     with suppress(OSError, ValueError, RuntimeError):
@@ -218,7 +218,7 @@ def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
 def _allow_file(
     file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Allows a file to run as code that a log names.
+    """Permits a file that the user names to run as code that a log names.
 
     The file belongs to the code that has the hash of the file. If there is no such code, it
     belongs to the code whose module has the name of the file; it is then another version of
@@ -311,10 +311,9 @@ class _LoggedUserLaw(NamedTuple):
 
 
 def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
-    """Returns the control laws in a scenario that are users' classes.
+    """Returns the control laws in an experiment that are users' classes, without running them.
 
-    None of their code is run. Each entry tells whether the law may run, and which file would be
-    used.
+    Each entry tells whether the law may run, and which file would be used.
 
     Args:
         scenario: Scenario of a log.

@@ -548,7 +548,7 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns the facts about the stop of a site's arm, as predicates for a sentence.
+    """Returns what happens if an arm is stopped, as ends of sentences.
 
     They say when the arm comes to rest, and whether its motors are strong enough.
     """

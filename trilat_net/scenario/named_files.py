@@ -153,9 +153,8 @@ def _find_file(name: str, folder: Path) -> Path:
 
 
 def use_unix_line_ends(text: str) -> str:
-    r"""Returns a text with "\n" at the end of each line.
+    r"""Returns a text with line feeds as line ends, as on Linux.
 
-    TOML stores line ends in this form. Without the conversion, a file that was written on
-    Windows would be another experiment.
+    A file that was written on Windows would otherwise be another experiment with another hash.
     """
     return text.replace("\r\n", "\n").replace("\r", "\n")

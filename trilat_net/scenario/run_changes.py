@@ -61,9 +61,9 @@ def resolve_change(
 ) -> Change:
     """Completes and checks a change that a user requests during a run.
 
-    A change concerns a link, which is the connection between two sites (the processes of the
-    arms), or the weights with which one site follows the others. A user may state only the
-    settings of a link that change. The others are taken from its current settings.
+    It changes a network link, or the weights with which one arm follows the others. A user may
+    state only the settings of a link that change; the others are taken from its present
+    settings.
 
     Args:
         scenario: Description of the experiment.

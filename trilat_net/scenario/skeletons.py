@@ -110,9 +110,10 @@ def _is_other_module(module: str, file: Path) -> bool:
 
 
 def name_skeleton_class(module: str, kind: str = "law") -> str:
-    """Returns the name of the class in a new file with an incomplete program.
+    """Returns the name of the class in a new file that a user completes.
 
-    The modules mylaw and my_law contain the class MyLaw, and spring contains Spring.
+    For example, the modules mylaw and my_law contain the class MyLaw, and spring contains
+    Spring.
 
     Args:
         module: Name of the Python module that contains the skeleton.

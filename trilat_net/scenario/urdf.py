@@ -1299,10 +1299,7 @@ def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
 
 
 def _find_sum_problem(total: BodyParameters) -> str:
-    """Returns the reason why the sum of the bodies at a joint is impossible.
-
-    Empty if it is a body with mass and extent.
-    """
+    """Returns why no real body can have the summed mass and inertia at a joint, or ""."""
     mass = total[0]
     if mass < LEAST_MASS_KG:
         return (

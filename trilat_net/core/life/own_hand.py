@@ -168,10 +168,10 @@ class OwnHand:
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the first tick after `k` in which the program decides or a decision acts.
+        """Returns the first control period after `k` in which the program changes anything.
 
-        A tick is a control period. Until that tick there is no new command. Therefore
-        `advance_span` computes the ticks before it in one compiled call.
+        In this period the program decides, or an earlier decision takes effect. Until then
+        `advance_span` computes all periods in one compiled call.
         """
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
         next_actions = [due for due, _ in self._due if due > k]
@@ -248,7 +248,7 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Checks a decision of the program, and schedules it after the program's reaction time.
+        """Checks a decision of the user's program, and schedules it after a reaction time.
 
         A decision is ignored if it is based on an older view of the arm than an earlier one.
 

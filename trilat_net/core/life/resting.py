@@ -125,10 +125,10 @@ def rests_by_law(site: SiteRow) -> bool:
 
 @leaf
 def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
-    """Enters a mode in which the arm comes to rest, and starts its rest reference.
+    """Begins to bring an arm to rest, for example because another arm has fallen silent.
 
-    The rest reference is the position that the joints follow until they stand still. An arm
-    that rests already keeps its reference, unless its control law failed now or before.
+    The joints then follow a motion that slows down until they stand still, the rest reference.
+    An arm that rests already keeps its reference, unless its control law failed now or before.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -149,7 +149,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 
 @leaf
 def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns the position that joint i follows while the arm comes to rest, and its velocity.
+    """Returns where joint i should be while the arm comes to rest, and with which velocity.
 
     `_write_rest_reference` says why joint space and task space keep them in different fields.
 
@@ -388,8 +388,8 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 def advance_rest(site: SiteRow) -> None:
     """Updates the integral term w of the torque that holds an arm at rest.
 
-    The term w carries a constant load, for example unknown gravity. In each period h of the
-    control loop, it changes by
+    The term carries a constant load, such as unknown gravity. In each control period h, it
+    changes by
 
         -h k B s,    s = qd - qd_ref + Lambda (q - q_ref)
 

@@ -256,9 +256,9 @@ def _extrapolate_reference(site: SiteRow) -> None:
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
     """Returns True while the torque blends from the torque at rest to that of the control law.
 
-    The change starts when the arm begins to move from rest towards the other arms, and takes
-    `RETURN_NS`. An arm that aligns with the remaining arms after one was lost, or after a lost
-    one came back, was not at rest. It needs no change.
+    The blend starts when the arm begins to move from rest towards the other arms, and takes
+    `RETURN_NS`. An arm that aligns with the others because one of them was lost or came back
+    was not at rest, and needs no blend.
 
     Args:
         t_ns: Time, ns since the start of the session.
@@ -292,7 +292,7 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
 @leaf
 def _find_fault(site: SiteRow) -> int:
-    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is none.
+    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is not.
 
     A fault is a number that is not finite, an angle beyond its limits, or a speed above its
     limit.

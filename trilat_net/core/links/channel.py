@@ -118,11 +118,11 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 def find_delay_us(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns the delay of a sample on a link, by the link's delay model, us.
+    """Returns the delay of a message on a simulated network link, us.
 
-    A sample is the state that another arm sends in one control period. The delay may follow a
-    distribution, a function of time, or a recorded trace, see `DelayKind`. The result is LOST
-    if the trace says that the sample is lost.
+    The delay may follow a distribution, a function of time, or a recorded trace, see
+    `DelayKind`. The result is LOST if the trace says that the message is lost. A message
+    (sample) is the state that another arm sends in one control period.
 
     Args:
         sample: Index of the sample.
@@ -185,10 +185,10 @@ def find_due_ns(
     model: Row,
     points: Points,
 ) -> int:
-    """Computes when a link delivers a sample (message), after its loss and delay were drawn.
+    """Computes when a network link delivers a message, after its loss and delay were drawn.
 
-    The result also depends on outages, duplicates and the order of samples. This function must
-    be called once for each sample, in the order of the indices.
+    Outages, duplicates and the order of messages matter too. The function must be called once
+    for each message (sample), in the order of the indices.
 
     Args:
         sample: Index of the sample.
@@ -228,11 +228,11 @@ def find_due_ns(
 def _due_ns(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Computes when a link delivers a sample, or that the link loses it.
+    """Computes when a network link delivers a message, or that it loses the message.
 
-    This function must be called once for each sample, in the order of the indices. The models
-    of bursts of loss and of correlated delays have a state, which it advances. Therefore loss
-    and delay are drawn even for a sample that is lost for another reason.
+    The function must be called once for each message (sample), in order, because bursts of loss
+    and correlated delays depend on the previous message. For the same reason, loss and delay
+    are drawn even for a message that is lost for another reason.
 
     Args:
         sample: Index of the sample, the state that the sender sent in the tick (period of its
@@ -290,12 +290,11 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
 def schedule_deliveries(
     sample: int, link: LinkRow, models: RowArray, dues: IntArray, points: Points
 ) -> None:
-    """Computes at which times a simulated link delivers its samples, up to a given sample.
+    """Computes when a simulated network link delivers its messages, up to a given one.
 
-    A link connects one site (the process that runs one arm) to another. A sample is the state
-    that the sender sends in one period of its control loop. The model of the link's delay and
-    loss may change at planned times. Each sample follows the model in force when the sample was
-    sent.
+    Every arm's process sends its state once per control period; such a message is called a
+    sample. The model of the link's delay and loss may change at planned times. Each message
+    follows the model in force when it was sent.
 
     Args:
         sample: Index of the last sample to compute. Earlier samples are not computed twice.

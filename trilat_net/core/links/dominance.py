@@ -36,10 +36,9 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns which arms each arm follows, directly or through other arms.
+    """Finds which arms each arm follows, directly or through other arms.
 
-    The process that controls an arm is called a site. Site i follows site j if the dominance
-    factor alpha_ij, the weight of site j, is above 0.
+    Arm i follows arm j if the weight alpha_ij (dominance factor) is above 0.
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -56,9 +55,9 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """Returns True if every arm (site) follows every other one, directly or through others.
+    """Returns True if every arm follows every other one, directly or through others.
 
-    The stability theorem needs this property of the dominance matrix.
+    The stability theorem needs this property of the matrix of weights (dominance matrix).
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -278,10 +277,10 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if nothing recent is known of some peer (other arm) that the site follows.
+    """Returns True if this arm has heard nothing recent of an arm that it follows.
 
-    That is, the sample (state) of the peer that is in use was sent too long ago. If there is no
-    such sample, the time counts from the epoch, the common start of the session.
+    That is, the message in use from the other arm was sent too long ago. If none has come yet,
+    the time counts from the common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.

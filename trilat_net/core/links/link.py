@@ -46,9 +46,9 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
 
 @cache
 def sample_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of a sample that waits until its simulated delay has passed.
+    """Returns the NumPy data type of a message that waits until its simulated delay has passed.
 
-    A sample is the state that another arm's process sends, see `SampleRow`.
+    A message (sample) is the state that another arm's process sends, see `SampleRow`.
 
     Args:
         shared: Number of coordinates of a sample: joint angles, or coordinates of the end
@@ -58,10 +58,10 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that the control law of another arm sends, in the order of their use here.
+    """Numbers that the control law of another arm sends, such as energies, as arrays.
 
-    C is the count of these numbers. If the arrays are for several peers (the processes of other
-    arms) or for several sites (the receivers), they have additional first axes.
+    C is the count of the numbers, in the order in which the law of this arm reads them. If the
+    arrays are for several senders or receivers, they have additional first axes.
 
     Attributes:
         waiting: Numbers that came with the samples whose simulated delay has not passed, one
@@ -133,12 +133,11 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Computes how many entries the ring buffer needs in which delayed samples wait.
+    """Returns how many entries the ring buffer needs in which delayed messages wait.
 
-    A sample is the state that another arm's process sends. The ring buffer is called the
-    calendar, and its entries pages. There is one page for each period of the receiver's control
-    loop in which a sample may be used first. The default arguments give the largest number that
-    any link needs.
+    The buffer is called the calendar, and its entries pages. There is one page for each control
+    period of the receiver in which a message may be used first. The default arguments give the
+    largest number that any network link needs.
 
     Args:
         rate_hz: Rate of the receiver's control loop, Hz.
@@ -157,9 +156,9 @@ def calendar_pages(
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Computes in which period of the receiver's control loop a sample is used first.
+    """Computes in which control period of the receiver a message is used first.
 
-    A sample is the state that a sender publishes in one period of its own control loop.
+    A message (sample) is the state that a sender publishes in one period of its own loop.
 
     Args:
         tick: Number of the period in which the sample was sent.
@@ -321,15 +320,14 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Puts into use the newest sample of another arm whose simulated delay has passed.
+    """Puts into use the newest message of another arm whose simulated delay has passed.
 
-    A sample is the state that the other arm sent. If no sample is due in tick (control period)
-    k, the last one stays in use. This function must be called once in each tick of the
-    receiver, in order. Otherwise samples stay in the calendar, the ring buffer with a page per
-    tick in which `accept_sample` has put them.
+    If none is due in control period (tick) k, the last one stays in use. The function must be
+    called once in each period of the receiver, in order. Otherwise messages stay in the ring
+    buffer (calendar), which has a page per period. `accept_sample` has put them there.
 
-    The due times of all samples with a stamp up to the time t_k of the tick are computed here,
-    so that the first sample after a long silence costs no more than any other.
+    The delivery times of all messages that were sent up to the time t_k of the period are
+    computed here, so that the first message after a long silence costs no more than any other.
 
     Args:
         k: Tick of the receiver.

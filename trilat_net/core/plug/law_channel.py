@@ -118,10 +118,10 @@ class LawChannel(NamedTuple):
 
     @property
     def record_size(self) -> int:
-        """Number of floating-point numbers that the law sends in a period of the control loop.
+        """Count of the floats that the law sends to all receivers in a control period.
 
-        This is the length of the field `ch` of a record. A vector of which each peer (the
-        process of another arm) gets its own counts once for each peer.
+        This is the length of the field `ch` in the log. A vector with a value of its own for
+        each receiver counts once per receiver.
         """
         if not self.vectors:
             return 0
@@ -157,9 +157,9 @@ class LawChannel(NamedTuple):
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[_SentEntry]:
-        """Describes each number that the law sends in a period of the control loop.
+        """Describes each number that the law sends in a control period, one after another.
 
-        The numbers are in the order of the field `ch` of a record, which stores them.
+        The order is that of the field `ch` in the log.
 
         Args:
             peers: Names of the sites that run the other arms, in the order of the scenario.
@@ -194,7 +194,7 @@ class LawChannel(NamedTuple):
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns all vectors that a control law may receive from the laws of other arms.
+    """Returns all vectors that the control law of an arm may receive from the other laws.
 
     A vector that several laws send, such as the energy E, appears once.
 

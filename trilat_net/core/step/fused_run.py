@@ -55,7 +55,7 @@ class RecentRecords(NamedTuple):
 
 @cache
 def sums_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the sums from which the metrics of a run are computed.
+    """Returns the NumPy data type of the sums from which the metrics of an arm are computed.
 
     `SumsRow` lists the sums, for example of squared errors and squared torques.
 
@@ -101,10 +101,9 @@ def first_sent_column(s: SiteRow) -> int:
 
 
 class ReplayedInputs(NamedTuple):
-    """Inputs of a recorded run, which a simulation of all N sites repeats.
+    """Inputs of a recorded run of N arms, with which a simulation repeats the run.
 
-    A site is a process that runs one arm. Each site has P peers, the other sites, whose samples
-    (states) it receives. A tick is one period of the control loop of a site.
+    Each arm receives the states of P other arms, its peers. A tick is one control period.
 
     Attributes:
         first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks
@@ -544,11 +543,11 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Computes the part of a site's next control period that comes before its control law.
+    """Computes the part of an arm's next control period that comes before its control law.
 
-    A site is a process that runs one arm. This part accepts the samples (states) of its peers,
-    the other sites, and computes the reference, the errors and the parameter estimate. The
-    samples arrive as in the recorded run. Without a recorded run they arrive without delay.
+    This part accepts the messages (states) of the other arms, and computes the reference, which
+    is the position to follow, the errors and the parameter estimate. The messages arrive as in
+    a recorded run, or without delay if there is none.
 
     Args:
         i: Index of the site.
@@ -626,7 +625,7 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Completes the control period of a site, whose first part `sense_site` computed.
+    """Completes a control period of one arm, after `sense_site` has computed its first part.
 
     The control law computes the torque, and the arm moves to the next period. The results of
     the period are added to statistics of the run.
@@ -712,8 +711,8 @@ def run_until(
 ) -> None:
     """Simulates all arms of an experiment up to a time, or until an arm diverges.
 
-    A site is the process that runs one arm. The control periods of all sites are computed in
-    the order of their times.
+    The control periods of all arms are computed in the order of their times, because each arm
+    receives the states of the others.
 
     Args:
         last_ns: Time of the last control period to compute, ns since the start of the session.

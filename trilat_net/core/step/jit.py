@@ -80,10 +80,10 @@ def _cache_root() -> Path:
 
 
 def _core_digest() -> str:
-    """Returns a hash that changes if stored machine code is out of date.
+    """Returns a hash that shows whether machine code on disk was compiled from these sources.
 
-    It covers Numba's version and all sources of the code: the files of the core, and `records`,
-    whose constants the core contains.
+    It covers Numba's version, the files of the core, and `records`, whose constants the core
+    contains.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for source in (*sorted(_CORE.rglob("*.py")), _CORE.with_name("records.py")):
@@ -211,10 +211,10 @@ _INNER = "within"
 
 @cache
 def _hash_folder(folder: Path) -> str:
-    """Returns a hash of all Python files of a folder, for functions outside of the core.
+    """Returns a hash of all Python files of a folder, to detect outdated machine code.
 
-    If a file changes, so does the hash, and compiled code that was stored with the old hash is
-    not used any more. All functions of a folder ask for the same hash.
+    Functions outside of the core use it. If a file changes, so does the hash, and machine code
+    that was stored with the old hash is not used any more.
     """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):

@@ -443,13 +443,11 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 @leaf
 def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
-    """Returns the arrays of the link from one peer, as views of the arrays of the site.
+    """Returns the arrays of the network link from one other arm, as views without copying.
 
-    A site is the process that runs one arm, and a peer another site that sends its samples
-    (states). `LinkArrays` describes the arrays of a link. Nearly all of them are rows of the
-    site's arrays, one row per peer. `state` is a slice, because it must stay an array, of
-    shape (1,). `points` is the table of all links of the site, in which each link has rows of
-    its own.
+    `LinkArrays` describes the arrays of a link. Nearly all of them are rows of this arm's
+    arrays, one row per other arm (peer). `state` is a slice, because it must stay an array, of
+    shape (1,). `points` is the table of all links, in which each link has rows of its own.
 
     Args:
         arrays: Arrays of the site.
@@ -467,10 +465,9 @@ def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Finds the period of the site's control loop in which a sample of a peer is used first.
+    """Finds the control period of this arm in which a message of another arm is used first.
 
-    A site is the process that runs one arm, and a peer is another site. A sample is the state
-    that the peer sends in one period of its own control loop.
+    A message (sample) is the state that the other arm sends once per period of its own loop.
 
     Args:
         peer: Index of the peer.
@@ -486,10 +483,10 @@ def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stores the samples that arrived, until their simulated delay has passed.
+    """Stores the messages that arrived, until their simulated network delay has passed.
 
-    A sample is the state that another arm sends in one period of its control loop. Samples wait
-    in ring buffers, which are called calendars.
+    A message (sample) is the state that another arm sends once per control period. Messages
+    wait in ring buffers, which are called calendars.
 
     Args:
         k: Number of the present control period.
@@ -758,11 +755,11 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Completes the state of a site that was restored from records, to continue the run.
+    """Completes the state of an arm that was restored from a log, to continue the run.
 
-    A site is the process that runs one arm. Some numbers that tick k + 1 (the next period of
-    the control loop) needs are not in the records. They are computed here from the restored
-    state: the tracking errors, the external torques, and the state of the arm at tick k + 1.
+    Some numbers that the next control period needs are not in the log. They are computed here
+    from the restored state: the tracking errors, the external torques, and the motion until
+    then. Control periods are called ticks.
 
     Args:
         k: The last tick that was recorded.

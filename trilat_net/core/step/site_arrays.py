@@ -218,9 +218,9 @@ class SiteArrays(NamedTuple):
         )
 
     def select(self, i: int, layout: Layout) -> "SiteArrays":
-        """Returns the arrays of one site (one arm) of a simulation of several sites, as views.
+        """Returns the arrays of one arm in a simulation of several arms, without copying.
 
-        Vectors may be longer than this site needs, because all sites have equally long ones.
+        Vectors may be longer than this arm needs, because all arms have equally long ones.
 
         Args:
             i: Index of the site.
@@ -291,11 +291,11 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Computes how many samples must be able to wait on each link of a site.
+    """Computes how many messages must be able to wait on each network link of an arm.
 
-    A site is a process that runs one arm. Its samples, the states of other sites, wait until
-    their simulated delay has passed. The result follows from the longest delay in the setup,
-    and from the time `_NEAR_NS` by which the clock of a sender may be ahead.
+    A message (the state of another arm) waits until its simulated delay has passed. The result
+    follows from the longest delay, and from the time `_NEAR_NS` by which the clock of a sender
+    may be ahead.
 
     Args:
         setup: Setup of the site.
@@ -345,9 +345,9 @@ def _count_kept_dues(setup: SiteSetup) -> int:
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
-    """Enlarges the ring buffers in which samples wait until their simulated delay has passed.
+    """Enlarges the ring buffers in which messages wait for their simulated delay to pass.
 
-    A sample is the state that another arm's process sends. All waiting samples are kept.
+    All waiting messages are kept. The buffers are called calendars.
 
     Args:
         arrays: Arrays of the site, the process that runs the arm.
@@ -483,7 +483,7 @@ class CalendarSizer:
 def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     """Adds a planned change of the weights with which an arm follows the other arms.
 
-    The table of changes is sorted by their start times.
+    The changes stand in a table, which is sorted by their start times.
 
     Args:
         arrays: Arrays of the site (the process that runs the arm). Their table must have a free
@@ -503,9 +503,9 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 
 
 def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
-    """Adds a planned change of a link's delay and loss to the table of changes.
+    """Adds a planned change of a network link's delay and loss.
 
-    The table is sorted by the time from which a change applies.
+    The changes stand in a table, which is sorted by the time from which each applies.
 
     Args:
         arrays: Arrays of the site (the process that runs the arm). Their table must have a free

@@ -335,9 +335,10 @@ class Gains(NamedTuple):
 
 
 class SiteSetup(NamedTuple):
-    """All settings of a site, the process that controls one arm, resolved to numbers.
+    """All settings of one arm and its controller, as numbers.
 
-    The state of the site before its first control period follows from them.
+    The state before the first control period follows from them. The process of an arm is called
+    a site.
 
     Attributes:
         name: The site's name.

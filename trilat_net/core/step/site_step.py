@@ -566,10 +566,10 @@ class Site:
         return tuple(counts)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Finds the control period of this site in which a sample of a peer is used first.
+        """Finds the control period of this arm in which a message of another arm is used first.
 
-        A peer is another site (process that runs one arm). A sample is the state that it sends
-        in one period of its own control loop.
+        Control periods are called ticks. A message (sample) is the state that the other arm
+        (peer) sends once per period of its own loop.
 
         Args:
             peer: Index of the peer.

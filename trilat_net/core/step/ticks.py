@@ -43,11 +43,11 @@ def tick_ns(tick: int, rate_hz: int) -> int:
 
 @leaf
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
-    """Returns the number of the first tick (control period) that begins at or after a time.
+    """Returns the number of the first control period (tick) that begins at or after a time.
 
-    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact:
-    floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The division of the negative
-    number rounds up.
+    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact: floor(k 10^9 /
+    rate) >= due if and only if k 10^9 >= due rate. The division of the negative number rounds
+    up.
 
     Args:
         due_ns: The time, ns since the epoch, the common start of the session.
@@ -61,11 +61,10 @@ MAX_ARRIVALS = 4096
 
 
 class LifeReason(IntEnum):
-    """Why a site last changed its mode, or what last happened to it.
+    """Why an arm last changed its mode, for example because another arm fell silent.
 
-    A site is the process that runs one arm. The reasons only exist under the rule `glide`, by
-    which an arm waits for the other arms and comes to rest while one of them is silent.
-    `session_life` explains this rule.
+    The reasons only exist under the rule `glide`, by which an arm waits for the others and
+    comes to rest while one of them is silent. `session_life` explains this rule.
     """
 
     START = 0
@@ -255,10 +254,10 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns why an arm last changed its mode, for example from RUN to HOLD, from its record.
+    """Returns why an arm last changed its mode, for example from RUN to HOLD, from its log.
 
     The arm must be under the rule `glide`, by which it comes to rest while another arm is
-    silent. Only then does a record contain the reason.
+    silent. Only then does the log contain the reason.
 
     Args:
         output: Record of the arm, the result of one control period.

@@ -290,9 +290,7 @@ class HandPlayer:
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Computes the actions of a program that operates the arm, for several periods.
-
-        A period is one cycle of the control loop.
+        """Computes the actions of the program that moves the arm, for several control periods.
 
         The result ends before the first period in which the program must observe a state of the
         arm that has not been computed yet.
