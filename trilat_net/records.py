@@ -223,15 +223,15 @@ class Layout(NamedTuple):
         return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the values that the rule `glide` stores in the field `mem` of a record.
+        """Counts the values with which an arm at rest can continue a recorded run.
 
-        A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
-        while another site is silent, see `core.life.session_life`. The values are the state of
-        this rule, from which a run can be continued. They come first in `mem`:
+        By the rule `glide`, an arm comes to rest while another arm is silent, see
+        `core.life.session_life`. The state of this rule stands first in the field `mem` of the
+        log:
 
-        - the values that every such site stores, for example when each peer was heard last,
+        - the values that every such arm stores, for example when each other arm was heard last,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
-        - if the site continues without a lost site, a value for each peer: whether it is lost.
+        - if the arm goes on without a lost arm, a value for each other arm: whether it is lost.
 
         Args:
             peers: Number of the other sites from which this site receives data.

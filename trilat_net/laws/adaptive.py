@@ -133,9 +133,10 @@ class Adaptive(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
-        The table contains the tuned gains and the first estimate of the arm's parameters.
+        They are the table [control] of a scenario file: the tuned gains and the first estimate
+        of the arm's parameters.
 
         Args:
             gains: The tuned gains by name.

@@ -566,11 +566,11 @@ def check_law_class(
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
-    """Refuses a class without `torque`, and a class that does not declare its memory.
+    """Refuses a class without a method `torque`, or with a memory that it does not declare.
 
-    The memory of a law is everything that it must know in the next tick, a period of the
-    control loop. It is recorded, so that a run can be verified from any record. A class
-    declares it by `remembers`, or by the methods `memory` and `recall`.
+    The memory of a law is everything that it must know in the next control period. It is
+    logged, so that a run can be verified from any period. A class declares it by `remembers`,
+    or by the methods `memory` and `recall`.
 
     Args:
         kind: The class.

@@ -159,10 +159,10 @@ class PF(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
-        The table depends on the role of the arm, because only the slave has a spring and only
-        the master feels forces.
+        They are the table [control] of a scenario file. It depends on the role of the arm,
+        because only the slave has a spring and only the master feels forces.
 
         Args:
             gains: The tuned gains by name.

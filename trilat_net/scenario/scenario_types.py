@@ -436,10 +436,11 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """Matrix of the dominance factors at the start of the run, shape (N, N), Eq. (6).
+        """Matrix of the weights with which the arms follow each other, shape (N, N), Eq. (6).
 
-        The entry of row i and column j is the weight with which site i follows site j. A site
-        without a factor for a peer does not follow it.
+        The entry of row i and column j states how much arm i follows arm j at the start of the
+        run; it is called a dominance factor. An arm without an entry for another one does not
+        follow it.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]

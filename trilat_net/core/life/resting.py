@@ -304,12 +304,13 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
-    """Returns the filtered deviation of joint i from its rest reference.
+    """Returns how far joint i deviates from its motion at rest, as a filtered error in rad/s.
 
         s = qd - qd_ref + Lambda (q - q_ref)
 
-    The damping and the integral term of an arm at rest act on s. Lambda is the rate of the
-    adaptive law in joint space, and `REST_RATE_1_S` with any other law, which has no such rate.
+    The reference q_ref brings the joint to rest. The damping and the integral term of an arm at
+    rest act on s. Lambda is the rate of the adaptive law in joint space, and `REST_RATE_1_S`
+    with any other law, which has no such rate.
 
     Returns:
         The deviation s, rad/s or m/s.

@@ -367,12 +367,12 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Computes the delay of a sample (message) by the compiled function of a user's model.
+    """Computes the delay of a message by the compiled function of a user's model, us.
 
     The delay is limited to the maximum that the user's model declares. The function has two
-    arguments: the parameters of the user's model, and the row of the delay model. It reads its
-    input from the fields `key`, `sample` and `stamp_ns` of the row, and writes the delay into
-    the field `drawn_us`, see `plugged`.
+    arguments: the parameters of the user's model, and the data of the delay model. From the
+    latter, it reads the fields `key`, `sample` and `stamp_ns`, and writes the delay into the
+    field `drawn_us`, see `plugged`.
 
     Args:
         key: Seed of all random numbers of the link.

@@ -136,7 +136,7 @@ class PeerView(NamedTuple):
 class LawInput(NamedTuple):
     """Input of a control law in one control period (tick), and the places for its results.
 
-    A vector has one number per joint, or one per coordinate that the sites share.
+    A vector has one number per joint, or one per coordinate that the arms share.
 
     >>> def torque(self, now: tn.LawInput) -> list[float]:
     ...     return [-d * speed for d, speed in zip(self.d, now.qd)]

@@ -98,8 +98,8 @@ def compute_fingerprint() -> str:
     """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
 
     Two platforms with the same fingerprint can be expected to compute the same bits. It is a
-    hash of many sines and cosines, and of a short simulation of two arms. Each arm follows the
-    other, and receives its state of the previous tick.
+    hash of many sines and cosines, and of a short simulation of two arms that follow each
+    other.
     """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))

@@ -212,9 +212,9 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
     """Turns the torque of the control law into the torque that the motors get.
 
-    This is the last part of stage 6 of a tick, after the law has written the torque `tau`. The
-    rate of every torque is limited. Under the rule `glide`, by which an arm comes to rest while
-    a peer (another arm) is silent, the torque is first modified in these cases:
+    It is called after the law has written the torque `tau`. The rate of every torque is
+    limited. Under the rule `glide`, by which an arm comes to rest while another arm is silent,
+    the torque is first modified in these cases:
 
     - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
     - The arm comes to rest or is at rest: damping and an integral term are added, see
@@ -570,11 +570,11 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Computes reference, tracking errors and parameter estimate of a control period.
+    """Computes the reference, tracking errors and parameter estimate of a control period.
 
-    These are stages 3 to 5 of a tick. They use the newest samples (states) of the other arms
-    whose delay has passed. Finally, the external torque of operators and environments is
-    computed.
+    The reference is the position that the arm follows. It results from the newest states of the
+    other arms whose network delay has passed. Finally, the external torque of operators and
+    environments is computed.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -717,11 +717,11 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes one whole tick of a site, with a control law that is built in.
+    """Computes one whole control period of an arm, with a control law that is built in.
 
-    A site is the process that runs one arm, and a tick is one period of its control loop. The
-    number of the tick is k, and its nominal time t_ns is in ns since the start of the session.
-    Only the first `count` rows of `arrivals` are read; they are the samples that arrived.
+    The number of the period (tick) is k, and its nominal time t_ns is in ns since the start of
+    the session. Only the first `count` rows of `arrivals` are read; they are the messages that
+    arrived.
 
     All other arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed one by
     one, because passing the two tuples from Python takes a microsecond longer.

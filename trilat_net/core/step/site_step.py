@@ -168,10 +168,10 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the inputs of the operator model that a person or program moves.
+        """Returns the inputs of the spring by which a person or program pulls the arm.
 
-        This operator model, the live hand, pulls the arm to a target by a simulated spring. The
-        grip multiplies the force. Grip and target change in each tick.
+        The inputs are the grip, which multiplies the force, and the target of the spring. They
+        change in each control period.
 
         Args:
             index: Index of the live hand among the operators and environments.
