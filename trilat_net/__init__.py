@@ -195,7 +195,10 @@ def _import_name(name: str) -> _Any:
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:
-    """Returns a function that only raises UsageError, in place of one that cannot be imported.
+    """Returns a function that raises UsageError when it is called.
+
+    It takes the place of a public function that cannot be imported, for example because a
+    package that it needs is not installed.
 
     Args:
         name: Public name of the function or class that cannot be imported.

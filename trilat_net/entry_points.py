@@ -61,7 +61,9 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
 
 
 def find_package(group: str, name: str) -> str:
-    """Returns the package of this program that has a name, or "" if none has.
+    """Returns which optional package of this program, such as trilat-studies, contains a name.
+
+    The result is "" if none does. With it, an error can tell the user what to install.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
@@ -71,7 +73,9 @@ def find_package(group: str, name: str) -> str:
 
 
 def load_entry(group: str, name: str, use: str) -> Any:
-    """Imports a command, function or viewer that an installed package adds to this program.
+    """Imports a command, function or viewer that another installed package adds.
+
+    Packages declare such additions as entry points in their metadata.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.

@@ -66,9 +66,10 @@ def _name_argument(match: re.Match[str]) -> str:
 
 
 class TrilatError(Exception):
-    """Base class of all errors that a user can act on.
+    """Base class of the errors that a user can correct, such as a wrong argument.
 
-    A command that ends with such an error has the exit code `exit_code` of its class.
+    The command line prints the message without a traceback, and ends with the exit code
+    `exit_code` of the class. Any other exception is a bug of the program.
     """
 
     exit_code = 1
@@ -82,13 +83,18 @@ class TrilatError(Exception):
 
 
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
-    """A name that a result does not contain, for example a site that is not in a log."""
+    """A name that a result does not contain, for example of an arm that is not in a log.
+
+    The error is also a KeyError, as for a dictionary.
+    """
 
     exit_code = 2
 
 
 class ScenarioError(TrilatError):
-    """An invalid scenario, override or argument, which its author must correct.
+    """A scenario (description of an experiment), override or argument with an invalid value.
+
+    The author has to correct the value; the message suggests how.
 
     Args:
         problem: The problem and its remedy.
@@ -128,7 +134,9 @@ class UsageError(TrilatError):
 
 
 class WireError(TrilatError):
-    """A payload from another machine that is not a message of this program.
+    """Network message from another machine that is not a valid message of this program.
+
+    The receiver drops and counts it; the sender may be a stranger or another version.
 
     Args:
         reason: Category of the problem, by which refused payloads are counted.
@@ -141,9 +149,10 @@ class WireError(TrilatError):
 
 
 class SessionError(TrilatError):
-    """A session that cannot start.
+    """A live session of several arms' processes that cannot start.
 
-    For example, a site is missing or has another scenario, or the session is running already.
+    For example, a process is missing or runs another experiment, or the session is running
+    already.
     """
 
     exit_code = 2
@@ -159,42 +168,45 @@ class LogError(TrilatError):
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """The disk refused to store more data of a log, for example because it is full.
+    """An output that the disk refused to store, for example because the disk is full.
 
-    Data that was written before is kept.
+    Data of the log that was written before is kept and can be read.
     """
 
     exit_code = 5
 
 
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
-    """A run that cannot be executed again from its log.
+    """A run that cannot be computed again from its log.
 
-    The message gives the reason, for example that the log lacks the inputs of a site.
+    The message gives the reason, for example that the log lacks what an arm received.
     """
 
 
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
-    """Error if no data could be recovered from a damaged log file."""
+    """A damaged log file from which no data could be recovered."""
 
     exit_code = 1
 
 
 class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
-    """A run or a comparison that failed.
+    """A run or a comparison of runs that was executed, but with a bad outcome.
 
-    For example, an arm diverged, a site died, or records differ that should be equal.
+    For example, an arm became unstable, a process died, or two runs differ that should be
+    equal.
     """
 
 
 class PeerLeft(RunFailed):
-    """A run that ended early because another site had left the session and not come back."""
+    """A live run that ended early, because another arm's process left and did not come back."""
 
     exit_code = 3
 
 
 class CodeFailed(RunFailed):
-    """A user's code that raised an exception, was too slow, or returned unusable results.
+    """A user's class that raised an exception, was too slow, or returned unusable results.
+
+    The class is a control law, or a model of an arm.
 
     Args:
         problem: The failure.
@@ -215,7 +227,7 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Returns what pickle needs to rebuild the error, with its site, code and tick.
+        """Returns what pickle needs to rebuild the error with all its facts.
 
         Worker processes report errors to the process that started them by pickle.
         """
@@ -224,9 +236,7 @@ class CodeFailed(RunFailed):
 
 
 class LawFailed(CodeFailed):
-    """A user's control law that failed.
-
-    It raised an exception, was too slow, or returned unusable results.
+    """A user's control law that raised an exception, was too slow, or had unusable results.
 
     A control law is the class that computes the torques of an arm.
     """
@@ -235,11 +245,9 @@ class LawFailed(CodeFailed):
 
 
 class PlantFailed(CodeFailed):
-    """A user's model of an arm (plant) that failed.
+    """A user's arm model that raised an exception, was too slow, or had unusable results.
 
-    It raised an exception, was too slow, or returned unusable results.
-
-    A plant is the class that simulates the motion of an arm.
+    The model is called a plant: a class that computes the motion of an arm from its torques.
     """
 
     kind = "plant"
@@ -286,7 +294,7 @@ def format_wall_time(seconds: float) -> str:
 
 
 def pluralise(singular: str) -> str:
-    """Returns the plural of a noun.
+    """Returns the plural of an English noun, as in "samples" for "sample" or "axes" for "axis".
 
     Args:
         singular: The noun, possibly with words before it, as in "late sample".
@@ -375,10 +383,10 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
 
 
 def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
-    """Returns suggestions by the words that users may have meant by a misspelt word.
+    """Returns suggestions for misspelt words, by what a user may have meant to type.
 
-    The words are in lower case. Users forget the unit at the end of a key: "delay" and "dely"
-    mean "delay_ms". Therefore such a key also stands without its unit.
+    Upper and lower case count as equal. Users also forget the unit at the end of a key: "delay"
+    and "dely" mean "delay_ms". Therefore each key is listed with and without its unit.
 
     Args:
         suggestions: For each valid word the text to suggest.
@@ -403,7 +411,10 @@ def join_words(words: Iterable[str]) -> str:
 
 
 def join_arguments(arguments: Iterable[str]) -> str:
-    """Returns a command as a user would type it into a shell of this operating system.
+    """Returns a command line with quotes where a shell needs them, for users to copy.
+
+    The quoting is that of this operating system. For example, "links.m1->s.loss=0" is quoted,
+    because a shell would take ">" as the redirection of output.
 
     Args:
         arguments: Name of the program and its arguments.
@@ -447,7 +458,9 @@ def describe_exception(error: BaseException) -> str:
 
 
 def _is_users_file(name: str) -> bool:
-    """Returns True if a source file belongs neither to this program nor to a library.
+    """Returns True if a source file is a user's, and not of this program or a library.
+
+    The place of an error is reported in the user's file, where it can be corrected.
 
     Args:
         name: Name of the file in a traceback. That of code without a file is "<string>".

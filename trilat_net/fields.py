@@ -25,10 +25,10 @@ from .records import MAX_JOINTS
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base class of the types that describe the tables of a scenario file.
+    """Base class of the immutable types to which the tables of a scenario file are converted.
 
-    The objects are immutable. If a table contains a key that the type does not have, the table
-    is refused, because the key is probably misspelt.
+    An unknown key in a table is refused, because it is probably misspelt and would otherwise
+    have no effect.
     """
 
 
@@ -89,7 +89,7 @@ TomlTable = dict[str, Any]
 
 
 class KeyProblem(NamedTuple):
-    """A key of a scenario's table that has an invalid value.
+    """What is wrong with one key of a scenario's table, before it becomes an error message.
 
     Attributes:
         key: Path of the key below the checked table. Empty for the table itself.
@@ -128,7 +128,10 @@ WITHOUT_QUOTES = ": write it without quotes and unit, which the key's name state
 
 
 def reword_problem(problem: str) -> str:
-    """Rewords an error message of msgspec in terms of TOML, for the author of a scenario.
+    """Rewords an error message of the library msgspec, for the author of a scenario file.
+
+    The library names types of Python and JSON, such as "object"; an author knows those of TOML,
+    such as "a table".
 
     Args:
         problem: The message, without the path of the key.

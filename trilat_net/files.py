@@ -53,7 +53,9 @@ EXTRAS = {
 
 
 def require_libraries(*names: str) -> None:
-    """Checks that the libraries that a command needs are installed, before it starts.
+    """Checks before a long command starts that all libraries that it needs are installed.
+
+    Otherwise the command would fail only at its end, for example when it draws a figure.
 
     Args:
         names: Names of the libraries. By default all of `STUDY_LIBRARIES`.
@@ -72,7 +74,7 @@ def require_libraries(*names: str) -> None:
 
 
 def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
-    """Returns the error message that a function needs a library that is not installed.
+    """Returns the error message for a function whose library is not installed.
 
     Args:
         function: Name of the function.
@@ -102,6 +104,9 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Imports a module of an optional package, which may not be installed.
+
+    Without the package, the user gets an error with the command that installs it, in place of a
+    traceback.
 
     Args:
         module: Name of the module.
@@ -161,10 +166,10 @@ def find_version() -> str:
 
 
 def find_page(name: str) -> Path:
-    """Returns the path of a documentation page.
+    """Returns the path of a documentation page on this machine.
 
-    In a clone of the repository the page is in a folder of docs. Otherwise it is where the
-    installation put it.
+    In a clone of the repository it lies in the folder docs, otherwise where the installation
+    put it.
 
     Args:
         name: File name of the page, as in "json.md". No two pages have the same name.
@@ -240,7 +245,7 @@ def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO
 
 
 def digest_file(path: Path) -> str:
-    """Returns the SHA-256 digest of a file's content, in hexadecimal.
+    """Returns the SHA-256 hash of a file's content in hexadecimal, to detect any change of it.
 
     Args:
         path: The file, which is read in parts. The file may therefore be large.
@@ -263,7 +268,9 @@ def read_foreign_permissions(path: Path) -> int:
 
 
 def make_folder(folder: Path) -> Path:
-    """Makes a folder and its parents unless they exist, and returns the folder.
+    """Makes a folder, with all parent folders that do not exist yet, and returns its path.
+
+    A folder that exists is left as it is.
 
     Raises:
         UsageError: The folder cannot be made.
@@ -301,7 +308,7 @@ def refuse_link(path: Path) -> None:
 
 
 def make_subfolder(folder: Path) -> Path:
-    """Makes a folder within an output folder unless it exists, and returns the folder.
+    """Makes a folder inside an output folder unless it exists, and returns its path.
 
     Args:
         folder: Path of the folder.
@@ -484,7 +491,7 @@ def write_whole(
 
 
 def _write_parts(stream: BinaryIO, parts: Iterable[bytes | str]) -> None:
-    """Writes the parts of a file one after the other. Text is encoded as UTF-8."""
+    """Writes the parts of a file one after the other, and encodes text as UTF-8."""
     for part in parts:
         stream.write(part.encode() if isinstance(part, str) else part)
 

@@ -25,7 +25,11 @@ _loaders: dict[str, Callable[[], Any]] = {}
 
 
 def register_hooks(package: str, functions: Mapping[str, str]) -> None:
-    """Registers functions of a package for the lower packages that look them up.
+    """Registers functions of an upper package by name, so that lower packages can call them.
+
+    A lower package, such as the one for logs, must not import an upper one, such as the one for
+    ROS. It looks up the registered function instead (`find_hook`). The modules are imported
+    only then.
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.
@@ -38,7 +42,9 @@ def register_hooks(package: str, functions: Mapping[str, str]) -> None:
 
 
 def find_hook(hook: str) -> Any:
-    """Returns the function that an upper package has registered.
+    """Returns the function that an upper package has registered under a name.
+
+    With it, a lower package calls a function that it must not import.
 
     Args:
         hook: Name of the hook, as in "plot a log".
@@ -51,7 +57,7 @@ def find_hook(hook: str) -> Any:
 
 
 def list_hooks() -> list[str]:
-    """Returns the names of all hooks for which a function is registered, for the tests."""
+    """Returns the names under which upper packages have registered functions, for the tests."""
     return list(_loaders)
 
 
@@ -84,5 +90,8 @@ def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], A
 
 
 def _import_function(module: str, name: str) -> Any:
-    """Imports the module of a hook, on the first use of the hook, and returns its function."""
+    """Imports a function that an upper package has registered as a hook.
+
+    It is called when a lower package uses the hook for the first time.
+    """
     return getattr(import_module(module), name)

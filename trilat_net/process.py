@@ -94,7 +94,9 @@ def request_real_time_scheduling() -> str:
 
 
 def _change_threads(change: Callable[[int], None]) -> None:
-    """Applies a change to this thread, and then to all other threads of the process.
+    """Applies a change, such as a higher priority, to all threads of this process.
+
+    The calling thread comes first.
 
     Args:
         change: Function that changes the thread of a given number. 0 is the calling thread.

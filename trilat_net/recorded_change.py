@@ -35,13 +35,11 @@ Users send "stop", "enable" and "reset". The site itself causes the others, for 
 class RecordedChange(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
 ):
-    """Change during a run as a record states it, for example a new delay of a link.
+    """Change that was made during a run, as a log contains it, for example a new network delay.
 
-    The change may also be one of dominance factors, or a command to a site. The values are not
-    checked.
-
-    Exactly one of `link`, `dominance` and `site` is not empty. `scenario_types.Change` is the
-    change that a scenario has checked.
+    It changes a network link, the weights with which an arm follows the others, or gives a
+    command to one arm's process. Exactly one of `link`, `dominance` and `site` is not empty.
+    The values are not checked; `scenario_types.Change` is the checked form.
 
     Attributes:
         at_s: Time at which the change takes effect, in s after the epoch, the common start

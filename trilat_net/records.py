@@ -48,10 +48,10 @@ class Mode(IntEnum):
 
 
 class Arrival(NamedTuple):
-    """Sample that arrived at a site from one of its peers.
+    """Sample that arrived at a site: the state that another arm sent at one moment.
 
-    A site is a process that runs one arm, and its peers are the other sites. A sample is the
-    state that a peer sends in each period of its control loop.
+    A site is a process that runs one arm, and its peers are the other sites. Each peer sends a
+    sample over the network in each period of its control loop.
 
     Attributes:
         peer: Index of the peer.
@@ -134,9 +134,10 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the part of the record that an arm sends to the other arms.
+        """Returns what an arm sends to the other arms in a control period.
 
-        In task space it refers to the end effector, otherwise to the joints.
+        In task space, where arms follow each other's end effectors, it is the motion of the end
+        effector, otherwise that of the joints.
 
         Returns:
             The position, the velocity and the exogenous torque, a number per coordinate each.
@@ -147,7 +148,9 @@ class TickRecord(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Lengths of the vectors that describe an arm and its control law.
+    """Lengths of the vectors that belong to an arm and its control law, such as 2 joint angles.
+
+    All arrays and log records of an arm are laid out by these lengths.
 
     Attributes:
         joints: Number of joints of the arm.
@@ -201,7 +204,10 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Finds the position of each vector among all computed numbers of a record.
+        """Returns which columns of a record contain each vector, for example "q": slice(0, 2).
+
+        A record is the row of floating-point numbers that an arm's process computes in one
+        period of its control loop.
 
         Returns:
             A slice for each vector, by name. Vectors that are inputs of the period are left
@@ -217,15 +223,15 @@ class Layout(NamedTuple):
         return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the values that the rule `glide` stores in the field `mem` of a record.
+        """Counts the values with which an arm at rest can continue a recorded run.
 
-        A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
-        while another site is silent, see `core.life.session_life`. The values are the state of
-        this rule, from which a run can be continued. They come first in `mem`:
+        By the rule `glide`, an arm comes to rest while another arm is silent, see
+        `core.life.session_life`. The state of this rule stands first in the field `mem` of the
+        log:
 
-        - the values that every such site stores, for example when each peer was heard last,
+        - the values that every such arm stores, for example when each other arm was heard last,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
-        - if the site continues without a lost site, a value for each peer: whether it is lost.
+        - if the arm goes on without a lost arm, a value for each other arm: whether it is lost.
 
         Args:
             peers: Number of the other sites from which this site receives data.
@@ -261,7 +267,9 @@ class Layout(NamedTuple):
         return slice(first, first + length)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the lost arms without which this arm goes on, from its record.
+        """Returns the names of the arms that fell silent and without which this arm goes on.
+
+        The names are derived from a record of this arm's log.
 
         Args:
             mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
@@ -275,9 +283,9 @@ class Layout(NamedTuple):
 
     @property
     def floats(self) -> int:
-        """Number of floating-point values in a record, without the values that are inputs.
+        """Count of the floats that an arm's process computes in one period of the control loop.
 
-        A record contains the inputs and results of one period of the control loop.
+        They form a record of the log. Floats that are inputs of the period are not counted.
         """
         shared_vectors = 5 if self.task else 2
         return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent

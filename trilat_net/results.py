@@ -26,10 +26,9 @@ _REPR_LENGTH = 200
 class Result:
     """Base class of the results of all commands and of the corresponding Python functions.
 
-    A subclass overrides `to_dict` if its JSON keys differ from its fields, and `to_rows` if its
+    Each result can be printed as text, printed as JSON, or converted to a pandas data frame. A
+    subclass overrides `to_dict` if its JSON keys differ from its fields, and `to_rows` if its
     table has several rows.
-
-    A result can be printed as text, as JSON, or converted to a pandas data frame.
     """
 
     def to_dict(self) -> dict[str, Any]:
@@ -89,7 +88,7 @@ JsonObject = dict[str, Any]
 
 
 def finite_or_none(value: float) -> float | None:
-    """Returns a number in the form in which JSON can contain it.
+    """Returns a number, or None in place of NaN or infinity, which JSON cannot express.
 
     Args:
         value: The number.

@@ -163,7 +163,7 @@ def end_process_at_signals() -> Callable[[], None]:
     unwatch = _watch_signals() if is_first_process else lambda: None
 
     def restore() -> None:
-        """Restores the handlers that were replaced, so that loops can poll for signals."""
+        """Restores the earlier signal handlers, so that loops can check for signals again."""
         unwatch()
         for number, handler in replaced.items():
             signal.signal(number, handler)
@@ -218,7 +218,9 @@ def _watch_signals() -> Callable[[], None]:
 
 
 def _may_interrupt(owner: object) -> bool:
-    """Returns True if the owner of a signal's handler allows the signal to interrupt its work.
+    """Returns True if a signal may interrupt the present work of the process.
+
+    The object that handles the signal decides this.
 
     Args:
         owner: Object whose method handles the signal. None if the handler is a plain function.

@@ -65,7 +65,9 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 
 def _prepare_worker(parent: int, in_command: bool) -> None:
-    """Prepares a worker process: it ignores Ctrl-C, and ends after its parent process.
+    """Prepares a new worker process, so that only its parent process decides when it ends.
+
+    The worker ignores Ctrl-C, and ends as soon as its parent has ended.
 
     Args:
         parent: Process number of the parent.
@@ -78,7 +80,10 @@ def _prepare_worker(parent: int, in_command: bool) -> None:
 
 
 def _exit_after(parent: int) -> None:
-    """Waits until the parent process has ended, and then ends this process.
+    """Ends this worker process as soon as its parent process has ended, however it ended.
+
+    The function waits in a thread. Without it, workers would go on computing after their parent
+    was killed.
 
     Args:
         parent: Process number of the parent.

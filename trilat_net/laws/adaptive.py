@@ -106,7 +106,7 @@ class Adaptive(ControlLaw):
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Converts the gains of this law to the record that the compiled control loop reads.
+        """Converts the gains of this law to the form that the compiled control loop reads.
 
         Args:
             theta: True parameters of the arm. This law does not use them, because it learns
@@ -133,9 +133,10 @@ class Adaptive(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
-        The table contains the tuned gains and the first estimate of the arm's parameters.
+        They are the table [control] of a scenario file: the tuned gains and the first estimate
+        of the arm's parameters.
 
         Args:
             gains: The tuned gains by name.

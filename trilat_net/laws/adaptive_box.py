@@ -62,7 +62,7 @@ class AdaptiveBox(Adaptive):
         return np.minimum(above_low, self.theta_high)
 
     def gains(self, theta: Array) -> Gains:
-        """Converts gains and bounds to the record that the compiled control loop reads.
+        """Converts gains and bounds of this law to the form that the control loop reads.
 
         Args:
             theta: True parameters of the arm. This law does not use them, because it learns

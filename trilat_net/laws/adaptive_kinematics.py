@@ -79,7 +79,7 @@ def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
 
 @leaf
 def _end_effector_motion(lengths: Pair, q: Pair, qd: Pair) -> tuple[float, float, float, float]:
-    """Returns the position (x, y) of the end effector, m, and its velocity along x and y, m/s.
+    """Returns the position (x, y) of the planar arm's end effector, m, and its velocity, m/s.
 
     Args:
         lengths: Lengths of the two links, m.
@@ -314,12 +314,12 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether this control law is known to be stable in a scenario.
+        """Evaluates whether this control law is proved to be stable in an experiment.
 
-        The proof in docs/theory/laws-lengths.md that e and qd go to zero requires that all
-        delays are constant, that the dominance matrix is irreducible, that the elbow of each
-        arm stays bent, and that the true lengths of the links lie between the bounds `least_m`
-        and `most_m`.
+        The proof in docs/theory/laws-lengths.md that the errors e and the velocities qd go to
+        zero requires that all delays are constant, that each arm follows every other one at
+        least through others (irreducible matrix of weights), that the elbows stay bent, and
+        that the true lengths of the links lie between the bounds `least_m` and `most_m`.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.

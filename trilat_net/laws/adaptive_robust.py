@@ -24,10 +24,11 @@ from .interface import TuningSite
 class AdaptiveRobust(AdaptiveBox):
     """Adaptive law with bounded estimates and a robust term -rho r / sqrt(r^2 + width^2).
 
-    Premises: constant delays, no operator, theta in its box, and a disturbance of at most rho
-    at each joint. Then the mean over time of the power that V, the energy function of the
-    stability proof, dissipates is at most 0.3003 sum_i beta_i sum rho width, and no stronger
-    statement is proved; docs/reference/laws-adaptive.md derives the bound.
+    Premises: constant delays, no person who moves an arm, parameters within their bounds, and a
+    disturbance of at most rho at each joint, where r is the filtered tracking error. Then the
+    mean over time of the power that V, the energy function of the stability proof, dissipates
+    is at most 0.3003 sum_i beta_i sum rho width, and no stronger statement is proved;
+    docs/reference/laws-adaptive.md derives the bound.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 

@@ -29,7 +29,9 @@ motion of all sites needs at its most critical mass.
 
 
 class ArmLoad(NamedTuple):
-    """Spring and damper by which an operator or environment reacts to the motion of an arm.
+    """Spring and damper by which a person or an object reacts to the motion of an arm.
+
+    A wall, for example, is a spring with a damper; a person's hand is modelled in the same way.
 
     Attributes:
         stiffness_nm_rad: Stiffness per joint, N m/rad.
@@ -41,7 +43,10 @@ class ArmLoad(NamedTuple):
 
 
 class LawSituation(NamedTuple):
-    """Input of a stability condition: the laws, delays and weights of all sites of a session.
+    """Facts for a stability condition: the laws, delays and weights of all arms.
+
+    The weights state how much each arm follows the others. The process of an arm is called a
+    site.
 
     Attributes:
         site: Index of the site.
@@ -106,7 +111,9 @@ class LawSituation(NamedTuple):
 
 
 class StabilityCondition(NamedTuple):
-    """Stability condition of a law at a site, evaluated for a scenario.
+    """Answer to the question whether a control law is stable at one arm of an experiment.
+
+    It states the condition, for example a lower bound of the damping, and whether it is met.
 
     Attributes:
         holds: True if the condition is met, False if not, None if it cannot be decided.
@@ -122,12 +129,12 @@ class StabilityCondition(NamedTuple):
 
 
 def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of a dominance matrix, if the matrix is reversible.
+    """Returns the least eigenvalue of a dominance matrix, or None if it is not reversible.
 
-    Row i of the matrix alpha contains the weights with which site i follows the other sites.
-    The matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
-    Then all eigenvalues are real. The negative of the least one is a lower bound of d / (K T),
-    where d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
+    Row i of the matrix alpha contains the weights with which arm i follows the others. The
+    matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji. Then
+    all eigenvalues are real. The negative of the least one is a lower bound of d / (K T), where
+    d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
 
     Args:
         alpha: Dominance matrix, shape (N, N).
@@ -144,12 +151,12 @@ def find_least_reversible(alpha: Array) -> float | None:
 def judge_position_exchange(
     situation: LawSituation, stiffness: str, damping: str
 ) -> StabilityCondition:
-    """Returns the stability condition of P+d, a spring to the other arms and a damper.
+    """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
 
-    The condition holds for arms of any mass. For two sites, it is due to Nuno, Basanez, Ortega
-    and Spong, IJRR 28, 2009. More than two sites need reversible dominance factors, see
-    `find_least_reversible`, and the same stiffness K, damping d and delay T at all sites
-    (docs/theory/damping-conditions.md, 13).
+    The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
+    due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two need the same stiffness
+    K, damping d and delay T at all arms, and reversible weights with which they follow each
+    other, see `find_least_reversible` (docs/theory/damping-conditions.md, 13).
 
     A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
     and T increased by h / 2, for arms whose least inertia is above d h / 2
@@ -354,7 +361,9 @@ and "tau_h" for the torque ON the arm.
 
 
 class LinearSituation(NamedTuple):
-    """Input of a linear form: the laws and weights of all sites, and the inertia of the arm.
+    """Facts for the linearisation of a control law: laws and weights of all arms, and inertia.
+
+    The linearised law describes small motions about a pose at rest.
 
     Attributes:
         site: Index of the site.
@@ -373,7 +382,7 @@ class LinearSituation(NamedTuple):
 
     @property
     def peers(self) -> list[int]:
-        """Indices of all sites but this one, ascending: those whose motion the law may use."""
+        """Indices of all other arms in ascending order, whose motion the law may use."""
         return [j for j in range(len(self.names)) if j != self.site]
 
 
@@ -403,7 +412,9 @@ class LinearForm:
         self.blocks: dict[tuple[BlockKey, BlockKey], Array] = {}
 
     def add(self, row: BlockKey, column: BlockKey, gain: Any) -> None:
-        """Adds a gain to a block of the matrix; a missing block counts as zero.
+        """Adds a gain to one block of the matrix that describes a linearised control law.
+
+        A block that does not exist yet counts as zero.
 
         Args:
             row: Row of the block, the quantity that depends on the other.

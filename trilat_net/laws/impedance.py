@@ -456,9 +456,9 @@ def _compute_loop_gain(
 def _select_master_hands(
     hands: Sequence[Sequence[ArmLoad] | None], slave: int
 ) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
-    """Returns each selection of the people who hold the masters, from nobody to all of them.
+    """Returns each selection of the persons who hold the masters, from nobody to all of them.
 
-    A person (hand) may let go of an arm at any time. Therefore stability is checked for each
+    A person may let go of an arm at any time. Therefore stability is checked for each
     selection.
 
     Args:

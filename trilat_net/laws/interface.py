@@ -44,7 +44,7 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """Facts about one arm whose gains are tuned, for the method `write_control` of a law.
+    """Facts about one arm, from which a law writes its settings after gains were tuned.
 
     The method `write_control` of a law receives them.
 
@@ -67,10 +67,10 @@ class TuningSite(NamedTuple):
 
 
 class TuningRun(NamedTuple):
-    """Motion of all arms in a run for which gains are tuned, for `target_motion` of a law.
+    """Motion of all arms in a trial run, from which a law computes how they should have moved.
 
-    The method `target_motion` of a law receives it. The run has N sites, n joints per arm, and
-    K times at equal distances.
+    The method `target_motion` of a law receives it, while gains are tuned. The run has N arms,
+    n joints per arm, and K times at equal distances.
 
     Attributes:
         laws: Settings of the law of each arm.
@@ -130,11 +130,11 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def tag(self) -> str:
-        """Name by which a scenario selects the law, for example "p_d"."""
+        """Name by which the description of an experiment selects the law, for example "p_d"."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses gains that contradict each other, and an unsuitable number of arms (sites).
+        """Refuses gains that contradict each other, and an unsuitable number of arms.
 
         Args:
             path: Path of the law's table in the scenario, for errors.
@@ -145,7 +145,9 @@ class LawSettings(Frozen, frozen=True):
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Finds a setting of the law that does not suit the rates of the control loops.
+        """Finds a setting of the law that does not suit the rates of the arms' control loops.
+
+        For example, some laws need equal rates at all arms.
 
         Args:
             rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
@@ -156,10 +158,10 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
-        """Converts the gains of the law to the record that the simulation kernel reads.
+        """Converts the gains of the law to the form that the compiled control loop reads.
 
-        The simulation kernel is the compiled code of the control loop. The default record
-        (`Law.USER`) tells the kernel that the class of the law computes the torque.
+        By default (`Law.USER`), they tell the loop that the Python class of the law computes
+        the torque.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),
@@ -211,7 +213,10 @@ class LawSettings(Frozen, frozen=True):
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates under which gains and delays this control law is stable in a scenario.
+        """Evaluates whether this control law is stable with the gains and delays of a scenario.
+
+        A scenario is the description of an experiment. A law with a known stability condition
+        overrides this method.
 
         Args:
             situation: The site, its peers (the other sites), their laws and the delays between
@@ -281,12 +286,17 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def sends(self) -> SentVectorSpecs:
-        """Vectors that the law sends to its peers besides the motion, by name. Often empty."""
+        """Vectors that the law sends to other arms besides the motion, such as waves, by name.
+
+        Most laws send none.
+        """
         sends = getattr(self.kind, "sends", {})
         return convert_sends(sends, self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
-        """Returns a function that creates the law for one arm (site) before a run.
+        """Returns a function that creates the control law of one arm before a run.
+
+        The law itself is created later, when the facts about the arm are known.
 
         Args:
             sites: Number of sites in the scenario.
@@ -354,7 +364,7 @@ class ControlLaw:
             cls.Settings = _derive_settings(cls, tag)
 
     def __init__(self, facts: LawContext, **gains: Any) -> None:
-        """Creates the law of one arm.
+        """Creates the control law of one arm, with its gains as attributes.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -383,7 +393,9 @@ class ControlLaw:
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Explains to the user why the law cannot be used for the arms of a scenario.
+        """Explains to the user why the law cannot couple the arms of a scenario.
+
+        For example, some laws need exactly one master, which a person moves, and one slave.
 
         Args:
             roles: Role of each site, "master" or "slave".
@@ -554,11 +566,11 @@ def check_law_class(
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
-    """Refuses a class without `torque`, and a class that does not declare its memory.
+    """Refuses a class without a method `torque`, or with a memory that it does not declare.
 
-    The memory of a law is everything that it must know in the next tick, a period of the
-    control loop. It is recorded, so that a run can be verified from any record. A class
-    declares it by `remembers`, or by the methods `memory` and `recall`.
+    The memory of a law is everything that it must know in the next control period. It is
+    logged, so that a run can be verified from any period. A class declares it by `remembers`,
+    or by the methods `memory` and `recall`.
 
     Args:
         kind: The class.

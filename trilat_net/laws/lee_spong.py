@@ -21,10 +21,10 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
 class LeeSpong(ControlLaw):
-    """A spring to the peers, with enough damping for all delays up to a known maximum.
+    """Spring to the other arms, with enough damping for all delays up to a known maximum.
 
     The damping is d = K T_max + P_e, where K is the stiffness of the spring, T_max half of the
-    longest round trip between the sites, and P_e additional damping.
+    longest round trip between the arms, and P_e additional damping.
 
     Source: Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO
     22, 2006.

@@ -73,7 +73,7 @@ class PD(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether the damping suffices for the delays, whatever the arms weigh.
+        """Evaluates whether the damping suffices for the network delays, for arms of any mass.
 
         Args:
             situation: All sites, their laws, the delays, and the weights with which they follow

@@ -100,10 +100,10 @@ class PF(ControlLaw):
         )
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses a scenario that has more or fewer than two sites.
+        """Refuses an experiment that has more or fewer than two arms.
 
-        A site is the process that runs one arm. With several other arms, it would be ambiguous
-        which contact force the master reflects to its user.
+        With several other arms, it would be ambiguous which contact force the master reflects
+        to its user.
 
         Args:
             path: Path of the law's settings in the scenario file, for error messages.
@@ -136,7 +136,7 @@ class PF(ControlLaw):
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Explains to the user why force reflection cannot be used for the sites of a scenario.
+        """Explains to the user why force reflection cannot couple the arms of an experiment.
 
         This law needs exactly one master, the arm that a person moves, and one slave, the arm
         that follows.
@@ -159,10 +159,10 @@ class PF(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+        """Returns the settings of this law for one arm, after its gains were tuned.
 
-        The table depends on the role of the arm, because only the slave has a spring and only
-        the master feels forces.
+        They are the table [control] of a scenario file. It depends on the role of the arm,
+        because only the slave has a spring and only the master feels forces.
 
         Args:
             gains: The tuned gains by name.

@@ -82,7 +82,10 @@ class PdD(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
+        """Evaluates whether the gains of this law are stable with the delays of a scenario.
+
+        The known condition of the law P+d on the stiffness K and the damping d is used. It
+        suffices for constant delays if the ratio Kd / K is the same at all arms.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.

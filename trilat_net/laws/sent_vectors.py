@@ -22,7 +22,9 @@ from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):
-    """Declaration of a vector that a law sends at every tick, see `core.plug.law_channel`.
+    """What a control law declares about a vector that it sends in every control period.
+
+    The length may depend on the arm, which the class of the law does not know.
 
     Attributes:
         unit: Unit of its numbers, as in "J"; "" for dimensionless numbers.
@@ -41,10 +43,9 @@ SentVectorSpecs = dict[str, _SentVectorSpec]
 
 
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
-    """Converts the class variable `sends` of a control law to checked specifications.
+    """Checks what a control law declares to send to other arms, and converts it.
 
-    The variable `sends` declares the vectors that the law sends to the other sites, each with
-    its name, unit and length.
+    The class variable `sends` declares vectors, each with its name, unit and length.
 
     Args:
         sends: Value of the class variable.

@@ -93,12 +93,12 @@ class Tanks(EnergyLaw):
         self.carried = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and sends an energy packet to each peer.
+        """Computes the torque of a control period, and sends energy packets to the other arms.
 
-        The steps of a tick are: book the work of the previous period and the packets that have
-        arrived; send packets; compute the torque of the transparency layer, the springs that
-        couple the sites; reduce it to the energy in the tank, and add damping while the tank is
-        below its level.
+        First, the work of the previous period and the received packets are booked, and packets
+        are sent. Then the torque of the springs that couple the arms is computed, and reduced
+        to what the energy in the tank pays for. Damping is added while the tank is below its
+        level.
 
         Args:
             now: Inputs and outputs of the law in this tick.
@@ -194,16 +194,16 @@ class Tanks(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why this law has no linear analysis (`trilat linear`), for the user."""
+        """Explains to the user why `trilat linear` cannot linearise this law."""
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether the energy tanks keep the session passive.
+        """Evaluates whether the energy tanks keep the coupled arms passive.
 
-        A tank is the amount of energy that the controller of an arm may still spend. In each
-        control period, it sends a fixed part of its content to the other arms. The condition is
-        met if this part is at most 1. Then the session is passive, provided that operators and
-        environments are passive.
+        Passive means that they never give more energy than they received. A tank is the amount
+        of energy that the controller of an arm may still spend. In each control period, it
+        sends a fixed part of its content to the other arms. The condition is met if this part
+        is at most 1, provided that persons and environments are passive.
 
         Args:
             situation: This arm, with the rate of its control loop.

@@ -695,13 +695,13 @@ def _follow_peers(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Couples arms, and limits the energy that each end of a coupling takes out.
+    """Couples arms so that no end of a coupling takes out more energy than was put in.
 
-    A spring K and a damper B move each site towards the integral of the velocities of its peers
-    (the arms that it follows), weighted by the dominance factors, and the peers feel the torque
-    of K and B. With K = 0 and B = 0 a site only leads.
+    The method is time-domain passivity control. A spring K and a damper B move each arm towards
+    the integral of the velocities of the arms that it follows, weighted by the dominance
+    factors, and these arms feel the torque of K and B. With K = 0 and B = 0 an arm only leads.
 
-    Source: Ryu, Artigas and Preusche (2010); for several sites Panzirsch and others (2012).
+    Source: Ryu, Artigas and Preusche (2010); for several arms Panzirsch and others (2012).
 
     Attributes:
         K: Spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
@@ -805,10 +805,10 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)  # inverse of the inertia matrix, row by row
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and sends torques and energies to the peers.
+        """Computes the torque of a control period, and sends torques and energies to others.
 
-        The site first acts as a follower, then as a leader. The torque that the site feels as a
-        leader is reduced if the torque of a joint would otherwise exceed its limit.
+        The arm first acts as a follower, then as a leader. The torque that it feels as a leader
+        is reduced if the torque of a joint would otherwise exceed its limit.
 
         Args:
             now: Inputs and outputs of the law in this tick.
@@ -917,7 +917,7 @@ class Tdpa(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why this law has no linear analysis (`trilat linear`), for the user."""
+        """Explains to the user why `trilat linear` cannot linearise this law."""
         return "its controllers act by energies, which are of second order in the motion"
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002

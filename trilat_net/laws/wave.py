@@ -407,9 +407,9 @@ def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
 
 
 def _find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance that a user stated for the line between two sites.
+    """Returns the impedance that a user stated for the line between two arms.
 
-    A line is the virtual connection over which two sites exchange waves. The order of the two
+    A line is the virtual connection over which two arms exchange waves. The order of the two
     names does not matter.
 
     Args:
@@ -677,11 +677,10 @@ class Wave(EnergyLaw):
         )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Finds a setting that prevents the use of this law in a scenario.
+        """Finds a setting that prevents the use of this law in an experiment.
 
-        Each line that the settings name must join two sites of the scenario, for example
-        "m1-s". All sites must have the same rate of the control loop, because one wave is sent
-        per period.
+        Each line that the settings name must join two arms of the experiment, for example
+        "m1-s". All control loops must have the same rate, because one wave is sent per period.
 
         Args:
             rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
@@ -916,12 +915,12 @@ class Wave(EnergyLaw):
         form.add(sent, received, 1.0)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether the law keeps the session passive.
+        """Evaluates whether the law keeps the coupled arms passive.
 
-        The law is passive for any delays and lost messages, if operators and environments are
-        passive. The text also states with which weight this site, the process of one arm,
-        follows each other site. The weights are proportional to the impedances of the lines,
-        over which the sites exchange waves.
+        Passive means that they never give more energy than they received. This holds for any
+        delays and lost messages, if persons and environments are passive. The text also states
+        with which weight each arm follows the others. The weights are proportional to the
+        impedances of the lines, the virtual connections over which arms exchange waves.
 
         Args:
             situation: The site and the other sites.

@@ -45,7 +45,10 @@ def make_own_instance(
 
 
 def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
-    """Refuses arguments that a user's class does not accept, before an object is created.
+    """Refuses arguments in a scenario that a user's class does not accept.
+
+    The check compares them with the constructor of the class, before an object is created, so
+    that the error names the wrong key of the scenario.
 
     Args:
         kind: The class, whose first argument is for the facts about the site.
@@ -92,13 +95,13 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
 
 
 def _describe_class(kind: Any, code: str) -> str:
-    """Returns the name of a class, with the file of its `__init__` in parentheses."""
+    """Returns the name of a user's class with the file of its constructor, for errors."""
     file = getattr(getattr(kind.__init__, "__code__", None), "co_filename", "")
     return f"{code} ({file})" if file else code
 
 
 def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
-    """Checks that a value in a scenario has the type of an argument of a user's class.
+    """Checks that a value has the type which a user's class expects for an argument.
 
     The type is that of the annotation. Without an annotation, it is the type of the default,
     and only a text in place of a number, or the reverse, is refused: the class may accept lists

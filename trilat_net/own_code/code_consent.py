@@ -48,7 +48,7 @@ LawFiles = str | Path | Sequence[str | Path]
 
 
 def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[NamedCode]:
-    """Returns the users' classes that scenarios name, and that would run with them.
+    """Returns the users' Python classes that experiments name, and that would run with them.
 
     These are control laws, operators (programs that move an arm) and plants (programs that
     compute the motion of an arm).
@@ -84,10 +84,10 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: ScenarioWithCode | None = None,
 ) -> AnyScenario:
-    """Allows the code that a scenario names to run, because a user of this process named it.
+    """Permits users' classes to run, because a user of this process has named them.
 
-    The program runs users' classes only with permission, since a scenario from elsewhere may
-    name harmful code.
+    Code that nobody has named or permitted is refused, since the description of an experiment
+    that comes from elsewhere may name harmful code.
 
     Args:
         scenario: Scenario that names the code.
@@ -116,7 +116,7 @@ def allow_own_code(
 
 
 class _RememberedFile(msgspec.Struct):
-    """File with a user's code for which a person has stored a permission to run.
+    """File with a user's code that a person has permitted to run, as stored on disk.
 
     Attributes:
         file: Path of the file.
@@ -177,7 +177,9 @@ def allow_logged_code(
 
 
 def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Makes the stored arguments available to the messages about refused code.
+    """Loads with which arguments stored permissions were given.
+
+    Messages about code that is refused then say which arguments differ.
 
     Args:
         remembered: Stored permissions, by the hash of the file.
@@ -191,21 +193,21 @@ def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None
 
 
 def _class_of(key: CodeKey) -> str:
-    """Returns the name of the class, without its module."""
+    """Returns the name of a user's class without its module: "Law" for "package.module:Law"."""
     return key.code.partition(":")[2]
 
 
 def _find_store() -> Path:
-    """Returns the path of the file in which permissions are stored."""
+    """Returns the path of the file with the permissions of this user to run code of others."""
     folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(folder, "trilat-net", "laws.json")
 
 
 def _read_store() -> dict[str, _RememberedFile]:
-    """Returns the stored permissions, by the hash of the file.
+    """Returns the permissions to run code that this user has stored, by the hash of the file.
 
-    If there is no store, or it cannot be read, there are no permissions. Earlier versions of
-    the program stored only the path of a file; such an entry permits nothing.
+    If nothing was stored, or the file cannot be read, there are no permissions. Earlier
+    versions of the program stored only the path of a file; such an entry permits nothing.
     """
     # A RuntimeError is raised if the user has no home folder.
     with suppress(OSError, ValueError, RuntimeError):
@@ -220,7 +222,7 @@ def _read_store() -> dict[str, _RememberedFile]:
 
 
 def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Writes the stored permissions."""
+    """Writes all permissions to run code to the user's file, in place of the earlier ones."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
     store = _find_store().resolve()
@@ -230,7 +232,7 @@ def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
 def _allow_file(
     file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Allows a file to run as code that a log names.
+    """Permits a file that the user names to run as code that a log names.
 
     The file belongs to the code that has the hash of the file. If there is no such code, it
     belongs to the code whose module has the name of the file; it is then another version of
@@ -272,12 +274,15 @@ def _allow_file(
 
 
 def _compare_hashes(key: CodeKey, sha256: str) -> str:
-    """Returns the beginning of a file's hash, and of the hash that the log states."""
+    """Returns the first digits of a file's hash and of the hash in a log, for a message.
+
+    Different digits show the user that the file is not the version that the log names.
+    """
     return f"its sha256 is {sha256[:16]}, but was {key.sha256[:16]}"
 
 
 class _LoggedUserLaw(NamedTuple):
-    """Control law of a user that a log names, and whether it may run on this computer.
+    """Control law that a log names and that is a user's class, with its permission to run.
 
     Attributes:
         code: Class of the law, for example "package.module:Law".
@@ -301,7 +306,7 @@ class _LoggedUserLaw(NamedTuple):
     other_settings: str = ""
 
     def __str__(self) -> str:
-        """Returns a sentence about the law, with the option that allows it to run."""
+        """Returns a sentence about the control law, with the option that permits it to run."""
         law = f"{self.code} of {', '.join(self.sites)}"
         settings = f" with {self.settings}" if self.settings else ""
         file_state = "is the one that ran"
@@ -320,10 +325,9 @@ class _LoggedUserLaw(NamedTuple):
 
 
 def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
-    """Returns the control laws in a scenario that are users' classes.
+    """Returns the control laws in an experiment that are users' classes, without running them.
 
-    None of their code is run. Each entry tells whether the law may run, and which file would be
-    used.
+    Each entry tells whether the law may run, and which file would be used.
 
     Args:
         scenario: Scenario of a log.
@@ -339,10 +343,10 @@ def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
 
 
 def may_run_user_laws(scenario: ScenarioWithCode) -> bool:
-    """Returns True if every control law in a scenario that is a user's class may run.
+    """Returns True if every control law in an experiment that is a user's class may run.
 
-    Whoever permitted the laws of a log also permitted what repeats its run: twins, roots and
-    the energies that the laws declare.
+    Whoever permitted the laws of a log also permitted what computes its run again, for example
+    copies of the run that start slightly displaced (twins).
 
     Args:
         scenario: Scenario of a log.

@@ -94,31 +94,35 @@ class NamedCode(Protocol):
 
 
 class _SiteWithCode(Protocol):
-    """Interface of a site (arm controller) of a scenario whose parts may be classes of users.
+    """Interface of the part of a scenario that describes one arm and the users' classes for it.
 
-    These parts are its control law, its operators and its plant. The checks of permissions look
-    for users' classes here, without importing the types of scenarios.
+    These are its control law, the programs that move the arm, and the model of the arm. The
+    checks of permissions search here for users' classes, without importing the scenario's
+    types.
     """
 
     @property
     def control(self) -> Any:
-        """Control law of the site."""
+        """Control law of the arm, possibly a user's class."""
 
     @property
     def hands(self) -> Sequence[Any]:
-        """Operators who move the arm of the site."""
+        """Persons and programs who move the arm. A program may be a user's class."""
 
     @property
     def plant(self) -> Any:
-        """What computes the motion of the arm."""
+        """What computes or measures the motion of the arm, possibly a user's class."""
 
 
 class ScenarioWithCode(Protocol):
-    """Interface of a scenario, the description of an experiment, that may name classes."""
+    """Interface of a scenario, the description of an experiment, which may name users' classes.
+
+    Only the attributes are listed that the checks of permissions need.
+    """
 
     @property
     def sites(self) -> Mapping[str, _SiteWithCode]:
-        """The sites, each of which is a process that controls one arm, by name."""
+        """Description of each arm's process (site), by name."""
 
 
 ANY_SETTINGS = "*"
@@ -147,7 +151,9 @@ class CodeKey(NamedTuple):
 
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
-        """Returns the identification under which a user's class may be permitted to run.
+        """Returns the key under which a user's class may be permitted to run.
+
+        The key consists of the class, the hash of its file and its arguments.
 
         Args:
             named: Entry of a scenario that names the class: a control law, an operator or a
@@ -161,7 +167,7 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission of a person to run the code of one file, which a scenario names.
+    """Permission of a person to run the code of one Python file, which a scenario names.
 
     Attributes:
         file: Path of the file. If None, it is the file that Python's import finds for the
@@ -185,7 +191,9 @@ what differs if code is refused; they permit nothing.
 
 
 def find_consent(key: CodeKey) -> CodeConsent | None:
-    """Looks up whether a user's code may run with its arguments.
+    """Returns the permission under which a user's class may run with its arguments.
+
+    The result is None if nobody has permitted the class, its present file or its arguments.
 
     Args:
         key: Class, hash of its file and arguments.
@@ -296,7 +304,10 @@ _executed: dict["_CodeSource", Any] = {}
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
-    """Control law of a scenario that is a user's class.
+    """Control law of a scenario whose torques a user's Python class computes.
+
+    The scenario names the class and the hash of its file. It does not import the class, so that
+    a scenario of a stranger can be read without running any code of it.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
@@ -385,7 +396,7 @@ def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
 
 
 def _find_file(code: str, path: str) -> Path:
-    """Returns the file that Python's import finds for the module of a class.
+    """Returns the file from which Python would import the module of a user's class.
 
     Raises:
         ScenarioError: There is no such module, or it is not a file.
@@ -518,9 +529,10 @@ PAGES = {
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Refuses a file that does not define a certain class with a certain method.
+    """Checks that a Python file defines a certain class with a certain method.
 
-    The check reads the syntax of the file, and runs no code of it.
+    The check reads the syntax of the file and runs no code of it, because nobody may have
+    permitted the code yet.
 
     Args:
         source: File, as it was read from disk.
@@ -641,7 +653,9 @@ def name_law_classes(value: Any) -> Any:
 
 @contextmanager
 def _searching(folder: Path | None) -> Iterator[None]:
-    """Makes Python search a folder for modules before all others, inside the `with` block.
+    """Makes Python search one folder for modules before all others, inside the `with` block.
+
+    A user's class can thus import other files that lie beside its own file.
 
     Args:
         folder: The folder. None for the working directory, unless Python searches it already.

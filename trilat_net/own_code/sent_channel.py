@@ -45,7 +45,10 @@ def build_channel(sends: SentVectorSpecs, layout: Layout, peers: int) -> LawChan
 
 
 def check_sends(channel: LawChannel, joints: int, path: str) -> None:
-    """Checks the names and the total length of the vectors that a control law sends.
+    """Checks the vectors that a control law declares to send: their names and total length.
+
+    The vectors travel in each network message between arms, and a long message would take too
+    much time.
 
     Args:
         channel: All vectors that the law sends to other sites (arm controllers).
@@ -107,7 +110,10 @@ def _find_name_problem(name: str) -> str:
 
 
 def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
-    """Returns the classes at the top level of a file, by name, without running the file.
+    """Returns the classes in a Python file by name, without running the file.
+
+    Only classes at the top level are included. The syntax tree is read, because nobody may have
+    permitted the code yet.
 
     Args:
         source: Content of the file.

@@ -173,9 +173,10 @@ CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
-    """Coordinates in which arms follow each other: joint angles, positions or poses.
+    """Coordinates in which the arms of a session follow each other.
 
-    A site is a process that runs one arm, and its peers are the other sites.
+    They are joint angles, positions of the end effectors, or whole poses. Arms with different
+    numbers of joints can only follow each other's positions or poses.
 
     Attributes:
         space: "joints": The sites share joint angles. "position": They share the positions of
@@ -198,9 +199,10 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of coordinates that sites share in task space: 3 for positions, 6 for poses.
+        """Number of coordinates of the end effector that arms send each other: 3 or 6.
 
-        It is 0 if the sites share joint angles, whose number depends on the arm.
+        These are 3 for a position and 6 for a pose. The number is 0 if they send joint angles
+        instead, because the count of joints depends on the arm.
         """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
@@ -257,9 +259,9 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 class ArmModel(NamedTuple):
-    """Model of an arm with n joints, from which dynamics and kinematics are computed.
+    """Model of an arm with n joints, which computes positions, Jacobians and inertias.
 
-    `build_arm` creates the model from the table of the arm in a scenario.
+    `build_arm` creates it from the table of the arm in a scenario.
 
     Attributes:
         theta: True inertial parameters: the five of Eq. (24) for the planar arm, ten per link
@@ -321,9 +323,9 @@ class ArmModel(NamedTuple):
         return self._replace(chain=self.chain._replace(joints=tuple(joints)))
 
     def joint_units(self, unit: str) -> list[str]:
-        """Returns the unit of a quantity for each joint.
+        """Returns the unit of a quantity for each joint, for example ["rad", "m"].
 
-        A prismatic joint has m in place of rad, and N in place of N m.
+        A joint that slides (prismatic) has m in place of rad, and N in place of N m.
 
         Args:
             unit: Unit of the quantity for a rotating joint, for example "rad/s".
@@ -336,7 +338,7 @@ class ArmModel(NamedTuple):
         ]
 
     def end_effector(self, q: Vector) -> list[float]:
-        """Returns the position of the end effector in the pose `q`, in m.
+        """Returns the position of the end effector at the joint angles `q`, m.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -354,14 +356,14 @@ class ArmModel(NamedTuple):
         return list(place_end_effector(self._place_links(q), np.array(self.chain.tip_m)))
 
     def _place_links(self, q: Vector | Array) -> RowArray:
-        """Returns the kernel's rows of a chain, with all links placed in the pose `q`."""
+        """Returns the data of a chain's joints, with all links placed at the angles `q`."""
         assert self.chain is not None
         rows = build_chain(self.chain.joints)
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return rows
 
     def end_effector_orientation(self, q: Vector) -> tuple[float, float, float]:
-        """Returns the orientation of the end effector in the pose `q`.
+        """Returns the orientation of the end effector at the joint angles `q`.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -401,10 +403,10 @@ class ArmModel(NamedTuple):
         return HandReach(joints[0].origin_m, inner_m, outer_m)
 
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
-        """Returns the range of each joint that its mechanical stops and position limits permit.
+        """Returns the range in which each joint of the arm may move.
 
-        The stops belong to the arm, and the limits to the scenario. The narrower of both
-        counts.
+        The mechanical stops of the arm and the position limits of the experiment both bound it;
+        the narrower of both counts.
 
         Args:
             limits: Position limits of the site that runs the arm.
@@ -419,10 +421,7 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the sites share the position or pose of their end effectors (task space).
-
-        Otherwise they share their joint angles.
-        """
+        """True if the arms follow each other's end effectors, and not each other's joints."""
         return self.chain is not None and self.chain.task is not None
 
     @property
@@ -436,11 +435,10 @@ class ArmModel(NamedTuple):
         return () if task is None else task.axes
 
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
-        """Returns the coordinates that a site publishes for its peers in the pose `q`.
+        """Returns the coordinates that an arm sends to the others in the pose `q`.
 
-        These are the joint angles, or the position of the end effector multiplied by the scale
-        of the task. If the sites share poses, the orientation as a rotation vector in rad
-        follows.
+        These are the joint angles, or the position of the end effector multiplied by a scale.
+        If whole poses are sent, the orientation as a rotation vector in rad follows.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -455,7 +453,8 @@ class ArmModel(NamedTuple):
     def task_jacobian(self, q: Vector) -> Array:
         """Returns the Jacobian J that converts joint velocities to task velocities: xd = J qd.
 
-        Task coordinates are those that sites share if their end effectors follow each other.
+        Task coordinates describe the end effector, if the arms follow each other's end
+        effectors.
 
         Args:
             q: Joint angles in rad, or m for a prismatic joint, shape (n,).
@@ -532,7 +531,7 @@ def _is_positive_definite(theta: Array) -> bool:
 
 
 def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool) -> ArmModel:
-    """Converts the table of an arm in a scenario to a model for computation.
+    """Builds the model of an arm from its table in a scenario, to compute its dynamics.
 
     Args:
         arm: Table of the arm, with its lengths and masses or the name of its URDF file.
@@ -592,9 +591,10 @@ def _list_planar_bodies(arm: Arm) -> Array:
 
 
 def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
-    """Returns the planar arm as a chain.
+    """Returns the planar arm of two links as a general chain of joints.
 
-    Its joints rotate about z, and gravity acts along -y.
+    The planar arm can then be simulated together with arms from URDF files. Its joints rotate
+    about z, and gravity acts along -y.
     """
     shoulder = ChainJoint(
         prismatic=False, axis=(0.0, 0.0, 1.0), rotation=_IDENTITY, origin_m=(0.0, 0.0, 0.0)
@@ -606,6 +606,9 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
 
 def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
     """Reads the joints between the base and the tip of an arm from its URDF file.
+
+    URDF is the usual XML format for the links and joints of a robot. Nothing is read from disk
+    here: the texts of the files are an argument.
 
     Args:
         arm: Table of the arm in the scenario, which names the file, the base and the tip.
@@ -674,7 +677,7 @@ def _read_cached(
 def _place_base(
     arm: Arm, joints: tuple[ChainJoint, ...], gravity: Three
 ) -> tuple[tuple[ChainJoint, ...], Three]:
-    """Expresses the joints of a chain, and gravity, in the frame that all sites share.
+    """Expresses the joints of an arm, and gravity, in a frame that is common to all arms.
 
     The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll). Only the first joint changes,
     because the others are expressed in the frame of the joint before them.
@@ -702,7 +705,7 @@ def _place_base(
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
-    """Returns the model of an arm whose chain has been read from its file.
+    """Builds the model of an arm from the joints that were read from its URDF file.
 
     Raises:
         ScenarioError: The number of drive inertias differs from that of the joints.
@@ -741,10 +744,11 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Returns a joint as the record that the simulation kernel reads.
+    """Converts a joint of a URDF file to the form that the compiled simulation reads.
 
-    A stop is a spring that pushes with the effort limit of the joint at the depth
-    `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the stiffness.
+    The ends of the joint's range become stops: a spring that pushes with the effort limit of
+    the joint at the depth `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the
+    stiffness.
 
     Args:
         joint: Joint from the file.
@@ -870,7 +874,11 @@ def bound_estimates(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float
 def _bound_planar_parameters(
     arm: ArmModel, limit_nm: Vector, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the five parameters of Eq. (24), shape (5,) each."""
+    """Returns lower and upper bounds of the planar arm's five parameters, shape (5,) each.
+
+    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
+    Eq. (24) defines the parameters.
+    """
     T_1, T_2 = np.broadcast_to(limit_nm, 2)
     outer = min(T_1, T_2) / g_m_s2
     inner = T_1 / g_m_s2
@@ -883,7 +891,10 @@ def _bound_planar_parameters(
 def _bound_chain_parameters(
     arm: ArmModel, chain: ChainSetup, limit_nm: float, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each."""
+    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each.
+
+    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
+    """
     joints = arm.counts.joints
     reach_m = sum(float(np.linalg.norm(joint.origin_m)) for joint in chain.joints)
     reach_m += float(np.linalg.norm(chain.tip_m))

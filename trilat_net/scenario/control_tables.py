@@ -21,7 +21,10 @@ _DEFAULT_LAW = "adaptive"
 def complete_control(
     written: TomlTable, common: TomlTable, path: str, counts: VectorCounts
 ) -> TomlTable:
-    """Returns the complete table of a control law and its gains.
+    """Returns the table of a control law in which every gain has a value.
+
+    Gains that the author of the scenario left out get their defaults, and a single number
+    becomes a vector with one number per joint.
 
     Args:
         written: Table `control` of a site as its author wrote it.

@@ -72,11 +72,10 @@ _ZIPPED_KINDS = {
 
 
 def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
-    """Decodes the content of a text file.
+    """Decodes the bytes of a text file, and refuses files that are not text.
 
-    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it.
-
-    Some bytes at the start of the content, such as a byte order mark, show the encoding.
+    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it; the first bytes of the
+    file, such as a byte order mark, tell which of them.
 
     Args:
         raw: Content of the file.
@@ -116,7 +115,7 @@ def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
 
 
 def _describe_kind(kind: str) -> str:
-    """Returns the problem of a file that is not text, and what the user can do about it.
+    """Explains to the user that a file is not text, and how to get a text file from it.
 
     Args:
         kind: The kind of file, with its article, as in "a PDF document".
@@ -126,9 +125,10 @@ def _describe_kind(kind: str) -> str:
 
 
 def _read_csv(path: Path) -> list[TracePoint]:
-    """Returns the points of a CSV file with the columns `t_s,delay_ms`.
+    """Reads a delay trace, a table of sending times and delays, from a CSV file.
 
-    A header line is optional. Empty lines, and lines that start with "#", are ignored.
+    The columns are `t_s,delay_ms`. A header line is optional. Empty lines, and lines that start
+    with "#", are ignored.
 
     Raises:
         ValueError: A line does not contain a time and a delay.
@@ -156,7 +156,7 @@ def _read_csv(path: Path) -> list[TracePoint]:
 
 
 def _is_number(cell: str) -> bool:
-    """True if a cell contains a number."""
+    """Returns True if a cell of a table contains a number."""
     try:
         float(cell)
     except ValueError:
@@ -192,11 +192,11 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns a delay trace as the string that a scenario contains.
+    """Returns recorded delays as the text by which an experiment contains them.
 
-    A delay trace is a table of send times and the delay that each message had. The form of the
-    text is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the
-    delay of a lost message. Times count from the first point.
+    The recording is a table of sending times and delays. The form of the text is "t_us
+    delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the delay of a lost
+    message. Times count from the first point.
 
     Args:
         points: Send time in s and delay in ms of each message. A lost message has an infinite
@@ -303,9 +303,9 @@ _DELAY_NAMES = ("delay", "rtt", "latency")
 
 @dataclass(frozen=True, repr=False)
 class MeasuredTrace(Result):
-    """Delays of a real network, imported from the output of a measurement.
+    """Delays of a real network, imported from the output of a measuring program.
 
-    `import_trace` returns it. A link of a scenario can then have the same delays.
+    `import_trace` returns them. A simulated network link can then repeat the same delays.
 
     Attributes:
         points: Send time of each message since the first one in s, and its delay in ms. The
@@ -487,7 +487,7 @@ def import_trace(
 
 
 class _Measurement(NamedTuple):
-    """Messages that a file of a measurement contains.
+    """Messages whose round trips or delays a measuring program has written to a file.
 
     Attributes:
         samples: Send time of each message in s, and its delay in ms.
@@ -501,10 +501,10 @@ class _Measurement(NamedTuple):
 
 
 def _build_trace(measurement: _Measurement) -> MeasuredTrace:
-    """Returns the trace of a measurement.
+    """Converts a measurement of a network to a delay trace, which a simulated link can repeat.
 
-    The messages are sorted by their send times, which then count from the first one. Of several
-    messages with the same time in microseconds, only the first is kept.
+    The messages are sorted by their sending times, which then count from the first one. Of
+    several messages with the same time in microseconds, only the first is kept.
 
     Raises:
         ValueError: There are no messages, or a delay is negative.
@@ -575,7 +575,9 @@ def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
 
 
 def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
-    """Returns the messages in the output of `ping` or `fping`, see `ping_output`.
+    """Reads the round trips of messages from the output of the programs `ping` or `fping`.
+
+    `ping_output` explains the forms of this output.
 
     Args:
         text: The output.
@@ -641,12 +643,12 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
 
 
 def _split_cells(line: str, separator: str | None) -> list[str]:
-    """Returns the cells of a line. Without a separator, white space separates them."""
+    """Splits a line of a table into cells, at white space if there is no separator."""
     return [cell.strip() for cell in line.split(separator)]
 
 
 def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
-    """Finds a column by the header line of a table.
+    """Finds which column of a table contains a quantity, by the names in the header line.
 
     Args:
         cells: Cells of the header line.

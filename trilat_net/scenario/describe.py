@@ -58,12 +58,12 @@ IRREVERSIBLE_SHARES = (
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """True if the dominance factors of a scenario are irreversible.
+    """Returns True if the weights with which arms follow each other are irreversible.
 
-    The dominance factor alpha_ij is the weight with which site i follows site j. The factors
-    are reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric,
-    where I is the identity matrix. Some stability conditions require this. The result is False
-    if a control law exchanges more than positions or does not compensate gravity, because the
+    The weight alpha_ij (dominance factor) states how much arm i follows arm j. The weights are
+    reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric, where I
+    is the identity matrix. Some stability conditions require this. The result is False if a
+    control law exchanges more than positions or does not compensate gravity, because the
     condition does not apply then.
     """
     laws = [spec.control for spec in scenario.sites.values()]
@@ -73,9 +73,10 @@ def lacks_detailed_balance(scenario: Scenario) -> bool:
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link in s, as `LawSituation.delay_s` contains it.
+    """Returns the delay of every network link in s, for the stability conditions.
 
-    A constant delay is rounded up to whole ticks of the receiver. The other delays are NaN.
+    A constant delay is rounded up to whole control periods of the receiver. Delays that vary
+    are NaN.
 
     Args:
         links: Links by name.
@@ -99,9 +100,10 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
 
 
 def _find_hold_time(scenario: Scenario) -> float:
-    """Returns the time for which a torque is held, in s.
+    """Returns for how long the torque of an arm is held constant, in s.
 
-    The time is 0 if the scheme is not digital, and NaN if the tick rates of the sites differ.
+    This is the control period for the integration scheme "digital", and 0 for other schemes. It
+    is NaN if the control loops of the arms have different rates.
     """
     if scenario.scheme != "digital":
         return 0.0
@@ -148,10 +150,10 @@ _TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
 
 
 def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each site, its control law, and the facts on which its stability depends.
+    """Yields each arm with its control law and the facts on which its stability depends.
 
-    The facts, such as delays, dominance factors and tick rates, are the input of the stability
-    condition that a law may have.
+    The facts are delays, the rates of the control loops, and the weights with which the arms
+    follow each other. A law with a stability condition evaluates it from them.
     """
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
@@ -213,9 +215,10 @@ def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> 
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about sites whose dominance factors have no effect.
+    """Returns lines about arms for which the weights in the scenario have no effect.
 
-    Some control laws determine themselves how the sites share authority.
+    The weights (dominance factors) state how much an arm follows each of the others. Some
+    control laws determine by other settings how the arms share authority.
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
@@ -295,7 +298,7 @@ def _describe_real_arms(scenario: Scenario) -> list[str]:
 
 
 def _format_per_joint(values: Any, units: Sequence[str]) -> str:
-    """Returns a quantity of each joint as text, once if it is the same for all joints."""
+    """Formats a quantity that each joint has, and writes it once if all joints agree."""
     texts = [f"{value:g}" for value in np.broadcast_to(values, len(units))]
     return _join_equal(texts, units)
 
@@ -312,9 +315,9 @@ def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
 
 
 def _describe_links(scenario: Scenario) -> list[str]:
-    """Returns a line for each link, or one line if all links are equal.
+    """Returns a line of text for each network link, or a single line if all links are equal.
 
-    Lines about views follow.
+    Further lines state with which delay the users see the other arms (views).
     """
     descriptions = {name: link.describe() for name, link in scenario.links.items()}
     if len(set(descriptions.values())) > 1:
@@ -328,7 +331,10 @@ def _describe_links(scenario: Scenario) -> list[str]:
 
 
 def _describe_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about the weights that follow from the matrix of dominance factors."""
+    """Returns lines about what follows from the weights with which arms follow each other.
+
+    The weights form the matrix of dominance factors.
+    """
     beta = scenario.beta
     weights = "none: alpha is reducible, some site's weight is zero"
     if beta is not None:
@@ -382,7 +388,10 @@ def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
 
 
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns each different arm with a URDF file, and the names of the sites that have it."""
+    """Returns each different arm that is read from a URDF file, with the names of its users.
+
+    The users are sites, the processes of the arms. URDF is an XML format for robots.
+    """
     groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:
@@ -422,7 +431,10 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
 
 
 def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences about the joints of a site that start beyond a stop in their file."""
+    """Returns sentences about joints of an arm that start beyond a stop of the URDF file.
+
+    A real arm at rest may stand a little beyond the nominal position of a stop.
+    """
     spec = scenario.sites[name]
     units = scenario.arms[name].joint_units("rad")
     joints = read_arm(spec.arm, scenario.urdf).joints
@@ -438,7 +450,10 @@ def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences about the joints of a site that start beyond a position limit."""
+    """Returns sentences about joints of an arm that start beyond a position limit.
+
+    The limit is moved for the run, so that the arm does not stop at once.
+    """
     spec = scenario.sites[name]
     model = scenario.arms[name]
     units = model.joint_units("rad")
@@ -462,7 +477,7 @@ def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
-    """Returns lines about the sites that share the position or pose of their end effectors."""
+    """Returns lines about the arms that follow each other's end effectors, not joints."""
     lines = []
     for name, model in scenario.arms.items():
         if not model.shares_pose:
@@ -483,10 +498,10 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
 
 
 def _describe_silences(scenario: Scenario) -> list[str]:
-    """Returns lines about how often sites will have to wait for late samples of their peers.
+    """Returns lines about how often arms will have to wait for late messages from others.
 
-    This concerns sites with the stale rule "glide". The number of waits is computed with the
-    delays and losses that the links will draw in the run.
+    Only arms under the rule "glide" wait: they come to rest meanwhile. The number is computed
+    with the delays and losses that the network links will draw in the run.
     """
     lines = []
     for name, spec in scenario.sites.items():
@@ -519,9 +534,9 @@ def _describe_silences(scenario: Scenario) -> list[str]:
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns lines about how arms with the stale rule "glide" come to rest.
+    """Returns lines about how arms come to rest while another arm is silent (rule "glide").
 
-    Sites with the same text share a line.
+    Arms with the same text share a line.
     """
     owners: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():
@@ -533,7 +548,7 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns the facts about the stop of a site's arm, as predicates for a sentence.
+    """Returns what happens if an arm is stopped, as ends of sentences.
 
     They say when the arm comes to rest, and whether its motors are strong enough.
     """
@@ -571,7 +586,7 @@ _SOME_LINKS = "link "
 
 
 class ScenarioDifference(NamedTuple):
-    """One key in which several experiments differ, as a row of a comparison.
+    """Key with different values in several experiments, as a row of a table that compares them.
 
     Attributes:
         key: Dotted path of the key, without `sites.NAME` for a key of a site.
@@ -586,16 +601,18 @@ class ScenarioDifference(NamedTuple):
 
     @property
     def concerns_link(self) -> bool:
-        """True if the difference is one of links, as in "every link" or "link m1->s"."""
+        """True if the differing key belongs to a network link, such as "link m1->s"."""
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
-        """Returns the key and the sites."""
+        """Returns the key that differs, with the names of the arms for which it does."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
 
 
 def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the keys in which several experiments differ, including keys that only some have.
+    """Finds the settings in which several experiments differ.
+
+    Settings that only some of the experiments have are included.
 
     Args:
         scenarios: Descriptions of at least two experiments.
@@ -625,14 +642,15 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
 
 
 def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    """Returns a table without some keys."""
+    """Returns a copy of a table without certain keys."""
     return {key: value for key, value in table.items() if key not in keys}
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    """Returns the differences between tables with the same keys.
+    """Returns the differences between several tables of scenarios, key by key.
 
-    If they contain control laws of different kinds, the laws are compared as a whole.
+    If they contain control laws of different kinds, the laws are compared as a whole, because
+    their gains have different meanings.
     """
     laws = {table.get("control", {}).get("law") for table in tables}
     if len(laws) > 1:
@@ -651,7 +669,10 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the differences between links. Links with the same difference share an entry."""
+    """Returns the differences between the network links of several experiments.
+
+    Links with the same difference share an entry.
+    """
     names_by_values: dict[tuple[str, ...], list[str]] = {}
     common_names = list(scenarios[0].links)
     for other in scenarios[1:]:
@@ -690,7 +711,7 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns the name of a control law and its gains as a short text for the user.
+    """Returns the name and gains of a control law as a short text, as in "p_d (K 20, d 4)".
 
     Args:
         control: Table of the law in a scenario.

@@ -35,7 +35,9 @@ DISTRIBUTION_FORM = "must be { normal = [mean, deviation] } or { uniform = [low,
 
 
 class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """The two kinds of random distribution that a number in a scenario may have.
+    """Keys of a table that states a random distribution in place of a number.
+
+    The distribution is either normal or uniform, for example `{ uniform = [1, 2] }`.
 
     Attributes:
         normal: Mean and standard deviation of a normal distribution. None for other kinds.
@@ -47,9 +49,10 @@ class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
 
 class StatedDistribution(_DistributionKeys, frozen=True):
-    """Table that the author of a scenario wrote in place of a number, to draw it at random.
+    """Table in a scenario that states a random distribution in place of a number.
 
-    It states either a normal or a uniform distribution, see `_DistributionKeys`.
+    Each seed then gives another number. The distribution is normal or uniform, see
+    `_DistributionKeys`.
     """
 
     def __post_init__(self) -> None:
@@ -111,7 +114,7 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
 
 
 def has_distribution(value: Any) -> bool:
-    """Returns True if a value of a scenario is a distribution, or a list that contains one."""
+    """Returns True if a value of a scenario is a random distribution, or a list with one."""
     entries = value if isinstance(value, list) else [value]
     return any(map(is_distribution, entries))
 
@@ -129,10 +132,10 @@ def dotted_key(path: str) -> str:
 
 
 class Draws:
-    """Draws the numbers of one scenario that are given as distributions.
+    """Draws the numbers of a scenario whose author stated random distributions.
 
-    It also remembers them, so that a resolved scenario can state both the numbers and their
-    distributions.
+    It also remembers them, so that the resolved scenario, in which every value is a number,
+    states their distributions too.
 
     Args:
         seed: Seed of the scenario.
@@ -164,7 +167,7 @@ class Draws:
         return {key: self._draw_entry(value, f"{path}.{key}") for key, value in table.items()}
 
     def _draw_entry(self, value: Any, path: str) -> Any:
-        """Returns the number in place of a distribution.
+        """Returns a value of a table, with a drawn number in place of a distribution.
 
         A number that was drawn from a distribution before is drawn again, because the seed may
         have changed. Other values are returned unchanged.
@@ -219,7 +222,7 @@ class Draws:
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
-    """Returns the distribution that a table states. Its value is not drawn yet.
+    """Reads a random distribution from a table of a scenario; no number is drawn from it yet.
 
     Raises:
         ScenarioError: The table does not state a distribution.

@@ -16,9 +16,9 @@ from .scenario_types import Change
 def describe_event(kind: str, text: str, command: str) -> str:
     """Returns the sentence that describes an event of a log to people.
 
-    Older versions of the program published the JSON text of a change of a link or site, in
-    place of a sentence. For such an event, the sentence is composed here, so that old and new
-    logs read alike. All other texts are returned unchanged.
+    Older versions of the program logged the JSON text of a change in place of a sentence. For
+    such an event, the sentence is composed here, so that old and new logs read alike. All other
+    texts are returned unchanged.
 
     Args:
         kind: Kind of the event, a short name for programs.

@@ -36,7 +36,10 @@ ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
 class _RunPart(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Keys of a window that do not depend on the number of joints, see `ExpectWindow`."""
+    """Keys for a part of a run (window) that are the same for every arm, see `ExpectWindow`.
+
+    The other keys name a joint, so they depend on the number of joints.
+    """
 
     from_s: WindowTime
     to_s: WindowTime
@@ -59,11 +62,11 @@ else:
 
 
 class ExpectWindow(_JointPart, frozen=True, kw_only=True):
-    """Expectations of a part of a run, which a test of the scenario checks.
+    """Expected ranges of quantities in a part of a run, which a test checks.
 
     For each quantity, the smallest and the largest permitted value may be stated. The force of
     the walls is computed from the logged state. It is the force along the normal, added up over
-    the walls of the scenario. If a run ends before the window ends, the quantities are not
+    the walls of the experiment. If a run ends before the window ends, the quantities are not
     measured, and the expectations count as not satisfied.
 
     Attributes:
@@ -112,9 +115,9 @@ _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
 def window_quantities(joints: int) -> tuple[str, ...]:
-    """Returns the names of the quantities that a window may limit.
+    """Returns the names of the quantities that can be limited in a part of a run (window).
 
-    A window is a part of a run for which a scenario states permitted values.
+    They include quantities of each joint, so their number depends on the arm.
 
     Args:
         joints: Number of joints of the arm, which decides how many quantities such as q1_rad
@@ -180,7 +183,9 @@ def number_window_joints(
 
 
 def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlTable:
-    """Returns a window in which the keys contain numbers of joints instead of names.
+    """Returns a table in which names of joints in the keys are replaced by their numbers.
+
+    For example, "q_elbow_rad" becomes "q3_rad" if the elbow is the third joint of the arm.
 
     Args:
         table: The window.
@@ -260,13 +265,13 @@ END_WINDOW_S = 1.0
 class Expect(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Conditions that every run of a scenario must satisfy, for every random seed.
+    """Conditions that every run of an experiment must satisfy, for every random seed.
 
-    `trilat test` checks them. The synchronisation error of a site is e = q_i - q_id, Eq. (9):
-    the difference between its joint angles q_i and its reference q_id. |e| is taken for each
-    joint. "Largest" and "smallest" refer to all sites (or links), all joints and all ticks of
-    the run. A run that diverged ends at that tick. Its quantities are those of the part before,
-    and the run fails unless `stable = false` is expected.
+    The command `trilat test` checks them. The error of an arm is e = q_i - q_id, Eq. (9): its
+    joint angles q_i minus the position q_id that it should follow. |e| is taken for each joint.
+    "Largest" and "smallest" refer to all arms (or network links), all joints and all control
+    periods. If an arm diverges, the run ends there. Only the part before counts, and the run
+    fails unless `stable = false` is expected.
 
     Attributes:
         stable: True if the run must be stable, False if it must be unstable. A run whose
@@ -324,7 +329,7 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if the scenario states at least one condition that its runs must satisfy.
+        """True if the experiment states at least one condition that its runs must satisfy.
 
         A tolerance alone only says how precisely other conditions are judged, and does not
         count.
@@ -334,10 +339,10 @@ class Expect(
 
 
 def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy the expectations of a scenario.
+    """Returns the reason why no run could satisfy the expectations of an experiment.
 
     For example, an expected end pose must have as many angles as the arm has joints. The
-    problem is reported when the scenario is loaded, and not after a long run.
+    problem is reported when the experiment is loaded, and not after a long run.
 
     Args:
         expect: The expectations.

@@ -26,9 +26,9 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """Lengths of the vectors of a site in a scenario, for example 6 gains for 6 joints.
+    """Lengths of the vectors that belong to one arm, for example 6 gains for 6 joints.
 
-    A scenario may state one number where a vector is needed. The counts say how long the vector
+    An author may state one number where a vector is needed. The counts say how long the vector
     becomes, and check vectors that are given in full.
 
     Attributes:
@@ -46,7 +46,9 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the lengths of the vectors for an arm that is a serial chain in space.
+        """Returns the lengths of the vectors that belong to an arm of several joints in space.
+
+        Gains per joint, for example, need as many numbers as the arm has joints.
 
         Args:
             joints: Number of joints of the arm.
@@ -105,7 +107,7 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 @lru_cache(maxsize=256)
 def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """Returns the fields of the type of a scenario's table, for example of `Arm`.
+    """Returns the fields of a type that describes a table of a scenario file, such as `Arm`.
 
     The result is cached, because `msgspec.structs.fields` evaluates the annotations of the type
     anew in each call, and a scenario has many tables of the same type.
@@ -182,7 +184,7 @@ def find_count_problem(
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Returns True if a value of a scenario is a number.
+    """Returns True if a value from a scenario file is a number.
 
     The values true and false are not numbers, although they are integers in Python.
 
@@ -193,9 +195,9 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 
 def is_distribution(value: Any) -> bool:
-    """Returns True if a value of a scenario is a distribution in place of a number.
+    """Returns True if a value from a scenario file is a random distribution.
 
-    Each run draws the number from the distribution, for example `{ uniform = [1, 2] }`.
+    Each run draws a number from it, for example from `{ uniform = [1, 2] }`.
 
     Args:
         value: A value as it was read from TOML.
@@ -234,7 +236,7 @@ def check_keys(
 
 
 def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
-    """Returns the problem of a key that a table must not have, with the key that may be meant.
+    """Explains that a table must not have a key, and suggests the key that may be meant.
 
     Args:
         key: The unknown key.
@@ -268,7 +270,7 @@ def hint_at_quotes(text: str) -> str:
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:
-    """Returns the keys that a table of a scenario may have: the fields of its type.
+    """Returns the keys that a table of a scenario may have, from the type that describes it.
 
     Args:
         kind: Type of the table.
@@ -277,7 +279,9 @@ def field_names(kind: StructType) -> tuple[str, ...]:
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Checks that a word of a scenario, such as the name of a law, is among the valid ones.
+    """Refuses a word of a scenario, such as the name of a law, that is not a valid choice.
+
+    The error suggests the most similar valid word.
 
     Args:
         word: A value of a scenario.
@@ -295,10 +299,9 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Checks that all numbers of a scenario's value are finite and fit into 64 bits.
+    """Checks that all numbers in a value from a scenario file are finite and fit into 64 bits.
 
-    Numbers that are infinite, NaN, or integers of more than 64 bits are refused. Tables and
-    lists are checked with everything that they contain.
+    Tables and lists are checked with everything that they contain.
 
     Args:
         value: A value of a scenario.

@@ -20,7 +20,7 @@ _LAWS_PACKAGE = "trilat_net.laws"
 
 
 def _find_laws() -> Iterator[type[ControlLaw]]:
-    """Yields the law of each file in the package of laws that contains one."""
+    """Yields the control law of each Python file in the package of laws that has one."""
     for file in pkgutil.iter_modules(import_module(_LAWS_PACKAGE).__path__):
         module = import_module(f"{_LAWS_PACKAGE}.{file.name}")
         kind = getattr(module, format_class_name(file.name), None)
@@ -46,7 +46,7 @@ else:
 
 
 def identify_law(law: Any) -> str:
-    """Returns the name with which a scenario names a control law.
+    """Returns the name by which a scenario file selects a control law.
 
     The name of a user's law consists of its module and class, for example "package.module:Law".
 

@@ -33,7 +33,9 @@ TensorEntries = Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length
 
 
 class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
-    """Mass and inertia of a link of a robot that replace the values in its URDF file.
+    """Mass and inertia of a robot's link that replace those in its URDF file.
+
+    Many such files contain inertias that are wrong or missing.
 
     Attributes:
         mass_kg: Mass, in kg. 0 removes the body of the link. By default, as in the file.
@@ -58,7 +60,7 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
-    """Returns the symmetric 3 x 3 inertia tensor with six given entries.
+    """Returns the symmetric 3 x 3 inertia tensor of a body from its six different entries.
 
     Args:
         entries: The entries xx, xy, yy, xz, yz, zz, in this order, in kg m^2.
@@ -140,7 +142,7 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
 
 
 def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine: float) -> None:
-    """Rotates the rows `p` and `q` of a matrix into each other, in place."""
+    """Rotates two rows of a matrix into each other by an angle, in place (Jacobi)."""
     for column in range(3):
         upper = matrix[p][column]
         lower = matrix[q][column]
@@ -151,7 +153,7 @@ def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine:
 def _rotate_columns(
     matrix: list[list[float]], p: int, q: int, cosine: float, sine: float
 ) -> None:
-    """Rotates the columns `p` and `q` of a matrix into each other, in place."""
+    """Rotates two columns of a matrix into each other by an angle, in place (Jacobi)."""
     for row in matrix:
         left = row[p]
         right = row[q]

@@ -23,7 +23,9 @@ from .written_tables import TRACE_KEYS, check_link
 def complete_link_tables(
     common: TomlTable, written: TomlTable, names: list[str], files: NamedFiles
 ) -> TomlTable:
-    """Returns the complete table of every link, by the name of the link.
+    """Returns the table of every network link with all its keys, by the name of the link.
+
+    Keys that the author left out get the values for all links, or their defaults.
 
     Args:
         common: Settings of all links as their author wrote them, the table `link`.

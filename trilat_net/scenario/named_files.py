@@ -24,7 +24,9 @@ SHIPPED_FOLDER = resources.files("trilat_net") / "scenarios"
 
 
 class NamedFiles(NamedTuple):
-    """Files that a scenario names.
+    """Files that a scenario names: the folder to search, and the robot descriptions (URDF).
+
+    Other files, such as tables of recorded delays, are read from the folder when needed.
 
     Attributes:
         folder: Folder in which the files are searched. None refuses every file.
@@ -114,10 +116,10 @@ class NamedFiles(NamedTuple):
 
 
 def _read_urdf(name: str, folder: Path | None, path: str) -> str:
-    """Returns the text of a URDF file.
+    """Reads the text of a URDF file, the XML description of a robot.
 
-    At most one character more than allowed is read. The parser then refuses the text as too
-    long.
+    At most one character more than allowed is read, so that a huge file cannot fill the memory.
+    The parser then refuses the text as too long.
 
     Args:
         name: Name of the file, as the arm names it.
@@ -140,10 +142,10 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Returns the shipped file of a name, or the file in `folder` if there is none.
+    """Returns the path of a file that a scenario names, in the package or in the user's folder.
 
-    Only a name without a folder can be that of a shipped file. The returned path need not
-    exist.
+    A file that the package ships has priority, but only for a name without a folder. The
+    returned path need not exist.
     """
     shipped = Path(str(SHIPPED_FOLDER / name))
     is_plain_name = "/" not in name and "\\" not in name
@@ -151,9 +153,8 @@ def _find_file(name: str, folder: Path) -> Path:
 
 
 def use_unix_line_ends(text: str) -> str:
-    r"""Returns a text with "\n" at the end of each line.
+    r"""Returns a text with line feeds as line ends, as on Linux.
 
-    TOML stores line ends in this form. Without the conversion, a file that was written on
-    Windows would be another experiment.
+    A file that was written on Windows would otherwise be another experiment with another hash.
     """
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -94,9 +94,10 @@ def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
 
 
 def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) -> str:
-    """Returns the path of a key that does not belong to a group.
+    """Returns the complete path of an overridden key that belongs to a single arm or link.
 
-    A key of a user's law is an argument of its class, and gets the path of this argument.
+    A key of a user's control law is an argument of its class, and gets the path of this
+    argument.
     """
     group, _, rest = key.partition(".")
     site, _, name = rest.partition(".control.")
@@ -107,7 +108,10 @@ def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) 
 
 
 def _user_law_key(path: str, name: str) -> str:
-    """Returns the path of a key of a user's law. Keys that are not its fields are arguments."""
+    """Returns the complete path of an overridden key that belongs to a user's control law.
+
+    Keys that the scenario itself does not define are arguments of the user's class.
+    """
     is_field = name.split(".")[0] in ("law", *field_names(ImportedLaw))
     return f"{path}.{name}" if is_field else f"{path}.settings.{name}"
 
@@ -168,7 +172,10 @@ def _expand_group(
 def _list_group_kinds(
     scenario: Scenario, group: str, overridden: Mapping[str, Any]
 ) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
-    """Returns the kind of each law or link after the overrides, and the keys of each kind.
+    """Returns the control laws (or delay models) of all arms (or links) after the overrides.
+
+    For each of these kinds, it also returns the keys that the kind has. An override of all arms
+    applies only where the law has the key.
 
     Returns:
         Kinds by the path of the law or link, and keys by the built-in kind.
@@ -188,7 +195,7 @@ def _list_group_kinds(
 
 
 def _split_entry(key: str) -> tuple[str, str]:
-    """Splits the key of an entry of a list, such as "q0_rad.1".
+    """Splits the key of an entry of a list into the name and the index, as in "q0_rad.1".
 
     Returns:
         Key of the list, and number of the entry as a string. For other keys, the key itself and
@@ -231,9 +238,9 @@ def split_entries(
 
 
 def _find_value(tables: TomlTable, key: str) -> Any:
-    """Returns the value at a dotted key, in which a number is an index.
+    """Returns the value of a scenario at a dotted key, in which a number is an index of a list.
 
-    None if there is none.
+    The result is None if the scenario has no such value.
     """
     value: Any = tables
     for name in key.split("."):
@@ -247,7 +254,7 @@ def _find_value(tables: TomlTable, key: str) -> Any:
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of a site's control law after the overrides."""
+    """Returns the name of an arm's control law as it will be after the overrides."""
     for path in (f"sites.{site}.control.law", "control.law"):
         if path in overridden:
             return overridden[path]
@@ -300,7 +307,10 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
 
 
 def _list_kind_keys(parents: Sequence[str]) -> list[str]:
-    """Returns the keys that name a kind, for the table at a path.
+    """Returns the keys that choose a kind in the table at a path, such as `law` or `model`.
+
+    If an override changes such a key, the other keys of the table belong to the previous kind
+    and are removed.
 
     Args:
         parents: Keys of the path.
@@ -311,7 +321,9 @@ def _list_kind_keys(parents: Sequence[str]) -> list[str]:
 
 
 def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> None:
-    """Refuses the key of a site that does not exist.
+    """Refuses an override of a key of an arm that the scenario does not have.
+
+    Otherwise a misspelt name would add a new arm.
 
     Args:
         tables: Tables of the scenario.
@@ -328,7 +340,7 @@ def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> N
 
 
 def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTable | list[Any]:
-    """Returns the table or list at a path. Missing tables and lists are added.
+    """Returns the table or list that contains an overridden key, and adds it if it is missing.
 
     Args:
         tables: Tables of the scenario.
@@ -355,7 +367,7 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
 
 
 def _list_index(entries: list[Any], name: str, path: str) -> int:
-    """Returns the index of an entry of a list.
+    """Returns the index that a part of an overridden key states, after a check of the range.
 
     Args:
         entries: The list.
@@ -374,9 +386,10 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
 
 
 def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
-    """Converts the overrides that a user or program gave to pairs of a key and a value.
+    """Converts overrides of a scenario, as a user wrote them, to pairs of key and value.
 
-    An override replaces one value of a scenario.
+    An override replaces one value of a scenario, the description of an experiment. A user
+    writes KEY=VALUE on the command line, or a mapping in Python.
 
     Args:
         overrides: Values by dotted key, or texts KEY=VALUE. The value of a text is written as
@@ -445,7 +458,9 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
 
 
 def nest_overrides(pairs: Sequence[Override]) -> TomlTable:
-    """Returns overrides as tables, for `find_written_path`.
+    """Returns overrides with dotted keys as nested tables, as if they stood in a scenario file.
+
+    `find_written_path` searches these tables for the key of an error.
 
     Args:
         pairs: Dotted keys and their values.
@@ -464,7 +479,7 @@ def nest_overrides(pairs: Sequence[Override]) -> TomlTable:
 
 
 def split_assignment(text: str) -> Override | None:
-    """Splits a text KEY=VALUE, as the option --set has it, into its key and its value.
+    """Splits a text KEY=VALUE, as given to the option --set, into its key and its value.
 
     For example, "links.delay_ms=5" gives the key "links.delay_ms" and the value 5.
 

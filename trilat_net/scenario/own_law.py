@@ -19,10 +19,10 @@ from ..own_code import CLASS_PATTERN, read_code, read_sends
 
 
 def complete_own_law(code: str, written: TomlTable, common: TomlTable, path: str) -> TomlTable:
-    """Returns the table of a control law that a user wrote as a Python class.
+    """Returns the complete table of a control law that a user wrote as a Python class.
 
     The table contains the name of the class, the hash of its file, and the vectors that the law
-    sends to its peers.
+    sends to other arms.
 
     Args:
         code: Module and class, for example "package.module:Law".

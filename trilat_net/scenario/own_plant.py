@@ -27,9 +27,9 @@ _MAX_SIZE_M = 100.0
 
 
 class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True):
-    """Table of a user's plant in a scenario.
+    """Table of a scenario that names a user's arm model (plant).
 
-    A plant is a program that computes the motion of an arm.
+    The model is a Python class, which computes the motion of the arm from its torques.
 
     Attributes:
         code: Class of the plant, for example "my_plant:Scene".
@@ -93,7 +93,9 @@ def resolve_plant(written: Any, path: str) -> Any:
 
 
 def _check_bodies(written: Any, path: str) -> Any:
-    """Returns the table of bodies unchanged if their names and extents are valid.
+    """Checks the names and sizes of the bodies that a user's arm model moves, such as a box.
+
+    The table is returned unchanged if it is valid.
 
     Raises:
         ScenarioError: There are too many bodies, or a name or extent is not valid.
@@ -119,7 +121,7 @@ def _check_bodies(written: Any, path: str) -> Any:
 
 
 def _is_box_size(size: Any) -> bool:
-    """True for a list of three lengths in m that a body may have."""
+    """Returns True for a list of three lengths in m that a body of the scene may have."""
     if not isinstance(size, list | tuple) or len(size) != 3:
         return False
     return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)

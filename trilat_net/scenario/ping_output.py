@@ -87,7 +87,7 @@ class _PingProbes(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Answer to a probe.
+    """Answer to one probe (request packet) that the program `ping` received.
 
     Attributes:
         rtt_ms: Round-trip time, in ms.
@@ -100,7 +100,7 @@ class _Answer(NamedTuple):
 
 
 class _Summary(NamedTuple):
-    """Numbers in the summary at the end: sent packets and received answers."""
+    """Counts that `ping` prints at the end of its output: sent packets and received answers."""
 
     sent: int
     received: int
@@ -138,7 +138,7 @@ def read_ping(text: str, every_s: float) -> _PingProbes:
 
 
 def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:
-    """Returns the numbers in a summary. None if the line is not a summary."""
+    """Reads the counts from a line of output, or returns None if it is not the summary line."""
     match = pattern.match(line)
     return None if match is None else _Summary(int(match[1]), int(match[2]))
 
@@ -204,12 +204,14 @@ def _unwrap_number(previous: int, number: int) -> int:
 
 
 def _parse_decimal(text: str) -> float:
-    """Returns a number that may have a decimal comma."""
+    """Converts a text to a number; the decimal separator may be a comma."""
     return float(text.replace(",", "."))
 
 
 def _read_fping(lines: Sequence[str], every_s: float) -> _PingProbes:
-    """Returns the probes in the output of `fping`, whose numbers start from 0 and never wrap.
+    """Reads the round trips from the output of `fping`, which numbers the probes from 0.
+
+    In contrast to `ping`, the numbers never start again from 0.
 
     Args:
         lines: Lines of the output.
@@ -253,7 +255,7 @@ def _arrange_probes(
     summary: _Summary | None,
     every_s: float,
 ) -> _PingProbes:
-    """Returns the probes of a run in the order of their numbers, including the lost ones.
+    """Returns all probes of a run of `ping` in the order of sending, including the lost ones.
 
     Args:
         answers: Answers, by the number of the probe.

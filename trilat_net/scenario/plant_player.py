@@ -29,7 +29,7 @@ _POSE_NUMBERS = 7
 
 
 class PlantContext(NamedTuple):
-    """Facts that a user's plant receives when it is created.
+    """Facts about the experiment that a user's arm model (plant) receives when it is created.
 
     >>> class Scene:
     ...     def __init__(self, facts: tn.PlantContext) -> None:
@@ -65,7 +65,7 @@ class _PlantProgram(Protocol):
     """
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
-        """Advances the plant by one period under a constant control torque.
+        """Computes the motion of the arm over a control period with a constant motor torque.
 
         Args:
             tau: Control torque ON the joints, in N m, shape (n,).
@@ -78,9 +78,10 @@ class _PlantProgram(Protocol):
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns the current poses of the bodies, in the order of `PlantContext.bodies_m`.
+        """Returns the current poses of the bodies that the model moves besides the arm.
 
-        This method is called only if the plant has bodies.
+        The order is that of `PlantContext.bodies_m`. The method is called only if there are
+        bodies.
 
         Returns:
             Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
@@ -89,9 +90,9 @@ class _PlantProgram(Protocol):
 
 
 class PlantPlayer:
-    """Runs a user's plant at its site, tick by tick.
+    """Runs a user's arm model (plant) at one arm, one control period after another.
 
-    A plant is a program that computes the motion of an arm from the torques of its motors.
+    A plant is a class that computes the motion of an arm from the torques of its motors.
 
     Args:
         scenario: The scenario.
@@ -140,7 +141,7 @@ class PlantPlayer:
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
     def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Lets the plant compute the motion of the arm from a tick to the next one.
+        """Lets the user's arm model compute the motion from one control period to the next.
 
         The result is stored in `state`.
 
@@ -169,7 +170,10 @@ class PlantPlayer:
         self.state = PlantState(q, qd, tau_x, bodies)
 
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
-        """Returns q, qd and, if the plant returns it, tau_x after one period."""
+        """Calls the user's arm model for one control period, and returns the motion after it.
+
+        The result is q, qd and, if the model measures it, the external torque tau_x.
+        """
         q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
         vectors = [q, qd, *others[:1]]
         return [[float(number) for number in vector] for vector in vectors]
@@ -195,7 +199,7 @@ class PlantPlayer:
         return numbers
 
     def _call(self, tick: int, function: Callable[[], T]) -> T:
-        """Calls the code of the plant, and returns the result.
+        """Calls a function of the user's arm model, and reports an exception with its place.
 
         Args:
             tick: Tick, for the error message.
@@ -212,7 +216,7 @@ class PlantPlayer:
             raise self._make_error(tick, describe_exception(error)) from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
-        """Returns the error that reports a problem of the plant in a tick."""
+        """Returns the error that the user's arm model failed in a certain control period."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
 
 

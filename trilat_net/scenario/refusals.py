@@ -66,7 +66,10 @@ def refuse(
     path: str,
     elsewhere: Sequence[str] = (),
 ) -> ScenarioError:
-    """Returns the error for the author of a table that msgspec has refused.
+    """Converts an error of the library msgspec to one for the author of the refused table.
+
+    The new error names the wrong key by its path in the scenario, and says what may stand
+    there.
 
     Args:
         error: Error that msgspec raised when it compared the table with its type.
@@ -100,7 +103,7 @@ def refuse(
 
 
 def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] = ()) -> T:
-    """Refuses one table of a scenario that has an unknown key, or a value of a wrong type.
+    """Converts one table of a scenario to its type, and refuses unknown keys and wrong values.
 
     Args:
         table: The table as its author wrote it.
@@ -123,7 +126,9 @@ def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] =
 def convert_drawn(
     table: TomlTable, kind: type[T], path: str, drawn: Mapping[str, Distribution], seed: int
 ) -> T:
-    """Converts a complete table, in which random numbers have been drawn, to its type.
+    """Converts a complete table of a scenario, with its random numbers drawn, to its type.
+
+    A drawn number that is not valid is reported with its distribution and seed.
 
     Args:
         table: The table.
@@ -163,7 +168,7 @@ def join_path(path: str, location: Location) -> str:
 
 
 def describe_wrong_type(value: Any, expected: str) -> str:
-    """Returns what is wrong with a value of a scenario that has another type than expected.
+    """Explains what is wrong with a value from a scenario file that has the wrong type.
 
     Args:
         value: The value as it was read from TOML.
@@ -187,7 +192,7 @@ def describe_wrong_type(value: Any, expected: str) -> str:
 def _describe_wrong_value(
     message: str, table: Any, kind: Any, location: Location, path: str
 ) -> str:
-    """Returns what is wrong with a value of a wrong type or range.
+    """Explains what is wrong with a value that has a wrong type or is out of range.
 
     Args:
         message: Message of msgspec without the location.
@@ -220,14 +225,14 @@ def _describe_wrong_value(
 
 
 def _describe_table_for_number(table: TomlTable, kind: Any, location: Location) -> str:
-    """Returns what is wrong with a table in place of a number, such as a wrong distribution."""
+    """Explains what is wrong with a table in place of a number, as a wrong distribution."""
     if is_distribution(table):
         return f"{DISTRIBUTION_FORM}, but is {table}"
     return _describe_wrong_number(table, kind, location)
 
 
 def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
-    """Returns what is wrong with a value that is no number, and what may stand in its place.
+    """Explains what is wrong with a value that should be a number, and what may stand there.
 
     Args:
         value: The value.
@@ -285,7 +290,10 @@ def _split_message(message: str, table: Any, kind: Any) -> tuple[str, Location]:
 
 
 def _find_refused_key(message: str, table: Any, kind: Any, location: Location) -> str | None:
-    """Returns the key of the entry of a dictionary that msgspec refuses with a message.
+    """Finds which entry of a dictionary the library msgspec has refused.
+
+    Its messages do not name the keys of dictionaries. Therefore entries are converted one by
+    one, until one gives the same message.
 
     Args:
         message: The message.
@@ -323,7 +331,7 @@ def _isolate(table: Any, location: Location, value: Any) -> Any:
 
 
 def _value_at(table: Any, location: Location) -> Any:
-    """Returns the value at a location inside a table."""
+    """Returns the value at a place inside nested tables and lists."""
     value = table
     for part in location:
         value = value[part]
@@ -331,10 +339,10 @@ def _value_at(table: Any, location: Location) -> Any:
 
 
 def _find_table_for_number(table: Any, kind: Any, location: Location) -> Location | None:
-    """Returns the location of a table that stands where a number belongs.
+    """Finds a table that stands where a number belongs, around a refused value.
 
-    It is the table of a random distribution, or was meant to be. None if the refused value is
-    not part of such a table.
+    Such a table states a random distribution, or was meant to. The result is None if there is
+    no such table.
     """
     for length in range(1, len(location) + 1):
         start = location[:length]
@@ -345,7 +353,7 @@ def _find_table_for_number(table: Any, kind: Any, location: Location) -> Locatio
 
 
 def _list_hints(kind: Any, location: Location) -> list[Any]:
-    """Returns the types that a value at a location of a table may have.
+    """Returns the types that a value may have at a given place of a scenario's table.
 
     Args:
         kind: Type of the table.
@@ -369,7 +377,7 @@ def _list_alternatives(hint: Any) -> Iterator[Any]:
 
 
 def _list_inner_hints(hint: Any, part: str | int) -> Iterator[Any]:
-    """Yields the type of a field, a value of a dictionary or an entry of a list.
+    """Yields the types one level deeper: of a field, a dictionary's value or a list's entry.
 
     Args:
         hint: Type of the struct, dictionary or list.
@@ -398,7 +406,7 @@ def _find_extra(kind: Any, location: Location, name: str) -> str | None:
 
 
 def _list_keys(hint: Any) -> tuple[str, ...]:
-    """Returns the keys of a table of a type. Empty if the type is no table."""
+    """Returns the keys that a table of a type may have; none if the type is no table."""
     is_struct = isinstance(hint, type) and issubclass(hint, msgspec.Struct)
     return field_names(hint) if is_struct else ()
 
@@ -409,7 +417,7 @@ def _list_choices(hint: Any) -> tuple[str, ...]:
 
 
 def _is_list_of_tables(hint: Any) -> bool:
-    """True for the type of a list of tables, as of operators or planned changes."""
+    """Returns True if a type is a list of tables, such as the list of planned changes."""
     base = _strip_annotation(hint)
     if get_origin(base) not in (list, tuple):
         return False

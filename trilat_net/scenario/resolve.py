@@ -89,7 +89,10 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
-    """Returns the dominance factors of a site: the weights with which it follows its peers.
+    """Returns the weights with which one arm follows each of the others, in a scenario.
+
+    The weights are called dominance factors. An arm that the author did not name has the weight
+    0.
 
     Args:
         written: Row as its author wrote it. A peer that it does not name has the factor 0. None
@@ -123,11 +126,11 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 def complete_timeline(
     written: Sequence[WrittenChange], links: TomlTable, site_names: list[str]
 ) -> list[TomlTable]:
-    """Returns the planned changes of a scenario, each complete in itself.
+    """Returns the planned changes of an experiment, each complete in itself.
 
-    A change affects a link or the dominance factors of a site. An author may state only those
-    keys of a link that change. In the result, each change states the whole link: the other keys
-    have the values that the earlier changes left.
+    A change affects a network link, or the weights with which an arm follows the others. An
+    author may state only those settings of a link that change. In the result, each change
+    states all settings: the others have the values that the earlier changes left.
 
     Args:
         written: Changes as their author wrote them.

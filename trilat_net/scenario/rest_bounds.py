@@ -70,7 +70,9 @@ class _RestBounds(NamedTuple):
 
 
 class _ArmSamples(NamedTuple):
-    """Dynamics of an arm in many poses.
+    """Inertias, Coriolis torques and gravity torques of an arm in many poses.
+
+    The bounds of a stop are the worst values over these poses.
 
     Attributes:
         M: Inertia matrix in each pose, shape (poses, n, n).
@@ -144,7 +146,7 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
 def _bound_rest_time(
     setup: SiteSetup, speed: Array, limit_nm: Array, samples: _ArmSamples, energy_j: float
 ) -> float:
-    """Computes the time within which the arm is at rest, Eq. (8), in s.
+    """Computes the time within which an arm is at rest after a stop, Eq. (8), in s.
 
     Args:
         setup: Setup of the site.
@@ -182,7 +184,7 @@ def _bound_rest_time(
 
 
 def _list_patterns(joints: int) -> Array:
-    """Returns combinations of directions of the joints, with entries 1 or -1.
+    """Returns the combinations of directions in which the joints of an arm may move: 1 or -1.
 
     The first joint always has the direction 1, because the opposite combination has the same
     kinetic energy and the same Coriolis torques.

@@ -31,12 +31,10 @@ from .written_tables import WrittenChange
 
 
 class LinkTables(dict[str, dict[str, Any]]):
-    """Current settings of every link during a run, by the name of the link.
+    """Present settings of every network link during a run, by the name of the link.
 
-    A link is the directed connection between two sites, and its settings are a table of a
-    scenario. They change when a change of the link takes effect. `advance_to` applies the
-    changes of the timeline; a caller that accepts a requested change stores the new table
-    itself.
+    The settings, such as the delay, change at planned times, which `advance_to` applies. A
+    caller that accepts a change requested by a user stores the new settings itself.
 
     Args:
         links: Links at the start of the run, by name.
@@ -48,7 +46,7 @@ class LinkTables(dict[str, dict[str, Any]]):
         self._planned = deque(change for change in timeline if change.link)
 
     def advance_to(self, t_ns: int) -> None:
-        """Applies the planned changes up to a time, so that the tables are valid at this time.
+        """Applies the changes of network links that the scenario plans up to a time.
 
         Args:
             t_ns: The time, in ns after the epoch (the common start time).
@@ -63,9 +61,9 @@ def resolve_change(
 ) -> Change:
     """Completes and checks a change that a user requests during a run.
 
-    A change concerns a link, which is the connection between two sites (the processes of the
-    arms), or the weights with which one site follows the others. A user may state only the
-    settings of a link that change. The others are taken from its current settings.
+    It changes a network link, or the weights with which one arm follows the others. A user may
+    state only the settings of a link that change; the others are taken from its present
+    settings.
 
     Args:
         scenario: Description of the experiment.
@@ -106,10 +104,10 @@ def resolve_change(
 
 
 def find_owner(change: Change) -> str:
-    """Returns the name of the site that must carry out a change.
+    """Returns the name of the arm whose process must carry out a change of a run.
 
-    A change of a link is carried out by the site that receives its samples. Any other change
-    names its site.
+    The receiver of a network link carries out a change of this link. Any other change names its
+    arm. The process of an arm is called a site.
 
     Args:
         change: Change of a link or of dominance factors, or a command to a site.
@@ -120,10 +118,9 @@ def find_owner(change: Change) -> str:
 def make_site_order(
     scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
 ) -> Change:
-    """Converts a command to a site, such as stop, to a change that can be sent and recorded.
+    """Converts a command to an arm's process, such as stop, to a change of the run.
 
-    A site is the process that runs one arm. Commands use the same record as changes of the
-    network or of the weights with which sites follow each other.
+    In this form it can be sent and logged like a change of the network.
 
     Args:
         scenario: Description of the experiment.
@@ -161,9 +158,9 @@ _ORDER_SENTENCES = {
 
 
 def describe_change(change: Change, ordered_by: str = "") -> str:
-    """Describes a change of a run to people, in a sentence without a full stop.
+    """Describes a change of a run in a phrase for people.
 
-    An example is "m2 was stopped by the experimenter at 58.2 s".
+    An example is "m2 was stopped by the experimenter at 58.2 s", without a full stop.
 
     Args:
         change: A command to a site, or a change of a link or of dominance factors.
@@ -190,7 +187,7 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
 
 
 def find_requester(sentence: str) -> str:
-    """Extracts from the sentence about a stop who requested it, for the timeline of a report.
+    """Returns who requested a stop, from the sentence about it in a log, for a report.
 
     Args:
         sentence: Sentence that `describe_change` returned.
@@ -204,7 +201,7 @@ def find_requester(sentence: str) -> str:
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
-    """Converts a change during a run to the record that the compiled control loop reads.
+    """Converts a change during a run to the form that the compiled control loop reads.
 
     Args:
         scenario: Description of the experiment.
@@ -227,9 +224,9 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Converts the text of a change in a record to the form of the simulation kernel.
+    """Converts the text of a change in a log to the form that the compiled control loop reads.
 
-    The record may come from an untrusted log, so the change is checked completely.
+    The log may come from a stranger, so the change is checked completely.
 
     Args:
         scenario: Scenario of the run.

@@ -36,12 +36,12 @@ _BLOCK = 8192
 
 
 class LinkSchedule:
-    """Computes when the samples of a link should arrive at the receiver.
+    """Computes when each message on a simulated network link should arrive at the receiver.
 
-    A sample is the state that a site publishes in one tick. The times follow from the delays
-    and losses that the scenario states. They are computed by the same function as during a run.
-    It reads a row of data that describes the link with all its models and outages. A model
-    applies to samples that are sent at its first stamp or later.
+    Every arm's process sends its state (a sample) once per control period. The arrival times
+    follow from the delays and losses in the description of the experiment, and are computed by
+    the same function as during a run. Each model of delay applies to messages sent at its first
+    time or later.
 
     Args:
         setup: Setup of the link, as the kernel reads it.
@@ -79,9 +79,9 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Computes when the next samples of the link are due at the receiver.
+        """Computes when the next messages of the link are due at the receiver.
 
-        The first of these samples is the one after the last sample of the previous call.
+        The first of these messages is the one after the last message of the previous call.
 
         Args:
             end: Number of the sample after the last one.
@@ -129,9 +129,9 @@ class LinkSchedule:
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first tick at or after each of some times at which samples are due.
+    """Returns the first control period of the receiver at or after each delivery time.
 
-    It computes the same as `core.ticks.first_tick_at`, for an array of times.
+    It is `core.ticks.first_tick_at` for an array of times.
 
     Args:
         due_ns: Times in ns after the epoch (the common start time).
@@ -147,10 +147,10 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 def draw_used_samples(
     link: LinkBase, key: int, receiver_hz: int, sender_hz: int, duration_s: float
 ) -> IntArray:
-    """Computes which sample of a peer a site uses in each of its ticks.
+    """Computes which message of another arm is in use in each control period of an arm.
 
-    A peer is another site that sends its state once per tick (a sample). Other links of the
-    site are not considered.
+    Messages are delayed and lost by the network link between the two arms; other links of the
+    arm are not considered. A message is called a sample.
 
     Args:
         link: Link over which the samples arrive.
@@ -180,7 +180,7 @@ def draw_used_samples(
 
 
 def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
-    """Returns the newest sample that is in use in each tick.
+    """Returns, for each control period, the newest message that has been received by then.
 
     Args:
         samples: Numbers of the samples.
@@ -197,9 +197,9 @@ def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
 
 
 def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
-    """Counts how often a site receives nothing new from a peer for longer than a limit.
+    """Counts how often an arm receives nothing new from another arm for longer than a limit.
 
-    The time before the first sample does not count.
+    The time before the first message does not count.
 
     Args:
         used: Number of the sample in use in every tick. -1 before the first sample.
@@ -259,9 +259,9 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns which sample of each peer the user sees in a tick of the site.
+        """Returns which state of each other arm the user sees in one control period.
 
-        The peers are the other sites, whose arms the picture shows.
+        The states are called samples, and the other arms peers.
 
         Args:
             tick: The tick. It must not be before that of the previous call.
@@ -280,7 +280,9 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns which state of the other arms the user sees in each control period.
+        """Returns which state of each other arm the user sees in each control period of a run.
+
+        The picture is delayed, so that it shows states of earlier periods.
 
         Args:
             ticks: Number of control periods of the user's site, from the start of the run.
@@ -296,7 +298,9 @@ class PictureDelay:
         }
 
     def _draw_until(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
-        """Yields the samples that each peer sent before a tick, and when they are shown.
+        """Yields the states that each other arm sent, and from when on the user sees them.
+
+        The time is a control period (tick) of this arm.
 
         Args:
             tick: Tick of the site.

@@ -60,7 +60,7 @@ def list_shipped() -> list[str]:
 
 
 def read_shipped(name: str) -> str:
-    """Returns the TOML text of one of the example scenarios in the package.
+    """Returns the TOML text of an example scenario in the package, such as "paper".
 
     Args:
         name: Name of the scenario. The name of an unlisted file begins with an underscore.
@@ -147,10 +147,10 @@ def _join_overrides(
 def _change_scenario(
     scenario: Scenario, overrides: Mapping[str, Any] | Sequence[str]
 ) -> Scenario:
-    """Returns a scenario with overrides applied.
+    """Returns the same scenario with some values replaced (overrides).
 
-    A key of a group, such as `control`, applies to all sites or links. A user who names a class
-    in an override thereby allows its code to run.
+    A key such as `control` applies to all arms. A user who names a class in an override thereby
+    permits its code to run.
 
     Raises:
         ScenarioError: An override is not valid.
@@ -171,7 +171,7 @@ def _change_scenario(
 
 
 class ExperimentText(NamedTuple):
-    """Description of an experiment as its author wrote it, before it is checked.
+    """Description of an experiment as its author wrote it, before it is checked and completed.
 
     Attributes:
         label: Name by which a command finds the experiment: the name of a scenario in the
@@ -187,7 +187,7 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Checks and completes the description of an experiment, after overrides of its keys.
+        """Converts the text to a complete scenario, after some of its values were replaced.
 
         Args:
             overrides: Texts KEY=VALUE, each of which replaces one value of the description. By
@@ -271,7 +271,9 @@ def read_source(source: str | Path) -> tuple[str, Path]:
 
 
 def find_site(scenario: Scenario, name: str) -> SiteSpec:
-    """Looks up a site of a scenario by its name, with a helpful error for a wrong name.
+    """Returns an arm of a scenario by its name; the error for a wrong name suggests another.
+
+    An arm with its control loop is called a site.
 
     Args:
         scenario: Description of the experiment.
@@ -302,7 +304,7 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Converts a TOML text to a checked scenario, in which every key has a value.
+    """Converts the TOML text of a scenario to an object with a checked value for every key.
 
     Args:
         text: TOML text of a scenario file.
@@ -388,11 +390,11 @@ def _refuse_long_keys(text: str) -> None:
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:
-    """Converts the text of a scenario from a log or another process to a scenario.
+    """Converts the text of an experiment from a log or another process to a scenario.
 
-    Such a text is not trusted. A table for all links could repeat a long trace of delays for
-    every link. A short text would then fill the memory. Therefore the traces of all links
-    together may not be longer than the text.
+    Such a text is not trusted. A table for all links could repeat a long recording of delays
+    for every link. A short text would then fill the memory. Therefore the recordings of all
+    links together may not be longer than the text.
 
     Args:
         text: TOML text of a resolved scenario, which names no files.
@@ -414,9 +416,9 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
 
 
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns a function that extracts the names of the sites from the text of a scenario.
+    """Returns a function that extracts the names of the arms from the text of an experiment.
 
-    The text may come from a log or another computer. Therefore the text is not trusted, see
+    The text may come from a log or another computer. Therefore it is not trusted, see
     `parse_embedded`.
 
     Args:

@@ -71,10 +71,9 @@ from .own_plant import OwnPlant
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """Stale rule of a site: its reaction if the samples of a peer are too old or missing.
+    """What an arm does if the messages of another arm are too old or missing.
 
-    A peer is another site whose states this site receives. A sample is the state that a site
-    publishes in one tick of its control loop.
+    Every arm's process (site) sends its state, a sample, in each period of its control loop.
 
     Attributes:
         action: What the site does. "use": It goes on with the old sample. "hold": It keeps its
@@ -106,10 +105,10 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> StaleRule:
-        """Reaction to missing messages of another site, as a record for the control loop.
+        """What to do if messages of another arm are missing, as the control loop reads it.
 
-        The scenario states times in ms, and the record in whole ns, because the kernel computes
-        with integers.
+        Times are converted from ms to whole ns, because the compiled code computes with
+        integers.
         """
         if self.action == "glide":
             return StaleRule(
@@ -150,11 +149,10 @@ def _or_infinity(limit: Any) -> Any:
 
 
 class Limits(Frozen, frozen=True):
-    """Limits of a site. Each limit is one number for all joints, or one number per joint.
+    """Limits of one arm, such as its largest torque, for all joints together or for each.
 
-    Some limits depend on the stale rule of the site: its reaction if the samples of another
-    site are too old or missing. Under the rule "glide", a site does not end the run, but stops
-    its own arm.
+    If a limit is exceeded, the run ends. Under the rule "glide" for silent arms, only this arm
+    is brought to rest instead.
 
     Attributes:
         tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
@@ -180,10 +178,9 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> MotionLimits:
-        """Limits of joint angles, reference speed and torque rate, as a record for the kernel.
+        """Limits of angles, reference speed and torque rate, as the control loop reads them.
 
-        A limit that the author of the scenario left out is infinite, so that the kernel needs
-        no special case.
+        A limit that the author left out is infinite, so that the loop needs no special case.
         """
         return MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -262,25 +259,24 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):
-    """Change of a link or of dominance factors, or a command to a site.
+    """Change during a run: of a network link, of weights, or a command to one arm's process.
 
-    A scenario plans changes in its timeline, and users request further ones during a run.
-    Exactly one of `link`, `dominance` and `site` is not empty, and says what is changed. Only
-    the changes in records of a run have `site`.
+    The weights (dominance factors) state how much an arm follows the others. A scenario plans
+    changes, and users request further ones. Exactly one of `link`, `dominance` and `site` is
+    not empty, and says what is changed. Commands (`site`) occur only in the log of a run.
     """
 
     @property
     def start_ns(self) -> int:
-        """Time at which the change takes effect, in ns after the epoch.
+        """Time at which the change takes effect, in ns after the common start of the session.
 
-        The epoch is the common start time of the sites. Times of the simulation are integers,
-        so that they are the same on every machine.
+        Times of the simulation are integers, so that they are the same on every machine.
         """
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """All settings of the link after this change, not only those that change.
+        """All settings of a network link after this change, also those that stay the same.
 
         Only a change of a link has them.
         """
@@ -341,14 +337,14 @@ def _drop_unused_keys(arm: dict[str, Any]) -> None:
 
 
 def _drop_absent_values(table: dict[str, Any]) -> None:
-    """Removes the values that mean the same as a missing key from a table, in place."""
+    """Removes values from a table, in place, that mean the same as leaving their keys out."""
     for key, absent_values in _ABSENT_VALUES.items():
         if key in table and table[key] in absent_values:
             del table[key]
 
 
 def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers on one line, for a match of `_NUMBER_LIST`."""
+    """Returns a list of numbers that TOML text spreads over several lines as one line."""
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 
@@ -410,9 +406,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file.
+        """Names of the arms, such as ("m1", "m2", "s"), in the order of the scenario file.
 
-        Arrays with an entry per site, such as `alpha`, have this order.
+        An arm with its process is called a site. Arrays with an entry per site have this order.
         """
         return tuple(self.sites)
 
@@ -440,10 +436,11 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """Matrix of the dominance factors at the start of the run, shape (N, N), Eq. (6).
+        """Matrix of the weights with which the arms follow each other, shape (N, N), Eq. (6).
 
-        The entry of row i and column j is the weight with which site i follows site j. A site
-        without a factor for a peer does not follow it.
+        The entry of row i and column j states how much arm i follows arm j at the start of the
+        run; it is called a dominance factor. An arm without an entry for another one does not
+        follow it.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
@@ -451,10 +448,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
-        """Control law of every site with its gains, in the order of the sites.
+        """Control law of every arm with its gains, in the order of the arms.
 
-        Some laws have gains that follow from the dominance factors at the start, the weights
-        with which a site follows its peers. Here these gains are filled in.
+        Some laws have gains that follow from the weights with which the arms follow each other
+        at the start. Here these gains are filled in.
         """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
@@ -511,11 +508,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
-        """Chooses a colour for each site, for figures.
+        """Chooses a colour for each arm, for figures.
 
-        The slave gets a fixed colour, so that it looks the same in the figures of all
-        scenarios. Until a slave has been met, this colour is reserved for it. The other sites
-        get the first free colours.
+        The slave, the arm that works at the environment, gets a fixed colour, so that it looks
+        the same in all figures. This colour is reserved until a slave has been met. The other
+        arms get the first free colours.
 
         Args:
             colours: Number of colours of the palette.
@@ -552,10 +549,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return max(1, round(self.duration_s * self.sites[site].rate_hz))
 
     def peers(self, site: str) -> tuple[str, ...]:
-        """Returns the names of all other sites, in the order of the scenario.
+        """Returns the names of all arms but one, in the order of the scenario.
 
-        Arrays with an entry per peer, such as the ages of samples, have this order. A peer is
-        included even if the site does not follow it.
+        They are called the peers of this arm's process (site). Arrays with an entry per peer
+        have this order. An arm that is not followed is included.
 
         Args:
             site: Name of the site whose peers are returned.
@@ -563,9 +560,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns the links at the start, and each state of a link after a planned change.
+        """Returns the settings of all network links, at the start and after planned changes.
 
-        For example, a scenario is random if any of them is.
+        For example, a run is random if any of these settings has random delays.
         """
         later_links = [
             link for name in self.links for _, link in scheduled_links(self.timeline, name)
@@ -591,9 +588,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def measured(self) -> bool:
-        """True if at least one link has no artificial delay, but that of the real network.
+        """True if at least one network link is delayed only by the real network.
 
-        Such a scenario can only run live.
+        Such an experiment cannot be simulated.
         """
         return any(link.measured for link in self._all_links())
 
@@ -607,10 +604,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the slave, the site whose arm works at the environment.
+        """Name of the slave, the arm that works at the environment.
 
-        If several sites have the role "slave", it is the first of them. If none has, it is the
-        last site of the scenario.
+        If several arms have the role "slave", it is the first of them. If none has, it is the
+        last arm of the experiment.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
@@ -638,17 +635,17 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def sites_may_return(self) -> bool:
-        """True if sites may leave a session and return while it runs.
+        """True if the process of an arm may leave a live session and return to it.
 
-        This requires the stale rule "glide" at every site, see `OnStale`. The remaining sites
-        then wait for the site that left, and align with it again when it returns.
+        This requires the rule "glide" at every arm, see `OnStale`: the other arms come to rest,
+        and follow the returning arm smoothly.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
-        """Returns the seed with which a user's code at a site should draw random numbers.
+        """Returns the seed with which a user's code at one arm should draw random numbers.
 
-        It depends on the seed of the scenario and the name of the site, so that sites with the
+        It depends on the seed of the experiment and the name of the arm, so that arms with the
         same code draw different numbers.
 
         Args:
@@ -657,10 +654,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns the layout of the numbers that the control law of a site sends to its peers.
+        """Returns which numbers the control law of an arm sends to the others, in their order.
 
-        Most laws send nothing but the state of the arm, and have an empty layout. A law that
-        sends waves, for example, has a vector for them.
+        Most laws send nothing but the state of the arm. A law that sends waves, for example,
+        has a vector for them.
 
         Args:
             site: Name of the site.
@@ -759,11 +756,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def motion_limits(self, site: str) -> MotionLimits:
-        """Returns the limits of a site's motion during a run.
+        """Returns the limits of an arm's motion during a run.
 
         A joint may start a little beyond `q_min_rad` or `q_max_rad`, up to a margin. For such a
         joint, the limit on that side is moved outward by the margin for the whole run, so that
-        the site does not stop at once.
+        the arm does not stop at once.
 
         Args:
             site: Name of the site.
@@ -804,10 +801,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> RestGains:
-        """Returns the gains of the controller that brings a site's arm to rest.
+        """Returns the gains of the controller that brings an arm to rest.
 
-        It acts, for example, when a peer is silent. The gains depend on the arm, on the limit
-        of its torque, on the tick rate and on the damping that the control law already has.
+        It acts, for example, when another arm has fallen silent. The gains depend on the
+        inertia of the arm, its largest torque, the control period, and the damping of the
+        control law.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -824,7 +822,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the link from a peer to a site as the record that the kernel reads.
+        """Returns the network link between two arms as the compiled simulation reads it.
 
         It includes the planned changes of the link.
 
@@ -861,17 +859,17 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the sites that a site follows, as an integer with bit n set for site n.
+        """Returns which arms an arm follows, as an integer with bit n set for arm n.
 
-        For example, 0b101 for the first and the third site. The kernel needs this compact
-        format.
+        For example, 0b101 stands for the first and the third arm. The compiled code needs this
+        compact form.
         """
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of each joint of a site, in rad/s.
+        """Returns the largest speed of each joint of an arm, in rad/s.
 
-        Empty if the sites do not share joint angles.
+        The result is empty if the arms follow each other's end effectors.
         """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints
@@ -898,9 +896,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the changes of a site's dominance factors that the scenario plans.
+        """Returns the planned changes of the weights with which one arm follows the others.
 
-        A dominance factor is the weight with which the site follows a peer.
+        The weights are called dominance factors, and change gradually (ramps).
 
         Args:
             site: Name of the site.

@@ -57,7 +57,7 @@ class SimulatedArm:
         self._gravity = np.array(model.chain.gravity_m_s2)
 
     def accelerate(self, torque: ArrayLike) -> Array:
-        """Computes the joint accelerations that a torque would cause, without moving the arm.
+        """Computes the joint accelerations that a torque would cause; the arm does not move.
 
         Args:
             torque: Torque that acts ON the joints, in N m, shape (n,).
@@ -79,7 +79,7 @@ class SimulatedArm:
         return acceleration
 
     def move(self, torque: ArrayLike, period_s: float) -> None:
-        """Moves the arm by one period under a constant torque.
+        """Simulates the motion of the arm for one period under a constant torque.
 
         The integration is semi-implicit (symplectic Euler): first the velocities are advanced,
         then the angles with the new velocities.

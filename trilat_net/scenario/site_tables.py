@@ -38,7 +38,7 @@ _BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
 
 
 class _SharedByAll(NamedTuple):
-    """What all sites of a scenario share while their tables are completed.
+    """Tables and files of a scenario that concern all its arms, while each arm is completed.
 
     Attributes:
         rate_hz: Tick rate of the sites that state no other, in Hz.
@@ -58,7 +58,9 @@ class _SharedByAll(NamedTuple):
 def complete_site_tables(
     tables: TomlTable, rate_hz: int, draws: Draws, files: NamedFiles
 ) -> TomlTable:
-    """Returns the complete table of every site, by name.
+    """Returns the table of every arm of a scenario with all its keys, by name.
+
+    Keys that the author left out get their values for all arms, or their defaults.
 
     Args:
         tables: Tables of the scenario file.
@@ -117,11 +119,11 @@ def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
 
 
 def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTable:
-    """Returns the complete table of a site.
+    """Returns the table of one arm with all its keys.
 
     The model of the arm comes first, because it states the number of joints, and thereby the
-    lengths of the site's vectors. The order of the draws decides the order of the table
-    `drawn`, and thereby the hash of the scenario, so it must not change.
+    lengths of all vectors. The order in which random numbers are drawn decides the order of the
+    table `drawn`, and thereby the hash of the scenario, so it must not change.
 
     Args:
         site: Table of the site, joined with the tables for all sites.
@@ -207,7 +209,7 @@ def _complete_arm(
 def _model_arm(
     table: TomlTable, task_table: TomlTable, shared: _SharedByAll, path: str
 ) -> ArmModel:
-    """Returns the model of an arm, which knows the dynamics and the number of joints.
+    """Builds the model of an arm from its table, to know its joints and dynamics.
 
     Args:
         table: Table of the arm.
@@ -241,7 +243,9 @@ def _model_arm(
 
 
 def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None:
-    """Refuses keys that belong to another kind of arm, and gravity without a direction.
+    """Refuses keys of an arm that have no effect on its kind, and gravity without a direction.
+
+    The kinds are the planar arm of two links, and a chain of joints from a URDF file.
 
     Args:
         arm: The arm.
@@ -268,11 +272,12 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 
 
 def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
-    """Returns the limits of a site that apply if its author states none.
+    """Returns the limits of an arm that apply if its author states none.
 
     The efforts and speeds of a chain's joints come from its URDF file. A joint for which the
-    file states no positive finite limit has the default of `Limits`. A simulated arm with the
-    stale rule "glide" also has a limit on the torque's rate of change.
+    file states no positive finite limit has the default of `Limits`. A simulated arm that comes
+    to rest while others are silent (rule "glide") also has a limit on the torque's rate of
+    change.
     """
     limits: TomlTable = {}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
@@ -288,10 +293,10 @@ def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
 
 
 def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
-    """Draws the numbers of a site that are given as distributions, in place.
+    """Replaces random distributions in the table of one arm by drawn numbers, in place.
 
-    These are the start, the limits, the rules for stale samples, the task and the gains of the
-    control law. The numbers of the arm have been drawn before.
+    These are the start pose, the limits, the rules for silent arms, the task and the gains of
+    the control law. The numbers of the arm's model have been drawn before.
     """
     start = {key: site[key] for key in ("q0_rad", "qd0_rad_s")}
     site |= draws.draw_numbers(start, path)
@@ -304,7 +309,7 @@ def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
-    """Refuses vectors of a site that have too few or too many numbers.
+    """Refuses vectors of an arm, such as gains per joint, with a wrong count of numbers.
 
     Args:
         site: Complete table of the site.

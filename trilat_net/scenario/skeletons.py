@@ -65,7 +65,7 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes a skeleton and its test, and returns the two files.
+    """Writes a Python file with an incomplete class to start from, and one with its test.
 
     Args:
         kind: "law", "hand" or "plant".
@@ -100,7 +100,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
 
 
 def _is_other_module(module: str, file: Path) -> bool:
-    """True if Python finds a module of this name in another file."""
+    """Returns True if Python would find another file under the name of a new module."""
     spec = find_spec(module)
     if spec is None:
         return False
@@ -110,9 +110,10 @@ def _is_other_module(module: str, file: Path) -> bool:
 
 
 def name_skeleton_class(module: str, kind: str = "law") -> str:
-    """Returns the name of the class in a new file with an incomplete program.
+    """Returns the name of the class in a new file that a user completes.
 
-    The modules mylaw and my_law contain the class MyLaw, and spring contains Spring.
+    For example, the modules mylaw and my_law contain the class MyLaw, and spring contains
+    Spring.
 
     Args:
         module: Name of the Python module that contains the skeleton.

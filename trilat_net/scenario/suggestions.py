@@ -14,13 +14,19 @@ from .scenario_types import SITE_GROUPS
 
 @cache
 def list_link_paths() -> tuple[str, ...]:
-    """Returns the dotted paths of all keys of the table for all links."""
+    """Returns the dotted paths of the keys that apply to all network links, as in "link.loss".
+
+    Messages about a misspelt key suggest them.
+    """
     keys = {key for model in DELAY_MODELS.values() for key in field_names(model)}
     return tuple(f"link.{key}" for key in ("model", "preset", *sorted(keys)))
 
 
 def list_group_paths() -> list[str]:
-    """Returns the dotted paths of all keys of the tables for all sites or all links."""
+    """Returns the dotted paths of the keys that apply to all arms or to all network links.
+
+    Messages about a misspelt key suggest them.
+    """
     gains = {key for law in LAWS.values() for key in field_names(law)}
     paths = [*list_link_paths(), *(f"control.{key}" for key in ("law", *sorted(gains)))]
     for group, kind in SITE_GROUPS.items():

@@ -75,7 +75,7 @@ _plain_sincos = getattr(sincos, "py_func", sincos)
 
 
 class UrdfPayload(NamedTuple):
-    """Body that a scenario fixes to the tip of an arm, such as a tool that its URDF file lacks.
+    """Body that is fixed to the tip of an arm, such as a tool that the URDF file lacks.
 
     Attributes:
         mass_kg: Mass, in kg.
@@ -90,7 +90,9 @@ class UrdfPayload(NamedTuple):
 
 
 class UrdfJoint(NamedTuple):
-    """A moving joint of an arm in a URDF file, and the body that it moves.
+    """Moving joint of an arm that was read from a URDF file, with the body that it moves.
+
+    The body includes everything that is fixed to it.
 
     Attributes:
         name: Name of the joint.
@@ -126,9 +128,9 @@ class UrdfJoint(NamedTuple):
 
 
 class UrdfChain(NamedTuple):
-    """An arm in a URDF file: the moving joints between a base and a tip.
+    """Arm that was read from a URDF file: its moving joints from a base link to a tip link.
 
-    `read_urdf` returns it.
+    URDF is the usual XML format for the links and joints of a robot.
 
     Attributes:
         base: Name of the link that does not move.
@@ -148,15 +150,16 @@ class UrdfChain(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """Orientation and origin of a frame, expressed in another frame."""
+    """Position and orientation of a coordinate frame, expressed in another frame."""
 
     rotation: Matrix = _IDENTITY
     origin_m: Three = _ORIGIN
 
     def __matmul__(self, inner: "_Pose") -> "_Pose":
-        """Returns the pose of a frame `inner` that is expressed in this frame.
+        """Returns the product of two poses, which places one frame inside another.
 
-        The result is expressed in the frame in which this frame is expressed.
+        The pose `inner` is expressed in the frame of this pose. The result is the same frame,
+        expressed where this pose is expressed.
         """
         x, y, z = apply(self.rotation, inner.origin_m)
         ox, oy, oz = self.origin_m
@@ -189,7 +192,7 @@ class _Edge(NamedTuple):
 
 
 class _Robot(NamedTuple):
-    """Tree of the links and joints of a file.
+    """All links and joints of a robot, as the tree that its URDF file describes.
 
     Attributes:
         links: XML elements of the links, by name.
@@ -203,7 +206,7 @@ class _Robot(NamedTuple):
 
 
 class _Inertias(NamedTuple):
-    """Changes that a scenario makes to the inertias of a file.
+    """Changes that a scenario makes to the masses and inertias in a URDF file.
 
     Attributes:
         links: Masses and inertias that replace those in the file, by the name of the link.
@@ -216,7 +219,9 @@ class _Inertias(NamedTuple):
 
 
 class _LinkBody(NamedTuple):
-    """Inertia of one link, expressed in the frame of the moving link to which it belongs.
+    """Mass and inertia of one link of a robot, in the frame of the moving link that carries it.
+
+    A link on a fixed joint moves together with the link before it.
 
     Attributes:
         link: Name of the link.
@@ -305,7 +310,10 @@ def read_urdf(
 def _check_supplied_inertias(
     robot: _Robot, links: Mapping[str, LinkInertia], moved_links: Collection[str]
 ) -> None:
-    """Refuses stated inertias of links that do not exist, or that no joint of the arm moves."""
+    """Refuses inertias in a scenario for links that do not exist or that the arm cannot move.
+
+    They would have no effect, probably because a name is misspelt.
+    """
     for name in links:
         if name not in robot.links:
             hint = suggest_nearest(name, list(robot.links))
@@ -319,12 +327,12 @@ def _check_supplied_inertias(
 
 
 def _key(link: str) -> str:
-    """Returns the path of a link's inertia in a scenario, quoted if TOML requires it."""
+    """Returns the path of a link's inertia in a scenario, quoted where TOML requires it."""
     return f"links.{link}" if re.fullmatch(r"[A-Za-z0-9_-]+", link) else f'links."{link}"'
 
 
 def _refuse(subject: str, problem: str) -> NoReturn:
-    """Raises an error about the file.
+    """Raises the error that a URDF file cannot be used, with the wrong part and the problem.
 
     Args:
         subject: Link, joint or line that is wrong. Empty if the file as a whole is wrong.
@@ -341,17 +349,17 @@ def _quote(text: str) -> str:
 
 
 def _link(name: str) -> str:
-    """Returns how an error message names a link."""
+    """Returns the name of a link as error messages write it."""
     return f"link {_quote(name)}"
 
 
 def _joint(name: str) -> str:
-    """Returns how an error message names a joint."""
+    """Returns the name of a joint as error messages write it."""
     return f"joint {_quote(name)}"
 
 
 def _list_names(names: Sequence[str]) -> str:
-    """Returns the first names of a list as a string, and the number of the others."""
+    """Returns a short text with the first names of a list, and how many others there are."""
     text = ", ".join(map(_quote, names[:_MAX_LISTED_NAMES]))
     more = len(names) - _MAX_LISTED_NAMES
     return f"{text} and {more} more" if more > 0 else text
@@ -361,7 +369,9 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _parse_xml(text: str) -> Element:
-    """Parses a URDF document, which may come from a stranger.
+    """Parses the XML text of a URDF file, which may come from a stranger.
+
+    Constructs with which a short text could fill the memory are refused.
 
     Args:
         text: The document.
@@ -414,7 +424,7 @@ def _is_xacro(element: Element) -> bool:
 
 
 def _name_elements(root: Element, tag: str) -> dict[str, Element]:
-    """Returns the elements with a certain tag below the root, by name.
+    """Returns the XML elements with a certain tag, such as all joints of a robot, by name.
 
     Raises:
         ScenarioError: An element has no name, or two have the same name.
@@ -434,7 +444,7 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
 
 
 def _read_tree(root: Element) -> _Robot:
-    """Reads the tree of links and joints from a URDF document.
+    """Reads the tree of links and joints of a robot from the root element of a URDF file.
 
     Args:
         root: Root element of the document.
@@ -474,7 +484,7 @@ def _read_tree(root: Element) -> _Robot:
 
 
 def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Edge:
-    """Returns a joint of the file, with its type and the two links that it connects.
+    """Reads one joint of a URDF file: its type, and the two links that it connects.
 
     Args:
         name: Name of the joint.
@@ -504,7 +514,9 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
 
 
 def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
-    """Yields a link and all links below it, in depth-first order.
+    """Yields a link of a robot and all links that hang on it, directly or through others.
+
+    The order is depth first.
 
     Yields:
         The name of a link, and whether any joint between `root` and the link can move.
@@ -523,7 +535,7 @@ def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
 
 
 def _check_end(robot: _Robot, end: str, link: str) -> str:
-    """Returns the name of the link that a caller chose as base or tip.
+    """Checks that the link which was chosen as the base or the tip of an arm exists.
 
     Args:
         robot: The robot.
@@ -539,7 +551,7 @@ def _check_end(robot: _Robot, end: str, link: str) -> str:
 
 
 def _find_base(robot: _Robot) -> str:
-    """Returns the only link that hangs on no joint.
+    """Returns the only link of a robot that hangs on no joint: the base of its tree.
 
     Raises:
         ScenarioError: There are several such links.
@@ -555,7 +567,9 @@ def _find_base(robot: _Robot) -> str:
 
 
 def _find_tip(robot: _Robot, base: str) -> str:
-    """Returns the only link that moves with respect to the base and carries no other link.
+    """Returns the only link at the end of a robot's tree, as the tip of the arm.
+
+    It moves with respect to the base, and carries no other link.
 
     Raises:
         ScenarioError: There is no such link, or there are several.
@@ -575,7 +589,7 @@ def _find_tip(robot: _Robot, base: str) -> str:
 
 
 def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
-    """Finds the joints on the way from the base of an arm to its tip.
+    """Returns the joints on the way from the base of an arm to its tip, in this order.
 
     Args:
         robot: Tree of links and joints.
@@ -625,7 +639,10 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
 def _walk_carried(
     robot: _Robot, moving: _Edge, path: Sequence[_Edge], notes: list[str]
 ) -> Iterator[tuple[str, _Pose]]:
-    """Yields all links that one joint moves, up to the next moving joint of the arm.
+    """Yields all links that move together with one joint, with their poses.
+
+    These are the links up to the next moving joint of the arm. Moving joints of a side branch,
+    such as fingers, are held at zero.
 
     Args:
         robot: The robot.
@@ -714,7 +731,10 @@ def _read_body(
     inertias: _Inertias,
     notes: list[str],
 ) -> _LinkBody:
-    """Returns the inertia of a link, balanced if it is impossible and the scenario permits it.
+    """Reads the mass and inertia of a link from a URDF file.
+
+    If no real body can have this inertia, the nearest possible one replaces it, provided that
+    the scenario permits it.
 
     Args:
         name: Name of the link.
@@ -755,7 +775,7 @@ def _read_body(
 
 
 def _advise_key(name: str, key: str) -> str:
-    """Returns the advice to state a key of a link's inertia in the scenario."""
+    """Advises the user to state a missing or wrong inertia of a link in the scenario."""
     return f"give {key} in [arm.{_key(name)}]"
 
 
@@ -773,7 +793,7 @@ def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
 
 
 def _note_supplied(name: str, supplied: LinkInertia) -> str:
-    """Returns the note about a link whose mass or inertia the scenario states."""
+    """Returns a note for the user that the scenario replaces the mass or inertia of a link."""
     if supplied.mass_kg == 0.0:
         return f"{_link(name)}: the scenario leaves its mass out"
     keys = ", ".join(supplied.list_given_keys())
@@ -783,7 +803,7 @@ def _note_supplied(name: str, supplied: LinkInertia) -> str:
 def _read_joint(
     edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]
 ) -> UrdfJoint:
-    """Returns a moving joint of the arm.
+    """Reads a moving joint of the arm from a URDF file: axis, range, friction and moved body.
 
     Args:
         edge: Joint of the file.
@@ -820,7 +840,7 @@ def _read_joint(
 
 
 def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
-    """Returns the viscous and the Coulomb friction of a joint, 0 if they are not stated.
+    """Returns the viscous and the Coulomb (dry) friction of a joint, or 0 if not stated.
 
     Raises:
         ScenarioError: A friction is negative.
@@ -840,7 +860,7 @@ def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
 
 
 class _JointLimits(NamedTuple):
-    """Limits of a joint.
+    """Limits of a joint in a URDF file: its range, its largest speed and its largest effort.
 
     Attributes:
         lower: Smallest position, in rad or m.
@@ -915,7 +935,9 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
 
 
 def _child(element: Element, tag: str, subject: str) -> Element | None:
-    """Returns the only child element with a certain tag. None if there is none.
+    """Returns the only XML child element with a certain tag, or None if there is none.
+
+    Several elements with this tag are refused, because only one could be used.
 
     Raises:
         ScenarioError: There are several such elements.
@@ -929,7 +951,7 @@ def _child(element: Element, tag: str, subject: str) -> Element | None:
 def _read_number(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> float:
-    """Returns the number in an attribute of an element.
+    """Reads a number from an attribute of an XML element, and refuses one that is out of range.
 
     Args:
         element: The element.
@@ -948,7 +970,7 @@ def _read_number(
 
 
 def _parse_number(text: str, attribute: str, subject: str, limit: float) -> float:
-    """Returns the finite number in a text.
+    """Converts a text of a URDF file to a number, and refuses NaN, infinity and huge numbers.
 
     Args:
         text: The text.
@@ -971,7 +993,7 @@ def _parse_number(text: str, attribute: str, subject: str, limit: float) -> floa
 def _read_vector(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> Three:
-    """Returns the three numbers in an attribute of an element, see `_read_number`."""
+    """Reads three numbers from an attribute of an XML element, see `_read_number`."""
     texts = element.get(key, "").split()
     attribute = f"{element.tag} {key}"
     if len(texts) != 3:
@@ -984,9 +1006,9 @@ def _read_vector(
 
 
 def _read_origin(parent: Element, subject: str) -> _Pose:
-    """Returns the frame that the element <origin> of a joint or inertia states.
+    """Reads the pose that the XML element <origin> states for a joint or an inertia.
 
-    Without this element, the frame is that of the parent.
+    Without this element, the pose is that of the parent element's frame.
 
     Raises:
         ScenarioError: The element has an unknown attribute, or a number is wrong.
@@ -1020,7 +1042,7 @@ def _read_origin(parent: Element, subject: str) -> _Pose:
 
 
 class _Inertial(NamedTuple):
-    """Inertia of a link, in the frame of the link.
+    """Mass, centre of mass and inertia tensor of a link, in the frame of the link.
 
     Attributes:
         mass: Mass, in kg. 0 if it is not stated.
@@ -1042,7 +1064,7 @@ _POINT_TENSOR = fill_tensor((0.0,) * 6)
 
 
 def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _Inertial | None:
-    """Returns the inertia of a link. None if the link has no mass.
+    """Reads the mass and inertia of a link, or returns None if the link has no mass.
 
     Args:
         link: XML element of the link.
@@ -1095,9 +1117,10 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
 def _read_stated_inertial(
     inertial: Element, name: str, supplied: LinkInertia
 ) -> tuple[float | None, _Pose, Matrix | None]:
-    """Returns the mass, the frame and the tensor of an <inertial> element.
+    """Reads the mass, the frame and the inertia tensor from an XML element <inertial>.
 
-    Parts that the scenario replaces are not read. Therefore errors in such parts do not matter.
+    Parts that the experiment replaces are not read. Therefore errors in such parts do not
+    matter.
 
     Args:
         inertial: The element.
@@ -1123,7 +1146,7 @@ def _read_stated_inertial(
 
 
 def _find_mass_problem(inertial: _Inertial) -> str:
-    """Returns the reason why the mass of a link is impossible. Empty if it is possible."""
+    """Returns why no real body can have the mass of a link, or "" if it is possible."""
     if inertial.lacks == "mass":
         return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
@@ -1134,7 +1157,9 @@ def _find_mass_problem(inertial: _Inertial) -> str:
 
 
 def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameters:
-    """Returns the inertial parameters of the payload in the frame of the last moving link.
+    """Returns the mass and inertia of a payload in the frame of the link that carries it.
+
+    The payload, for example a tool, is fixed to the tip of the arm.
 
     Args:
         payload: The payload, in the frame of the tip.
@@ -1224,10 +1249,10 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
 
 
 def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
-    """Returns the sum of the bodies that one joint moves.
+    """Adds up the masses and inertias of all links that one joint moves together.
 
-    Links that do not lead to the tip may have impossible moments of inertia. They count as
-    stated if the sum is a possible body all the same. Otherwise they count as points of mass.
+    Links on side branches may have impossible moments of inertia. They count as stated if the
+    sum is a possible body all the same, otherwise as points of mass.
 
     Args:
         edge: The joint.
@@ -1265,7 +1290,7 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> 
 
 
 def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
-    """Returns the sum of the inertial parameters of bodies in the same frame."""
+    """Returns the mass and inertia of several bodies together, given in the same frame."""
     total = bodies[0]
     # The built-in `sum` rounds differently from Python 3.12 on.
     for body in bodies[1:]:
@@ -1274,10 +1299,7 @@ def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
 
 
 def _find_sum_problem(total: BodyParameters) -> str:
-    """Returns the reason why the sum of the bodies at a joint is impossible.
-
-    Empty if it is a body with mass and extent.
-    """
+    """Returns why no real body can have the summed mass and inertia at a joint, or ""."""
     mass = total[0]
     if mass < LEAST_MASS_KG:
         return (

@@ -50,7 +50,7 @@ RANK_TOLERANCE = 1e-6
 
 
 def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
-    """Returns the settings with which a scenario runs with simulated arms only.
+    """Returns the settings that must change to run an experiment with simulated arms only.
 
     The masses of a simulated arm are known, and only a real arm has a dead-man switch.
 
@@ -72,9 +72,10 @@ def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
 
 
 def write_simulated_options(scenario: Scenario) -> str:
-    """Returns the options `--set` with which a command runs with simulated arms only.
+    """Returns the command-line options that run an experiment with simulated arms only.
 
-    Error messages suggest them when a scenario with real arms cannot be simulated.
+    Error messages suggest these options `--set` when an experiment with real arms cannot be
+    simulated.
 
     Args:
         scenario: Description of the experiment.
@@ -87,10 +88,10 @@ def write_simulated_options(scenario: Scenario) -> str:
 
 
 def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> None:
-    """Refuses scenarios with arms that the program does not simulate itself.
+    """Refuses experiments with arms that the program does not simulate itself.
 
-    Such an arm is either a real robot outside of the program, or a user's class that computes
-    the motion.
+    Such an arm is either a real robot outside of the program, or a user's class computes its
+    motion.
 
     Args:
         scenario: Description of the experiment.
@@ -168,13 +169,12 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or whose reference could jump.
+    """Refuses real robots that lack limits, or that a jump of the reference could move.
 
-    The stale rule of a site says how it reacts if the samples of other sites are late or
-    missing. Only under the rule "glide" does the reference never jump.
-
-    The check is made before a session, and not for every scenario, because the scenarios in
-    logs of earlier versions may lack these keys.
+    The reference is the position that an arm follows. It could jump when another arm falls
+    silent or is heard again, except under the rule "glide". The check is made before a session
+    and not for every scenario, because the scenarios in logs of earlier versions may lack these
+    keys.
 
     Args:
         scenario: Description of the experiment.
@@ -201,7 +201,9 @@ def check_outside_arms(scenario: Scenario) -> None:
 
 
 def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
-    """Refuses a real robot whose stale rule lets its reference jump.
+    """Refuses a real robot whose reference position may jump when another arm falls silent.
+
+    A jump would move the robot suddenly. The rule for silent arms must therefore be "glide".
 
     Args:
         scenario: Description of the experiment.
@@ -218,10 +220,10 @@ def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
 
 
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a control law that its site cannot carry out.
+    """Refuses a control law that an arm cannot use, for example because its masses are unknown.
 
-    Keys of the site that contradict its plant are refused as well. The plant says who computes
-    or measures the motion of the arm: the program, a user's class, or a real robot.
+    Settings that contradict the way in which the arm moves are refused as well. An arm is
+    simulated by the program, simulated by a user's class, or a real robot.
 
     Args:
         name: Name of the site, for error messages.
@@ -256,7 +258,7 @@ def _check_law(name: str, site: SiteSpec, sites: int) -> None:
 
 
 def _check_plant(path: str, site: SiteSpec) -> None:
-    """Refuses keys that only a simulated arm, or only a real robot, can have.
+    """Refuses settings that only a simulated arm can have, or only a real robot.
 
     Args:
         path: Path of the site, for error messages.
@@ -287,7 +289,7 @@ def _check_plant(path: str, site: SiteSpec) -> None:
 
 
 def build_scenario(resolved: TomlTable) -> Scenario:
-    """Converts resolved tables to a scenario, and checks it completely.
+    """Converts complete tables of a scenario to an object, and checks them against each other.
 
     The order of the checks decides which error is reported if a scenario contains several.
 
@@ -339,7 +341,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _normalise_change(change: Change) -> Change:
-    """Returns a change whose link is written in the same form as the links of the scenario.
+    """Returns a change with its link written in the same form as the links of the scenario.
 
     Authors may write 350 or 350.0. Both must give the same text, so that both are the same
     experiment with the same hash.
@@ -386,7 +388,7 @@ def _check_joint_space(scenario: Scenario) -> None:
 
 
 def _check_links(scenario: Scenario) -> None:
-    """Refuses links, and delayed views of users, whose keys contradict each other."""
+    """Refuses network links and delayed views of users with contradictory keys."""
     links = {f"links.{name}": link for name, link in scenario.links.items()}
     views = {
         f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view
@@ -407,9 +409,9 @@ def _check_links(scenario: Scenario) -> None:
 def _check_damping(scenario: Scenario) -> None:
     """Refuses damping gains that are too large for the inertia of a light joint of a chain.
 
-    A sampled damping torque -K qd is held for one tick of duration h. A single joint of inertia
-    M then oscillates from tick to tick if K h / M >= 1 with the second-order scheme, or K h / M
-    >= 2 with the digital scheme. For several joints, the largest eigenvalue of K M^-1 takes the
+    A damping torque -K qd is held for one control period h. A single joint of inertia M then
+    oscillates from period to period if K h / M >= 1 with the second-order scheme, or K h / M >=
+    2 with the digital scheme. For several joints, the largest eigenvalue of K M^-1 takes the
     place of K / M. It is computed for the start pose.
     """
     for name, model in scenario.arms.items():
@@ -443,10 +445,10 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses law vectors that a site receives under one name but with different lengths.
+    """Refuses vectors that an arm receives from several laws under one name, unequally long.
 
-    A control law may send additional vectors to the peers, each with a name. A site stores the
-    vectors of all its peers in one array per name, so their lengths must agree.
+    A control law may send additional vectors to the other arms, each with a name. A receiver
+    stores those of one name in one array, so their lengths must agree.
     """
     for site in scenario.names:
         first_senders: dict[str, tuple[str, int]] = {}
@@ -463,11 +465,11 @@ def _check_received(scenario: Scenario) -> None:
 
 
 def _check_energy_laws(scenario: Scenario) -> None:
-    """Refuses scenarios in which only some sites have a law that keeps account of energy.
+    """Refuses scenarios in which only some arms have a law that keeps an account of energy.
 
-    Such a law proves passivity by counting the energy that enters and leaves the links. It
-    works only if both ends of each link count. It may have further conditions on the
-    integration scheme and the tick rates.
+    Such a law proves stability by counting the energy that enters and leaves each network link,
+    which works only if both ends count. It may have further conditions on the integration
+    scheme and the rates of the control loops.
     """
     laws = {name: site.control for name, site in scenario.sites.items()}
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
@@ -479,7 +481,9 @@ def _check_energy_laws(scenario: Scenario) -> None:
 def _check_energy_law(
     scheme: str, name: str, laws: dict[str, LawSettings], rates_hz: dict[str, int]
 ) -> None:
-    """Refuses an energy-counting law at one site if its conditions on all sites fail.
+    """Refuses a control law that accounts for energy at one arm, if the other arms do not fit.
+
+    For example, the other arms may use another law, or control loops with other rates.
 
     Args:
         scheme: Integration scheme of the scenario.
@@ -536,7 +540,9 @@ def _check_start_poses(scenario: Scenario) -> None:
 
 
 def _check_limits(scenario: Scenario, name: str) -> None:
-    """Refuses position limits that leave no room, have no effect or exclude the start pose.
+    """Refuses limits of joint positions that contradict each other or exclude the start pose.
+
+    Limits that can never have an effect are refused as well.
 
     Args:
         scenario: The scenario.
@@ -574,7 +580,7 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
 
 def _check_task_poses(scenario: Scenario) -> None:
-    """Checks the start poses of all sites that share the pose of the end effector."""
+    """Checks the start poses of all arms that follow each other's end effectors."""
     for name, model in scenario.arms.items():
         if model.shares_pose:
             _check_task_pose(scenario, name)
@@ -583,9 +589,9 @@ def _check_task_poses(scenario: Scenario) -> None:
 def _check_task_pose(scenario: Scenario, name: str) -> None:
     """Refuses a start pose from which the end effector cannot move along all followed axes.
 
-    The rows of the Jacobian J belong to the axes that the site follows. A row of zeros is an
-    axis along which no joint moves the end effector. If J does not have full row rank, the pose
-    is singular: the end effector cannot move along some combination of the axes.
+    The Jacobian J of the end effector has a row per followed axis. A row of zeros is an axis
+    along which no joint moves the end effector. If J does not have full row rank, the pose is
+    singular: the end effector cannot move along some combination of the axes.
 
     Args:
         scenario: The scenario.
@@ -633,10 +639,10 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
 
 
 def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
+    """Returns why a row of the dominance matrix is not valid, Eq. (7), or None if it is.
 
-    The row contains the weights with which one site follows the others. They must lie between 0
-    and 1 and sum to 1, and the site must not follow itself.
+    The row contains the weights with which one arm follows the others. They must lie between 0
+    and 1 and sum to 1, and the arm must not follow itself.
 
     Args:
         row: Dominance factors of one site, shape (N,).
@@ -659,7 +665,7 @@ def find_row_problem(row: Array, site: int) -> str | None:
 def _check_actors(
     actors: Sequence[operators.Operator | operators.Environment], path: str
 ) -> None:
-    """Refuses operators or bodies of the environment whose keys contradict each other.
+    """Refuses persons (operators) or environments such as walls whose settings contradict.
 
     Args:
         actors: The operators or bodies of one site.
@@ -672,11 +678,11 @@ def _check_actors(
 
 
 def _check_hands(site: SiteSpec, path: str) -> None:
-    """Refuses operators of a site that cannot exist, or that would act between its ticks.
+    """Refuses persons and programs who cannot move an arm as the experiment states.
 
     An arm has at most one live operator: a person, or a program in the session, who moves the
-    arm during the run. The program must simulate this arm. An operator that is a user's program
-    acts every n-th tick, so its rate must divide the tick rate of the site.
+    arm during the run. The program must simulate this arm. A user's program acts in every n-th
+    control period, so its rate must divide the rate of the control loop.
 
     Args:
         site: The site.
@@ -706,10 +712,11 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:
-    """Refuses links of a site whose samples in transit would need too much memory.
+    """Refuses network links on which more messages would wait than memory permits.
 
-    A sample is in transit from its sending until its delay has passed. The memory grows with
-    the delay, the tick rate and the number of sites. `MAX_LINKS_BYTES` is the limit.
+    A message waits at the receiver until its simulated delay has passed. The memory grows with
+    the delay, the rate of the control loop and the number of arms. `MAX_LINKS_BYTES` is the
+    limit.
 
     Args:
         scenario: Description of the experiment, with its links and tick rates.
@@ -730,11 +737,11 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses stale rules under which a site would wait for its peers during the whole run.
+    """Refuses time limits for silent arms that would be exceeded in normal operation.
 
-    The stale rule of a site says when the samples of a peer are too old, and what happens then.
-    The tick period of a peer alone must not make it count as silent, and the fixed delay of a
-    link alone must not make its samples too old.
+    An arm counts as silent if its last message is too old. The period between two messages, and
+    the fixed delay of the network link, must be below the limit. Otherwise the receiver would
+    wait during the whole run.
 
     Args:
         scenario: Description of the experiment.
@@ -796,10 +803,11 @@ def _check_lost(scenario: Scenario) -> None:
 
 
 def _can_lose_master(scenario: Scenario, name: str) -> bool:
-    """True if a site can go on after some master that it follows has become silent.
+    """Returns True if an arm can go on after some master that it follows has fallen silent.
 
-    The site must follow another site as well. The remaining sites must all reach each other
-    along nonzero dominance factors: their dominance matrix must be irreducible.
+    A master is an arm that a person moves. The arm must follow another arm as well. The
+    remaining arms must all follow each other, directly or through others (irreducible matrix of
+    weights).
 
     Args:
         scenario: The scenario.

@@ -22,7 +22,7 @@ from .key_checks import StructType, find_extra, list_fields
 def written_kind(
     kind: StructType, *other_keys: str, takes_distributions: bool = True
 ) -> StructType:
-    """Returns the type of the table that an author may write for a type of a complete table.
+    """Returns the type of a table as its author may write it, from that of the complete one.
 
     Every key may be left out. A single number may stand for a vector with one number per joint,
     axis or parameter.
@@ -43,7 +43,9 @@ def written_kind(
 
 
 def written_type(hint: Any, takes_distributions: bool) -> Any:
-    """Returns the type that an author may write for the type of a complete value.
+    """Returns the type that an author may write for a key, from the type of its complete value.
+
+    For example, a single number may stand for a vector with a number per joint.
 
     For example, a number may be a number or a distribution, and a vector with one entry per
     joint may be a number, a distribution, or a list of both.
@@ -101,7 +103,7 @@ def _list_type(hint: Any, takes_distributions: bool) -> Any:
 
 
 def _split_annotation(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
-    """Returns a type without its annotations, and its annotations."""
+    """Splits the annotation of a field into the type itself and its limits."""
     if get_origin(hint) is Annotated:
         return get_args(hint)[0], hint.__metadata__
     return hint, ()

@@ -90,10 +90,10 @@ key does not name them as the owners of the key.
 
 
 class WrittenSite(Frozen, frozen=True, kw_only=True):
-    """Table of a site as an author may write it, see `scenario_types.SiteSpec`.
+    """Table of one arm as an author may write it.
 
-    The keys of `control`, `view` and of the tables in the lists depend on the kind that the
-    table names.
+    The complete form is `scenario_types.SiteSpec`. The keys of `control`, `view` and of the
+    tables in the lists depend on the kind that the table names.
     """
 
     role: Literal["master", "slave"] | UnsetType = UNSET
@@ -112,9 +112,10 @@ class WrittenSite(Frozen, frozen=True, kw_only=True):
 
 
 class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
-    """Planned change of a link or of dominance factors as an author may write it.
+    """Planned change of a network link, or of weights, as an author may write it.
 
-    The keys of `to` depend on what is changed, see `scenario_types.Change`.
+    The weights (dominance factors) state how much an arm follows the others. The keys of `to`
+    depend on what is changed, see `scenario_types.Change`.
     """
 
     at_s: Annotated[float, Meta(extra={"must_be": "a time in s"})]
@@ -125,7 +126,9 @@ class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class WrittenScenario(Frozen, frozen=True, kw_only=True):
-    """Tables of a scenario file as an author may write them, see `scenario_types.Scenario`.
+    """Tables of a scenario file as its author may write them, with many keys left out.
+
+    `scenario_types.Scenario` is the complete form.
 
     Attributes:
         rate_hz: Tick rate of all sites that state no other, in Hz.
@@ -189,7 +192,7 @@ def check_tables(tables: TomlTable) -> WrittenScenario:
 
 
 def _check_site_names(names: Collection[str]) -> None:
-    """Refuses names that a site cannot have, and too few or too many sites.
+    """Refuses names that an arm cannot have, and too few or too many arms in a scenario.
 
     Args:
         names: Names of the sites.
@@ -217,7 +220,7 @@ def _check_site_names(names: Collection[str]) -> None:
 
 
 def check_control(table: TomlTable, law: str, path: str) -> None:
-    """Refuses a table `control` with a key that its law does not have, or a wrong gain.
+    """Refuses a control law's table with a key that the law does not have, or a wrong gain.
 
     Args:
         table: The table as its author wrote it.
@@ -229,7 +232,7 @@ def check_control(table: TomlTable, law: str, path: str) -> None:
 
 
 def check_link(table: TomlTable, model: str, path: str) -> None:
-    """Refuses a table of a link with a key that its delay model does not have.
+    """Refuses a network link's table with a key that its delay model does not have.
 
     Args:
         table: The table as its author wrote it.
@@ -245,7 +248,7 @@ def check_link(table: TomlTable, model: str, path: str) -> None:
 def _check_foreign_keys(
     table: TomlTable, kinds: Mapping[str, StructType], group: str, chosen: str, path: str
 ) -> None:
-    """Refuses a key that belongs to another law or delay model than that of a table.
+    """Refuses a key that belongs to another control law or delay model than the chosen one.
 
     Upper and lower case count as equal, so that the user of `control.D` learns of `d`. A key
     that differs from a valid one only in its case is left to `check_table`, which suggests it.

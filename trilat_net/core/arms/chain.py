@@ -194,9 +194,10 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
 
 @leaf
 def three(a: Vector) -> Three:
-    """Returns the three numbers of an array as a tuple.
+    """Returns the first three numbers of an array as a tuple, for vector arithmetic in 3D.
 
-    Compiled code handles a tuple without allocating memory.
+    Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
+    control loop.
 
     Args:
         a: A vector of length 3, for example a field of a joint's row.
@@ -207,6 +208,8 @@ def three(a: Vector) -> Three:
 @leaf
 def put_three(a: Array, values: Three) -> None:
     """Writes a vector, given as a tuple of three numbers, into an array of length 3.
+
+    The array is overwritten in place, because compiled code of the control loop allocates none.
 
     Args:
         a: The array, which is changed.
@@ -220,7 +223,7 @@ def put_three(a: Array, values: Three) -> None:
 
 @leaf
 def dot(a: Three, b: Three) -> float:
-    """Returns the scalar product a' b."""
+    """Returns the scalar product a' b = a_1 b_1 + a_2 b_2 + a_3 b_3 of two 3D vectors."""
     x = a[0] * b[0]
     y = a[1] * b[1]
     z = a[2] * b[2]
@@ -229,7 +232,7 @@ def dot(a: Three, b: Three) -> float:
 
 @leaf
 def cross(a: Three, b: Three) -> Three:
-    """Returns the vector product a x b."""
+    """Returns the vector product a x b of two 3D vectors, which is perpendicular to both."""
     x = a[1] * b[2] - a[2] * b[1]
     y = a[2] * b[0] - a[0] * b[2]
     z = a[0] * b[1] - a[1] * b[0]
@@ -238,7 +241,7 @@ def cross(a: Three, b: Three) -> Three:
 
 @leaf
 def add(a: Three, b: Three) -> Three:
-    """Returns a + b."""
+    """Returns the sum a + b of two 3D vectors, element by element."""
     x = a[0] + b[0]
     y = a[1] + b[1]
     z = a[2] + b[2]
@@ -247,7 +250,7 @@ def add(a: Three, b: Three) -> Three:
 
 @leaf
 def subtract(a: Three, b: Three) -> Three:
-    """Returns a - b."""
+    """Returns the difference a - b of two 3D vectors, element by element."""
     x = a[0] - b[0]
     y = a[1] - b[1]
     z = a[2] - b[2]
@@ -256,7 +259,7 @@ def subtract(a: Three, b: Three) -> Three:
 
 @leaf
 def scale(factor: float, a: Three) -> Three:
-    """Returns factor * a."""
+    """Returns a 3D vector multiplied by a number, factor * a."""
     x = factor * a[0]
     y = factor * a[1]
     z = factor * a[2]
@@ -265,7 +268,10 @@ def scale(factor: float, a: Three) -> Three:
 
 @leaf
 def rotate(R: Array, a: Three) -> Three:
-    """Returns the product R a, the vector `a` rotated by R.
+    """Returns the product R a of a rotation matrix and a 3D vector.
+
+    If R is the orientation of a link in the base frame, a vector given in the axes of the link
+    becomes the same vector in the axes of the base.
 
     Args:
         R: Rotation matrix, shape (3, 3).
@@ -280,7 +286,9 @@ def rotate(R: Array, a: Three) -> Three:
 
 @leaf
 def _rotate_back(R: Array, a: Three) -> Three:
-    """Returns the product R' a, the vector `a` rotated by the inverse of R.
+    """Returns the product R' a: a 3D vector rotated by the inverse of a rotation matrix R.
+
+    The inverse of a rotation matrix is its transpose, so that no equations are solved.
 
     Args:
         R: Rotation matrix, shape (3, 3).
@@ -294,7 +302,7 @@ def _rotate_back(R: Array, a: Three) -> Three:
 
 
 def apply(a: Matrix, b: Three) -> Three:
-    """Returns the product a b of a matrix and a vector.
+    """Returns the product of a 3 x 3 matrix `a` and a 3D vector `b`.
 
     The sums have a fixed order, so that the result has the same bits on every machine.
 
@@ -312,7 +320,7 @@ def apply(a: Matrix, b: Three) -> Three:
 
 
 def multiply(a: Matrix, b: Matrix) -> Matrix:
-    """Returns the product a b of two matrices of three rows.
+    """Returns the product a b of two 3 x 3 matrices, each given as three rows.
 
     The sums have a fixed order, so that the result has the same bits on every machine. The sums
     of a linear algebra library may differ in the last bit.
@@ -325,11 +333,12 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
 
 @leaf
 def place_joints(chain: RowArray, q: Vector) -> None:
-    """Computes the rotation R and the origin p of the frame of each link.
+    """Computes the position and orientation of each link of an arm from the joint positions.
 
-    Both refer to the frame of the previous link, and are written into the rows of the joints.
-    `build_chain` gives the equation of R. Most other functions of this module use these
-    results, so this function must be called first after each change of the positions.
+    The frame of a link moves with the link. Its rotation R and origin p (m) refer to the frame
+    of the previous link, and are written into the rows of `chain`, one per joint. `build_chain`
+    gives the equation of R. Call this function first after each change of the positions,
+    because most other functions of this module read R and p.
 
     Args:
         chain: Data of the joints, one row per joint; written.
@@ -384,7 +393,10 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
 
 @leaf
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
-    """Returns the linear and angular momentum I(pi) V of a link about the origin of its frame.
+    """Returns the linear and angular momentum of a link about the origin of its frame.
+
+    It is the product I(pi) V, where V is the spatial velocity of the link and I(pi) its spatial
+    inertia.
 
     Args:
         pi: Inertial parameters of the links: per link its mass m, m times its centre of mass,
@@ -419,9 +431,10 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
 
 @leaf
 def _along_axis(row: Row, linear: Three, angular: Three) -> float:
-    """Returns S' f, the component of a spatial force along a joint's axis.
+    """Returns the component of a spatial force along the axis of a joint, S' f.
 
-    It is the torque of a revolute joint or the force of a prismatic joint.
+    A spatial force f is a force together with a torque, and S is the axis. The result is the
+    torque of a revolute joint, N m, or the force of a prismatic (sliding) joint, N.
 
     Args:
         row: Data of the joint.
@@ -435,11 +448,12 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
 
 @leaf
 def friction_torque(row: Row, speed: float) -> float:
-    """Returns the torque with which friction opposes the motion of a joint, N m or N.
+    """Returns the torque with which friction opposes the motion of a joint, N m.
 
         f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
 
-    It increases with the velocity v. The second term is a smooth form of dry friction.
+    It increases with the joint velocity v. The second term is a smooth form of dry friction,
+    which would otherwise jump at v = 0 and disturb the integration.
 
     Args:
         row: Data of the joint, with the coefficients `viscous` and `coulomb`.
@@ -454,9 +468,10 @@ def friction_torque(row: Row, speed: float) -> float:
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
-    """Adds the force on a link to the force on the previous link, which has to transmit it.
+    """Adds the force on a link to the force on the previous link, which has to carry both.
 
-    The force and its torque are transformed to the frame of the previous link.
+    The inverse dynamics add up forces in this way from the last link of an arm to its base. The
+    force and its torque are first transformed to the frame of the previous link.
 
     Args:
         row: Data of the joint that moves the link.
@@ -724,10 +739,12 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
 
 @leaf
 def _add_composite(row: Row, before: Row) -> None:
-    """Adds a composite body to that of the previous link, about the previous link's origin.
+    """Adds the mass and inertia of a composite body to those of the previous link.
 
     A composite body is a link together with all links after it, as if they were rigidly
-    connected. The parallel-axis theorem is written out for the ten parameters of a body.
+    connected. The inertia matrix of an arm is computed from such bodies. The parallel-axis
+    theorem moves the inertia to the origin of the previous link; it is written out for the ten
+    parameters of a body (mass, first moments, moments of inertia).
 
     Args:
         row: Data of the joint that moves the body.
@@ -838,9 +855,10 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 
 @leaf
 def _stop_torque(row: Row, q: float, qd: float) -> float:
-    """Returns the torque of the mechanical stops at the ends of a joint's range, N m or N.
+    """Returns the torque of the mechanical stops at the ends of a joint's range, N m.
 
-    A stop is a spring and a damper, which only push the joint back into its range.
+    A stop acts only beyond the end of the range: a spring and a damper push the joint back, and
+    never pull. Within the range the torque is 0. For a joint that slides it is a force, N.
 
     Args:
         row: Data of the joint.

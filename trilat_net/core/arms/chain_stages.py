@@ -33,10 +33,11 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def place_chain(s: Row, chain: RowArray) -> None:
-    """Updates the frames of the joints and, in task space, the pose of the end effector.
+    """Updates the pose of every link of an arm and, in task space, of its end effector.
 
-    The other functions of this module use the results. Therefore this function must be called
-    after each change of the joint positions.
+    In task space, the arms follow each other's end effectors instead of their joint angles.
+    Call this function after each change of the joint positions, because the other functions of
+    this module use the poses.
 
     Args:
         s: State of the site (the process that runs the arm). If the site works in task space,
@@ -177,7 +178,9 @@ def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
-    """Computes the gravity torque of an arm with its true dynamic parameters.
+    """Computes the joint torque of gravity on a simulated arm, with its true masses.
+
+    The controller may not know these masses; `put_gravity` takes the parameters as an argument.
 
     Args:
         s: Settings of the site (the process that runs the arm), with the parameters.
@@ -221,10 +224,11 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque with which some of the operators and environments act on the arm.
+    """Computes the joint torque that operators and environments exert on an arm.
 
-    A sampled operator or environment is evaluated once per period of the control loop, and its
-    torque is constant until the next period. All others act continuously.
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    Some are sampled: their torque is evaluated once per period of the control loop and constant
+    until the next period. All others act continuously. One call covers one of the two groups.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -255,10 +259,11 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert on the arm now.
+    """Computes the torque that operators and environments exert on the arm at time t.
 
-    The state of the site receives the whole torque, the part that stays constant until the next
-    period of the control loop, and the largest force of a wall.
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    The row `s` of the arm receives the whole torque, the part that stays constant until the
+    next period of the control loop, and the largest force of a wall.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -302,9 +307,11 @@ def update_external_torque(
 def put_stage_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque of operators and environments for a stage of the integrator.
+    """Computes the torque of operators and environments at a stage of the integrator.
 
-    A stage is one of the four evaluations of the Runge-Kutta method in a control period.
+    The Runge-Kutta method evaluates the accelerations of the arm four times per control period,
+    at four states (stages). Walls and springs act continuously, so each stage needs their
+    torque at its own time and position.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
@@ -329,11 +336,11 @@ def put_stage_torque(
 
 @leaf
 def put_stage_acceleration(s: Row, chain: RowArray) -> None:
-    """Computes the joint accelerations for a stage of the integrator.
+    """Computes the joint accelerations at an intermediate state (stage) of the integrator.
 
-    A stage is one of the four evaluations of the Runge-Kutta method in a control period. The
-    torque is the sum of the motor torque u, which is constant during the period, and the torque
-    of operators and environments in the stage.
+    The Runge-Kutta method evaluates the accelerations at four stages per control period. The
+    total torque is the sum of the motor torque u, which is constant during the period, and the
+    torque of operators (models of persons) and environments (walls, dampers) at this stage.
 
     Args:
         s: State of the site (the process that runs the arm), with the positions `stage_q`,
@@ -358,9 +365,10 @@ def put_stage_acceleration(s: Row, chain: RowArray) -> None:
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the joint accelerations for a stage of the integrator, with all torques.
+    """Computes the external torques and then the joint accelerations for an integrator stage.
 
-    A stage is one of the four evaluations of the Runge-Kutta method in a control period.
+    A stage is one of the four states at which the Runge-Kutta method evaluates the
+    accelerations of the arm in a control period.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
@@ -409,6 +417,9 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
 @leaf
 def begin_stages(s: Row, joints: int) -> None:
     """Prepares the first of the four stages of the Runge-Kutta method in a control period.
+
+    The first stage is the present state of the arm: its positions and velocities are copied,
+    and the sums of the derivatives are set to zero.
 
     Args:
         s: State of the site (the process that runs the arm).

@@ -79,10 +79,11 @@ _LARGE = 20.0
 
 @leaf
 def tanh(x: float) -> float:
-    """Returns the hyperbolic tangent, to two units in the last place; NaN for NaN.
+    """Returns the hyperbolic tangent, with equal bits on every machine; NaN for NaN.
 
-    The method and the coefficients of all polynomials are those of Cephes (`tanh` and `exp`).
-    Arguments with |x| < 0.625 use a rational function of x^2, where P and Q are polynomials:
+    The error is at most two units in the last place. The method and the coefficients of all
+    polynomials are those of Cephes (`tanh` and `exp`). Arguments with |x| < 0.625 use a
+    rational function of x^2, where P and Q are polynomials:
 
         tanh(x) = x + x^3 P(x^2) / Q(x^2)
 

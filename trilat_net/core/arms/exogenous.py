@@ -76,7 +76,9 @@ OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
 class TorqueSource(NamedTuple):
     """Settings of one operator or environment, which exerts a torque on an arm.
 
-    Which settings are used, and the meaning of the vectors, depend on the kind.
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    `kind` decides which of the other settings are used, and what the vectors `a` and `b` mean.
+    For a wall, for example, they are a point and a normal; for an operator, start and target.
 
     Attributes:
         kind: The kind of operator or environment.
@@ -171,7 +173,11 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Converts operators and environments to arrays, which compiled code can read.
+    """Converts operators and environments to two NumPy arrays, which compiled code can read.
+
+    An operator is a model of a person who moves an arm, and an environment a wall or a damper.
+    Compiled code cannot read Python objects, and lists of different lengths, such as recorded
+    torques, are joined into one table.
 
     Args:
         actors: Operators and environments of the arm, one row for each.
@@ -350,7 +356,9 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 
 @leaf
 def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
-    """Finds the two rows of recorded torques between which to interpolate at a time.
+    """Finds the two recorded torques between which to interpolate at time t.
+
+    The recording is a table with a row per time, in which a bisection finds the neighbours.
 
     Args:
         actor: Data of the operator, with the place of its rows in the common table.
@@ -524,9 +532,10 @@ def _is_at_end_effector(actor: Row) -> bool:
 def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
     """Calls the compiled function of an operator or environment that a user wrote.
 
-    The function exchanges its numbers through the row of the actor: the caller has written the
-    position (`at`) and the velocity (`speed`), and the function writes the torque or force
-    (`effort`), which is zero until then.
+    An operator is a model of a person who moves an arm, and an environment a wall or a damper.
+    Function and program exchange numbers through the fields of the row `actor`: before the call
+    the program has written position (`at`) and velocity (`speed`), and the function writes the
+    resulting torque or force into `effort`, which is zero before the call.
 
     Args:
         actor: Data of the operator or environment. `call` is the address of the function.
@@ -602,7 +611,10 @@ def _end_effector_torque(
 def source_torque(
     t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
 ) -> SourceTorque:
-    """Computes the torque with which a single operator or environment acts on the planar arm.
+    """Computes the joint torque that one operator or environment exerts on the planar arm.
+
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    A force at the end effector is converted to joint torques by the transposed Jacobian.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -652,7 +664,9 @@ def add_source_torque(
     table: TorqueTable,
     sampled: int,
 ) -> SourceTorque:
-    """Adds the torque of one operator or environment to the torque of the previous ones.
+    """Adds the joint torque of one operator or environment to a running sum.
+
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 
     Args:
         total: Torque on the joints so far, N m, and the largest force of a wall so far, N.
@@ -684,11 +698,12 @@ def torque_on_arm(
     table: TorqueTable,
     sampled: int,
 ) -> SourceTorque:
-    """Computes the torque with which operators and environments act on the planar arm.
+    """Computes the joint torque that all operators and environments exert on the planar arm.
 
-    A sampled operator or environment is evaluated once per period of the control loop, and its
-    torque is constant until the next period. One call computes the torque of either the sampled
-    actors or all others.
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    Some are sampled: their torque is evaluated once per period of the control loop and constant
+    until the next period. One call computes the torque of either the sampled ones or all
+    others.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -783,7 +798,10 @@ def _add_joint_torque(
     table: TorqueTable,
     torque: Array,
 ) -> None:
-    """Adds the torque of an operator or environment that acts on the joints of a chain.
+    """Adds the torque of an operator or environment that acts directly on joints of a chain.
+
+    Examples are a recorded torque per joint, and a damper in each joint. Forces at the end
+    effector are converted to joint torques elsewhere, by `put_torque_on_chain`.
 
     Args:
         actor: Data of the operator or environment.
@@ -866,11 +884,12 @@ def put_torque_on_chain(
     sampled: int,
     torque: Array,
 ) -> float:
-    """Computes the torque with which operators and environments act on a chain of joints.
+    """Computes the joint torque that operators and environments exert on a chain of joints.
 
-    A sampled operator or environment is evaluated once per period of the control loop, and its
-    torque is constant until the next period. One call computes the torque of either the sampled
-    actors or all others.
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    Some are sampled: their torque is evaluated once per period of the control loop and constant
+    until the next period. One call computes the torque of either the sampled ones or all
+    others.
 
     Args:
         t_s: Time since the start of the session, s.

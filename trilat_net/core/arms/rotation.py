@@ -28,9 +28,11 @@ closed forms.
 
 @leaf
 def arctan(x: float) -> float:
-    """Returns the arc tangent of a number from 0 to 1, rad (Cephes, `atan`).
+    """Returns the arc tangent of a number from 0 to 1, rad, with equal bits on every machine.
 
-    The method is a rational function P / Q of x^2. Numbers above 0.66 are transformed first.
+    The standard library is not used, because its last bit differs between platforms. The method
+    is that of Cephes (`atan`): a rational function P / Q of x^2, after a transformation of
+    numbers above 0.66.
     """
     # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
     is_large = x > 0.66
@@ -84,7 +86,10 @@ def rotation_matrix(vector: Three) -> Matrix:
 def _choose_component(
     trace: float, xx: float, yy: float, zz: float, components: tuple[float, float, float, float]
 ) -> float:
-    """Returns one of four values, by the largest component of a quaternion.
+    """Returns one of four values, depending on which component of a quaternion is the largest.
+
+    The components themselves are not known yet. The diagonal xx, yy, zz of the rotation matrix
+    and its trace tell which of them has the largest magnitude.
 
     Args:
         trace: Trace of the rotation matrix.
@@ -155,7 +160,11 @@ def rotation_vector(R: Array | Matrix) -> Three:
 
 @leaf
 def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
-    """Returns the rotation from the orientation `other` to the orientation R, in base axes.
+    """Returns the rotation that turns the orientation `other` into the orientation R.
+
+    The result is a rotation vector in the axes of the base frame: its direction is the axis,
+    its length the angle in rad. It is the orientation error of an arm that should reach
+    `other`.
 
     Args:
         R: Rotation matrix of the first orientation, three rows.
@@ -176,10 +185,10 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 
 @leaf
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
-    """Returns the scalar products of a vector with the vectors a, b and c.
+    """Returns the scalar products of the vector `row` with the three vectors a, b and c.
 
-    This is a row of the product of a matrix with the transpose of the matrix with the rows a, b
-    and c.
+    These are one row of the product P Q' of two matrices, where `row` is a row of P, and a, b
+    and c are the rows of Q.
     """
     x = row[0]
     y = row[1]
@@ -211,7 +220,10 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
 
 @leaf
 def rotate_by_vector(turn: Three, vector: Three) -> Three:
-    """Returns a vector after a rotation.
+    """Returns a 3D vector after a rotation, which is given by its rotation vector.
+
+    A rotation vector has the direction of the axis, and its length is the angle in rad. For
+    example, the rotation vector (0, 0, pi/2) turns the x axis into the y axis.
 
     Args:
         turn: Rotation vector: its direction is the axis, its length the angle in rad.
@@ -223,7 +235,7 @@ def rotate_by_vector(turn: Three, vector: Three) -> Three:
 
 @leaf
 def length(vector: Three) -> float:
-    """Returns the Euclidean length of a vector, in the unit of its numbers."""
+    """Returns the Euclidean length of a 3D vector, in the unit of its numbers."""
     return math.sqrt(dot(vector, vector))
 
 

@@ -47,9 +47,9 @@ TINY = 1e-12
 
 @leaf
 def has_orientation(s: Row) -> bool:
-    """Returns True if the sites share poses, a position and an orientation.
+    """Returns True if the arms follow each other in position and orientation (6 coordinates).
 
-    It is False if they share only positions, or joint angles.
+    The result is False if they follow only positions of the end effector, or joint angles.
     """
     is_pose: bool = s.task != 0 and s.shared == POSE
     return is_pose
@@ -57,10 +57,11 @@ def has_orientation(s: Row) -> bool:
 
 @leaf
 def count_linear_coordinates(s: Row) -> int:
-    """Returns the number of shared coordinates that are not part of an orientation.
+    """Returns how many of the shared coordinates can be subtracted as plain numbers.
 
-    They come first. The difference of two such coordinates is a plain subtraction, but that of
-    two orientations is a rotation.
+    The arms of a session share positions (m) or joint angles (rad), which come first. The last
+    three coordinates of a pose are an orientation, and the difference of two orientations is a
+    rotation instead.
     """
     return POSITION if has_orientation(s) else s.q_des.shape[0]
 
@@ -210,7 +211,11 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 
 @leaf
 def _divide(number: float, pivot: float) -> float:
-    """Returns a number divided by a pivot of J J', or 0 if the pivot vanishes."""
+    """Returns a number divided by a pivot of a matrix factorisation, or 0 if the pivot is 0.
+
+    A pivot of J J' is 0 for a direction in which the end effector cannot move. The result 0
+    then means no motion in this direction.
+    """
     has_pivot = pivot > TINY
     return choose(has_pivot, number / choose(has_pivot, pivot, 1.0), 0.0)
 
@@ -255,7 +260,10 @@ def _factor(s: Row, damping: float) -> None:
 
 @leaf
 def _solve(s: Row, b: Array, y: Array) -> None:
-    """Solves the linear equations L D L' y = b, with the factors that `_factor` has computed.
+    """Solves the linear equations L D L' y = b by forward and backward substitution.
+
+    L is a lower triangular and D a diagonal matrix. `_factor` must have computed them before;
+    it stores both in `s.A`.
 
     Args:
         s: State of the site (the process that runs the arm). `A` has D on its diagonal, and the

@@ -28,7 +28,10 @@ from .elementary import sincos
 
 
 class ArmLinks(NamedTuple):
-    """Lengths, masses and inertias of the two links, which `theta_from_links` converts.
+    """Lengths, masses and inertias of the two links of a planar arm.
+
+    These are the quantities that one measures on a real arm. `theta_from_links` converts them
+    to the five parameters in which the equations of motion are linear.
 
     Attributes:
         l1_m: Length of the first link, m.
@@ -210,7 +213,10 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
 
 @leaf
 def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the positions of the elbow and the end effector for the joint angles.
+    """Returns the positions of the elbow and of the end effector of the planar arm, m.
+
+    The origin is the shoulder, with x to the right and y up. With both angles 0, the arm is
+    stretched along x.
 
     Args:
         lengths: Lengths of the two links, m.
@@ -232,7 +238,10 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the Jacobian of the end effector, which maps joint velocities to its velocity.
+    """Returns the Jacobian J of the planar arm's end effector, as two rows.
+
+    J qd is the velocity of the end effector (m/s) at the joint velocities qd (rad/s), and J' F
+    is the joint torque that corresponds to a force F at the end effector.
 
     Args:
         lengths: Lengths of the two links, m.

@@ -52,9 +52,10 @@ def update_errors(s: Row) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Integrates the adaptive law's estimate of the dynamic parameters over a time step.
+    """Advances the adaptive control law's estimate of the arm's parameters by a time step.
 
-    The result is limited to lower and upper bounds.
+    Each parameter, such as an inertia, is then limited to its lower and upper bound, so that
+    the estimate stays plausible.
 
     Args:
         s: State of the site (the process that runs the arm), with the estimate, its gains and
@@ -120,7 +121,9 @@ def update_torque(s: Row) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
-    """Computes the gravity torque of the planar arm with its true dynamic parameters.
+    """Computes the joint torque of gravity on the planar arm, with its true dynamic parameters.
+
+    The controller may not know these parameters; `put_gravity` takes them as an argument.
 
     Args:
         s: State of the site (the process that runs the arm), with the joint angles and
@@ -250,7 +253,7 @@ def update_external_torque(
 
 @leaf
 def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
-    """Returns x + step_s * rate, a linear step of two numbers over the duration `step_s`."""
+    """Returns x + step_s * rate: two joint values after a time at constant rates."""
     first = x[0] + step_s * rate[0]
     second = x[1] + step_s * rate[1]
     return first, second
@@ -306,7 +309,11 @@ def advance_stage(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
-    """Evaluates stage 2, 3 or 4 of the Runge-Kutta method, from the previous stage.
+    """Computes the state and the acceleration of stage 2, 3 or 4 of the Runge-Kutta method.
+
+    The method evaluates the acceleration of the arm at four states (stages) per control period.
+    The state of a stage is the start of the period plus `ahead_s` times the derivatives of the
+    previous stage.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
@@ -478,9 +485,10 @@ def rk4_step(
 
 @leaf
 def move_arm(s: Row, q: Pair, qd: Pair) -> bool:
-    """Writes joint angles and velocities into the state of a site, if they are finite.
+    """Writes joint angles and velocities into the state of an arm, if all are finite.
 
-    A simulation that has become unstable stops with its last finite state.
+    A simulation that has become unstable thus stops with its last finite state, instead of
+    filling the log with NaN.
 
     Returns:
         False if a number is not finite. Then the state is unchanged.

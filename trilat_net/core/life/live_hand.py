@@ -54,9 +54,10 @@ SILENT = "is silent: let go"
 
 
 class HandReach(NamedTuple):
-    """Region of the goals that an arm can reach: a spherical shell, a box, or both.
+    """Region of the positions that an arm can reach: a spherical shell, a box, or both.
 
-    The region may be larger than what the arm can really reach.
+    Goals outside are moved to its border, so that the arm is not pulled where it cannot go. The
+    region may be larger than what the arm can really reach.
 
     Attributes:
         centre: Centre of the shell, m. Empty if there is no shell.
@@ -73,10 +74,10 @@ class HandReach(NamedTuple):
     high: Vector = ()
 
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Moves a goal into the reachable region; a reachable goal stays unchanged.
+        """Returns the reachable position nearest to a goal, or the goal if it is reachable.
 
-        The goal is moved to the nearest point of the box, and then to the nearest point of the
-        spherical shell.
+        The goal is first moved to the nearest point of the box, and then to the nearest point
+        of the spherical shell.
 
         Args:
             goal: The goal, rad or m.
@@ -132,7 +133,10 @@ class HandRules(NamedTuple):
 
 
 class HandCommand(NamedTuple):
-    """Message by which a human or program moves an arm during the run.
+    """Message by which a person or program moves an arm during the run.
+
+    For example, a web page sends such a message for each movement of the mouse: who sends it,
+    where the arm shall be pulled, and whether the arm is still held.
 
     Attributes:
         source: Identifies the sender, a random number above 0.
@@ -152,7 +156,9 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """State of a human or program that moves an arm, as stored between two control periods.
+    """State of the pull of a person or program on an arm, stored between two control periods.
+
+    It states who holds the arm, how firmly, and how the point moves to which the arm is pulled.
 
     Attributes:
         source: Sender that holds the arm; 0: nobody, though a grip may still fade.
@@ -181,9 +187,10 @@ class HandMemory(NamedTuple):
 
 
 class HandInForce(NamedTuple):
-    """How a human or program pulls an arm in one control period, as a record contains it.
+    """How a person or program pulls an arm in one control period, as stored in a log.
 
-    A tick is a control period. The fields are in the order of the field `hand` of its record.
+    A record of the log has these numbers in its field `hand`, in the order of the attributes.
+    With them, a run can be repeated without the person. Control periods are called ticks.
 
     Attributes:
         grip: Firmness of the grip, 0 to 1.
@@ -201,7 +208,7 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Reads from a record what a person or program did with the arm in a control period.
+        """Reads how a person or program pulled an arm in one control period, from a log.
 
         Args:
             vector: Field `hand` of the record. It contains the numbers of all fields of this
@@ -219,7 +226,9 @@ class HandInForce(NamedTuple):
 
 
 class HandStep(NamedTuple):
-    """Result of one control period for the human or program that moves an arm.
+    """Result of one control period for the person or program that moves an arm.
+
+    It contains the new state, and the numbers that the log stores.
 
     Attributes:
         memory: State for the next period.
@@ -237,10 +246,10 @@ class HandStep(NamedTuple):
 
 
 def count_hand_numbers(size: int) -> int:
-    """Computes the length of the field `hand` of a record.
+    """Returns how many numbers the log stores about a person or program who moves the arm.
 
-    The field states what a person or program did with the arm in a control period. It contains
-    the numbers of a `HandInForce`.
+    They are the fields of a `HandInForce` for one control period, written one after another
+    into the field `hand` of a record. Vectors such as the goal have `size` numbers.
 
     Args:
         size: Number of coordinates of the target to which the arm is pulled.
@@ -249,7 +258,7 @@ def count_hand_numbers(size: int) -> int:
 
 
 def empty_hand_vector(size: int) -> list[float]:
-    """Returns the field `hand` of a record for a control period in which nobody holds the arm.
+    """Returns what the log stores in its field `hand` while no person or program moves the arm.
 
     Args:
         size: Number of coordinates of the target to which a holder would pull the arm.
@@ -366,7 +375,10 @@ def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> flo
 
 @leaf
 def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
-    """Returns the time in which a target glides to the goal of a new message, ns.
+    """Returns the time that the target of a pulled arm takes to reach a new goal, ns.
+
+    The target is the point to which a person or program pulls the arm. It arrives when the next
+    message is expected, so that it moves evenly instead of jumping with each message.
 
     Args:
         between_messages_ns: Time from the previous message to the new one, ns.

@@ -115,7 +115,9 @@ class HandProgram(Protocol):
     """
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Decides where the program pulls the arm, from what its control process knows.
+        """Decides where the program pulls the arm, given what it may know at this moment.
+
+        The program is called at regular times, for example 50 times a second.
 
         Args:
             now: State of the arm, of the target to which it is pulled, and of the other arms.
@@ -166,10 +168,10 @@ class OwnHand:
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the first tick after `k` in which the program decides or a decision acts.
+        """Returns the first control period after `k` in which the program changes anything.
 
-        A tick is a control period. Until that tick there is no new command. Therefore
-        `advance_span` computes the ticks before it in one compiled call.
+        In this period the program decides, or an earlier decision takes effect. Until then
+        `advance_span` computes all periods in one compiled call.
         """
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
         next_actions = [due for due, _ in self._due if due > k]
@@ -177,6 +179,8 @@ class OwnHand:
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Collects what the user's program may know when it decides how to pull the arm.
+
+        This is the state of its own arm, and the newest states that other arms have sent.
 
         Args:
             k: Control period of the decision. Its results have not been computed yet.
@@ -207,9 +211,10 @@ class OwnHand:
         )
 
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
-        """Returns what the program may know about the peers, the other arms.
+        """Returns what the user's program may know about the other arms.
 
-        It sees the samples (states of the peers) that this site used at the previous tick.
+        It sees the states of the other arms that this arm used in the previous control period,
+        after their network delay.
 
         Args:
             k: Number of the tick (control period) of the decision.
@@ -243,7 +248,7 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Checks a decision of the program, and schedules it after the program's reaction time.
+        """Checks a decision of the user's program, and schedules it after a reaction time.
 
         A decision is ignored if it is based on an older view of the arm than an earlier one.
 
@@ -287,7 +292,9 @@ class OwnHand:
         self._schedule(k, k, (), grip=False)
 
     def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
-        """Stores a command of the program until the tick (control period) in which it acts.
+        """Stores a decision of the user's program until the tick (period) in which it acts.
+
+        The wait imitates the reaction time of a person.
 
         Args:
             k: Tick of the view on which the command is based.
@@ -305,7 +312,10 @@ class OwnHand:
         self._due.append((due, command))
 
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Computes how the program pulls the arm in the next control period.
+        """Computes how the user's program pulls the arm in control period k.
+
+        Decisions whose reaction time has passed take effect. Then the point to which the arm is
+        pulled moves on by one period.
 
         Args:
             k: Number of the control period. It must follow the period of the previous call.

@@ -66,11 +66,11 @@ _KNOWN = int(Law.KNOWN)
 
 @leaf
 def rests(site: SiteRow) -> bool:
-    """Returns True if the arm comes to rest or is at rest in the present mode.
+    """Returns True if the arm is being brought to rest, or is at rest already.
 
-    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the rule for
-    other arms that are silent is `StaleAction.GLIDE`. Under the other rules, these modes do not
-    stop the arm smoothly.
+    This is so in the modes WAITING, HOLD, FAULT and STOPPED, but only if the scenario chose
+    `StaleAction.GLIDE` for arms that fall silent. With other choices, these modes do not stop
+    the arm smoothly.
     """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
@@ -93,9 +93,10 @@ def _find_brake_ratio(site: SiteRow) -> float:
 
 @leaf
 def _is_fast(site: SiteRow) -> bool:
-    """Returns True if the damping B of some joint alone would exceed its torque limit.
+    """Returns True if an arm moves so fast that braking by damping exceeds a torque limit.
 
-    The torque of the damping is B |qd|, where qd is the velocity of the joint.
+    The damping of a joint needs the torque B |qd|, where B is the damping gain in N m s/rad and
+    qd the velocity of the joint. It suffices that one joint exceeds its limit.
     """
     fast: bool = _find_brake_ratio(site) > 1.0
     return fast
@@ -124,10 +125,10 @@ def rests_by_law(site: SiteRow) -> bool:
 
 @leaf
 def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
-    """Enters a mode in which the arm comes to rest, and starts its rest reference.
+    """Begins to bring an arm to rest, for example because another arm has fallen silent.
 
-    The rest reference is the position that the joints follow until they stand still. An arm
-    that rests already keeps its reference, unless its control law failed now or before.
+    The joints then follow a motion that slows down until they stand still, the rest reference.
+    An arm that rests already keeps its reference, unless its control law failed now or before.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -148,7 +149,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 
 @leaf
 def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns the position that joint i follows while the arm comes to rest, and its velocity.
+    """Returns where joint i should be while the arm comes to rest, and with which velocity.
 
     `_write_rest_reference` says why joint space and task space keep them in different fields.
 
@@ -204,9 +205,10 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Slows down the reference that brings the joints to rest, by one or more periods.
+    """Slows down the motion that brings the joints of an arm to rest, by some control periods.
 
-    The rules are at the top of this module.
+    The joints follow this motion, which is called the rest reference. Its rules are at the top
+    of this module.
 
     Args:
         t_ns: Time of the present period of the control loop, ns since the start of the session.
@@ -302,12 +304,13 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
-    """Returns the filtered deviation of joint i from its rest reference.
+    """Returns how far joint i deviates from its motion at rest, as a filtered error in rad/s.
 
         s = qd - qd_ref + Lambda (q - q_ref)
 
-    The damping and the integral term of an arm at rest act on s. Lambda is the rate of the
-    adaptive law in joint space, and `REST_RATE_1_S` with any other law, which has no such rate.
+    The reference q_ref brings the joint to rest. The damping and the integral term of an arm at
+    rest act on s. Lambda is the rate of the adaptive law in joint space, and `REST_RATE_1_S`
+    with any other law, which has no such rate.
 
     Returns:
         The deviation s, rad/s or m/s.
@@ -323,7 +326,9 @@ def _find_slip(site: SiteRow, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque that is reduced towards zero by `change`, but not past zero.
+    """Returns a torque with a magnitude reduced by `change`, but at least zero.
+
+    For example, 3 N m reduced by 2 gives 1 N m, and -1 N m reduced by 2 gives 0.
 
     Args:
         torque: The torque, N m.
@@ -384,8 +389,8 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 def advance_rest(site: SiteRow) -> None:
     """Updates the integral term w of the torque that holds an arm at rest.
 
-    The term w carries a constant load, for example unknown gravity. In each period h of the
-    control loop, it changes by
+    The term carries a constant load, such as unknown gravity. In each control period h, it
+    changes by
 
         -h k B s,    s = qd - qd_ref + Lambda (q - q_ref)
 

@@ -102,9 +102,10 @@ def _limit_turn(site: SiteRow) -> None:
 
 @leaf
 def is_torque_finite(site: SiteRow) -> bool:
-    """Returns True if the torque that the control law wrote is finite for each joint.
+    """Returns True if the torque of each joint that the control law wrote is finite.
 
-    NaN is found too. Therefore a law that wrote no torque is noticed.
+    The torque is NaN before the law is called. Therefore the function also notices a law that
+    wrote no torque at all.
     """
     finite = True
     for i in range(site.joints):
@@ -114,9 +115,10 @@ def is_torque_finite(site: SiteRow) -> bool:
 
 @leaf
 def return_to_law(t_ns: int, site: SiteRow) -> None:
-    """Blends the torque of an arm that leaves its rest into the torque of the control law.
+    """Blends from the torque that held an arm at rest to the torque of its control law.
 
-    The torque changes linearly within BLEND_S, so that the arm does not jerk.
+    The blend is linear and takes BLEND_S, because a sudden change of torque would make the arm
+    jerk.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.

@@ -102,10 +102,11 @@ _ORDER_HELD = int(LifeOrder.HELD)
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """Returns True if none of the other arms that this arm follows is silent.
+    """Returns True if this arm has recently received the state of every arm that it follows.
 
-    Another arm, a peer, is silent if none of its samples (sent states) came into use within the
-    last `silence_ns`. Peers with a weight (dominance factor) of zero are not followed.
+    The states are called samples, and the followed arms peers. A peer counts as silent if none
+    of its samples came into use within the last `silence_ns`. Peers with a weight (dominance
+    factor) of zero are not followed, and so may be silent.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -255,9 +256,9 @@ def _extrapolate_reference(site: SiteRow) -> None:
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
     """Returns True while the torque blends from the torque at rest to that of the control law.
 
-    The change starts when the arm begins to move from rest towards the other arms, and takes
-    `RETURN_NS`. An arm that aligns with the remaining arms after one was lost, or after a lost
-    one came back, was not at rest. It needs no change.
+    The blend starts when the arm begins to move from rest towards the other arms, and takes
+    `RETURN_NS`. An arm that aligns with the others because one of them was lost or came back
+    was not at rest, and needs no blend.
 
     Args:
         t_ns: Time, ns since the start of the session.
@@ -272,10 +273,10 @@ def is_law_returning(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
-    """Enters a mode in which the arm comes to rest, FAULT or STOPPED.
+    """Stops an arm for good: enters the mode FAULT or STOPPED, which only an order can end.
 
-    Only an order ends these modes. Estimates of the arm's parameters that are not finite become
-    zero, so that the gravity torque, which holds the arm, stays finite.
+    The arm comes to rest and is then held against gravity. Estimates of its parameters that are
+    not finite become zero, because the gravity torque is computed from them and must be finite.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -291,7 +292,7 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
 @leaf
 def _find_fault(site: SiteRow) -> int:
-    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is none.
+    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is not.
 
     A fault is a number that is not finite, an angle beyond its limits, or a speed above its
     limit.

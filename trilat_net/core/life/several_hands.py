@@ -27,9 +27,10 @@ ACTION_NUMBERS = 1 + 2 * AXES
 
 
 class HandArrays(NamedTuple):
-    """How programs pull the arms in L runs: the state and the limits of each pull.
+    """State and limits of the programs that pull the arms, in L simulations side by side.
 
-    See `HandMemory` and `HandRules` for the same quantities of a single run.
+    Each row belongs to one simulation. `HandMemory` and `HandRules` explain the same quantities
+    for a single simulation.
 
     Attributes:
         holds: 1 if the program holds the arm, shape (L,).
@@ -65,10 +66,10 @@ class HandArrays(NamedTuple):
 
 @leaf
 def _put_nearest_goal(lane: int, goal: Array, hands: HandArrays) -> None:
-    """Stores the goal to which a program pulls its arm, moved to where the arm can reach.
+    """Stores the goal to which a program pulls its arm, moved to the nearest point in reach.
 
-    The goal is moved to the nearest point of a box, and then of a spherical shell, as in
-    `HandReach.find_nearest`.
+    The point is first moved into a box, and then into a spherical shell, exactly as
+    `HandReach.find_nearest` does for a single simulation.
 
     Args:
         lane: Index of the run among the runs that are computed side by side.
@@ -114,7 +115,10 @@ def _advance_hands(
     rows: Array,
     actions: Array,
 ) -> None:
-    """Computes how each program pulls its arm in the next ticks, from its decisions.
+    """Computes how programs pull the arms in the next ticks, for several simulations at once.
+
+    A tick is a period of the control loop. Each simulation has one program, whose decision is
+    made at the start and acts for all these ticks.
 
     Args:
         runs: Number of runs.
@@ -179,7 +183,10 @@ def _advance_hands(
 
 
 class SeveralHands:
-    """Computes how programs pull the arms in several runs, one program in each run.
+    """Computes how programs pull the arms in several simulations at once.
+
+    A training environment, for example, simulates many runs side by side, and in each run one
+    program moves an arm. One compiled call then replaces a call per run.
 
     Args:
         count: Number L of runs.
@@ -228,9 +235,10 @@ class SeveralHands:
 
     @staticmethod
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Returns why the actions of a program cannot be computed for several runs at once.
+        """Returns why a program's pulls cannot be computed for several simulations at once.
 
-        The caller then computes each run alone, by `OwnHand`.
+        The result is empty if they can. Otherwise the caller computes each simulation alone, by
+        `OwnHand`.
 
         Args:
             rules: Limits of the program's actions.
@@ -249,7 +257,9 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Prepares a new run, in which the program does not hold the arm yet.
+        """Resets the numbers of one simulation, whose program does not hold its arm yet.
+
+        It is called for each simulation before its first tick, a period of the control loop.
 
         Args:
             run: Index of the run.
@@ -281,7 +291,9 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes how each program pulls its arm in the next ticks (control periods).
+        """Computes how each program pulls its arm during the next control periods (ticks).
+
+        Each simulation has one program and one arm, and one call advances all simulations.
 
         Args:
             runs: Number of runs that are advanced, the first ones.

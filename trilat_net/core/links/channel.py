@@ -44,9 +44,9 @@ _CUSTOM = int(DelayKind.CUSTOM)
 
 @leaf
 def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
-    """Returns True if a sample was sent during an outage, in which the link delivers nothing.
+    """Returns True if a message was sent during an outage, in which the link delivers nothing.
 
-    An outage includes its start and excludes its end.
+    Outages are intervals that the scenario lists. Each includes its start and excludes its end.
 
     Args:
         stamp_ns: Stamp of the sample, ns since the epoch, the common start of the session.
@@ -61,7 +61,10 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
 @leaf
 def loses_samples(model: Row) -> bool:
-    """Returns True if a network model may lose samples at random."""
+    """Returns True if the model of a network link drops messages at random.
+
+    If it does not, no random number needs to be drawn for the losses.
+    """
     return bool(model.loss_good != 0.0 or model.enter != 0.0)
 
 
@@ -94,7 +97,10 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Returns True if the network loses a sample (message), as random numbers decide.
+    """Decides by random numbers whether the simulated network loses a message.
+
+    Losses are independent or come in bursts, as the model says. The same seed, link and message
+    number always give the same decision, so that a run can be repeated.
 
     Args:
         sample: Index of the sample.
@@ -112,11 +118,11 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 def find_delay_us(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns the delay of a sample on a link, by the link's delay model, us.
+    """Returns the delay of a message on a simulated network link, us.
 
-    A sample is the state that another arm sends in one control period. The delay may follow a
-    distribution, a function of time, or a recorded trace, see `DelayKind`. The result is LOST
-    if the trace says that the sample is lost.
+    The delay may follow a distribution, a function of time, or a recorded trace, see
+    `DelayKind`. The result is LOST if the trace says that the message is lost. A message
+    (sample) is the state that another arm sends in one control period.
 
     Args:
         sample: Index of the sample.
@@ -149,9 +155,10 @@ def find_delay_us(
 
 @leaf
 def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int:
-    """Returns when a sample that is not lost is delivered, ns since the start of the session.
+    """Returns when a message that is not lost is delivered, ns since the start of the session.
 
-    A sample is the state that another arm sends in a control period.
+    This is the time of sending plus the delay. A minimum delay (play-out buffer) may postpone
+    it. A message is a sample: the state that another arm sends in a period of its control loop.
 
     Args:
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
@@ -178,10 +185,10 @@ def find_due_ns(
     model: Row,
     points: Points,
 ) -> int:
-    """Computes when a link delivers a sample (message), after its loss and delay were drawn.
+    """Computes when a network link delivers a message, after its loss and delay were drawn.
 
-    The result also depends on outages, duplicates and the order of samples. This function must
-    be called once for each sample, in the order of the indices.
+    Outages, duplicates and the order of messages matter too. The function must be called once
+    for each message (sample), in the order of the indices.
 
     Args:
         sample: Index of the sample.
@@ -221,11 +228,11 @@ def find_due_ns(
 def _due_ns(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Computes when a link delivers a sample, or that the link loses it.
+    """Computes when a network link delivers a message, or that it loses the message.
 
-    This function must be called once for each sample, in the order of the indices. The models
-    of bursts of loss and of correlated delays have a state, which it advances. Therefore loss
-    and delay are drawn even for a sample that is lost for another reason.
+    The function must be called once for each message (sample), in order, because bursts of loss
+    and correlated delays depend on the previous message. For the same reason, loss and delay
+    are drawn even for a message that is lost for another reason.
 
     Args:
         sample: Index of the sample, the state that the sender sent in the tick (period of its
@@ -257,9 +264,10 @@ def _due_ns(
 
 @leaf
 def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) -> bool:
-    """Selects the model of a link's delay and loss that is in force when a sample is sent.
+    """Selects the model of delay and loss that applies to a message, by the time of sending.
 
-    The model may change at planned times. A sample is the state that another arm sends.
+    A scenario may change the model at planned times, for example to a slower network after 5 s.
+    Messages that were sent before keep the earlier model.
 
     Args:
         sample: Index of the sample.
@@ -282,12 +290,11 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
 def schedule_deliveries(
     sample: int, link: LinkRow, models: RowArray, dues: IntArray, points: Points
 ) -> None:
-    """Computes at which times a simulated link delivers its samples, up to a given sample.
+    """Computes when a simulated network link delivers its messages, up to a given one.
 
-    A link connects one site (the process that runs one arm) to another. A sample is the state
-    that the sender sends in one period of its control loop. The model of the link's delay and
-    loss may change at planned times. Each sample follows the model in force when the sample was
-    sent.
+    Every arm's process sends its state once per control period; such a message is called a
+    sample. The model of the link's delay and loss may change at planned times. Each message
+    follows the model in force when it was sent.
 
     Args:
         sample: Index of the last sample to compute. Earlier samples are not computed twice.

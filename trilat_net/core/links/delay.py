@@ -62,9 +62,9 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """How a trace, a table of delays by time, continues after its last point.
+    """How a recorded delay trace, a table of delays by time, continues after its last entry.
 
-    It holds the last delay, or starts again.
+    It either holds the last delay or starts again from the first.
     """
 
     HOLD = 0
@@ -72,9 +72,10 @@ class TraceEnd(IntEnum):
 
 
 class LinkModel(NamedTuple):
-    """Network model of a link, its delay and its losses, for samples sent from a time on.
+    """Model of a network link: how long it delays messages, and how many it loses.
 
-    The stamp of a sample is the time at which it was sent.
+    It applies to the messages that are sent from a given time on, until the next model applies.
+    The time of sending is called the stamp of a message.
 
     Attributes:
         from_ns: First stamp to which the model applies, ns since the start of the session.
@@ -186,10 +187,10 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Computes an upper bound of the delays on a link.
+    """Returns an upper bound of the delay of any message on a link, us.
 
-    The bound decides for how many delayed samples the receiver reserves memory. It includes the
-    play-out buffer, a minimum delay that the receiver adds to reduce jitter.
+    The receiver reserves memory for as many waiting messages as this bound permits. The bound
+    includes the play-out buffer, a minimum delay that the receiver adds to reduce jitter.
 
     Args:
         models: The delay models that apply to the link, one after another.
@@ -366,12 +367,12 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Computes the delay of a sample (message) by the compiled function of a user's model.
+    """Computes the delay of a message by the compiled function of a user's model, us.
 
     The delay is limited to the maximum that the user's model declares. The function has two
-    arguments: the parameters of the user's model, and the row of the delay model. It reads its
-    input from the fields `key`, `sample` and `stamp_ns` of the row, and writes the delay into
-    the field `drawn_us`, see `plugged`.
+    arguments: the parameters of the user's model, and the data of the delay model. From the
+    latter, it reads the fields `key`, `sample` and `stamp_ns`, and writes the delay into the
+    field `drawn_us`, see `plugged`.
 
     Args:
         key: Seed of all random numbers of the link.
@@ -400,9 +401,9 @@ def custom_delay_us(
 
 @leaf
 def clamp_delay_us(delay_us: float) -> int:
-    """Returns a delay in whole microseconds, from 0 to `MAX_DELAY_US`.
+    """Returns a delay rounded to whole microseconds and limited to 0 to `MAX_DELAY_US`.
 
-    A distribution such as the normal one can draw a negative delay, which becomes 0.
+    A random distribution such as the normal one can give a negative delay, which becomes 0.
     """
     rounded_us = math.floor(delay_us + 0.5)
     return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))

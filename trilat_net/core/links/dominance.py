@@ -36,10 +36,9 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns which arms each arm follows, directly or through other arms.
+    """Finds which arms each arm follows, directly or through other arms.
 
-    The process that controls an arm is called a site. Site i follows site j if the dominance
-    factor alpha_ij, the weight of site j, is above 0.
+    Arm i follows arm j if the weight alpha_ij (dominance factor) is above 0.
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -56,9 +55,9 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """Returns True if every arm (site) follows every other one, directly or through others.
+    """Returns True if every arm follows every other one, directly or through others.
 
-    The stability theorem needs this property of the dominance matrix.
+    The stability theorem needs this property of the matrix of weights (dominance matrix).
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -155,9 +154,10 @@ end.
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
-    """Returns the dominance factor at a time during a linear change from `before` to `after`.
+    """Returns a weight at time t during its linear change from `before` to `after`.
 
-    The result is `after` once the change has ended.
+    The weight (dominance factor) states how much an arm follows another. It is `after` once the
+    change has ended.
 
     Args:
         t_ns: Time t, ns since the start of the session.
@@ -174,11 +174,11 @@ def _interpolate(
 
 @leaf
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
-    """Computes the dominance factors and their derivatives at time t, for each link.
+    """Computes the weights with which an arm follows the others, and their rates, at time t.
 
-    A dominance factor is the weight with which the site follows a peer, another site. It
-    changes by ramps, linear changes over time. A ramp starts at the factors that the previous
-    ramp has at that time, complete or not.
+    The weights are called dominance factors, one per network link. They change by ramps, which
+    are linear in time. A ramp starts at the factors that the previous ramp has at that time,
+    complete or not.
 
     Args:
         t_ns: The time, ns since the epoch, the common start of the session.
@@ -277,10 +277,10 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if nothing recent is known of some peer (other arm) that the site follows.
+    """Returns True if this arm has heard nothing recent of an arm that it follows.
 
-    That is, the sample (state) of the peer that is in use was sent too long ago. If there is no
-    such sample, the time counts from the epoch, the common start of the session.
+    That is, the message in use from the other arm was sent too long ago. If none has come yet,
+    the time counts from the common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.

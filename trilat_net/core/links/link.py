@@ -34,9 +34,9 @@ from .delay import MAX_DELAY_US, DelayKind
 
 @cache
 def link_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the row that stores the state of a link, see `LinkRow`.
+    """Returns the NumPy structured data type for the state of a network link, see `LinkRow`.
 
-    A link is the connection from another arm. An arm has one row per link, in scenario order.
+    A link is the one-way connection from another arm. There is one array element per link.
 
     Args:
         shared: Number of coordinates that sites share, the length of the row's vectors.
@@ -46,9 +46,9 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
 
 @cache
 def sample_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of a sample that waits until its simulated delay has passed.
+    """Returns the NumPy data type of a message that waits until its simulated delay has passed.
 
-    A sample is the state that another arm's process sends, see `SampleRow`.
+    A message (sample) is the state that another arm's process sends, see `SampleRow`.
 
     Args:
         shared: Number of coordinates of a sample: joint angles, or coordinates of the end
@@ -58,10 +58,10 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that the control law of another arm sends, in the order of their use here.
+    """Numbers that the control law of another arm sends, such as energies, as arrays.
 
-    C is the count of these numbers. If the arrays are for several peers (the processes of other
-    arms) or for several sites (the receivers), they have additional first axes.
+    C is the count of the numbers, in the order in which the law of this arm reads them. If the
+    arrays are for several senders or receivers, they have additional first axes.
 
     Attributes:
         waiting: Numbers that came with the samples whose simulated delay has not passed, one
@@ -78,7 +78,10 @@ class ChannelArrays(NamedTuple):
 
 
 class LinkArrays(NamedTuple):
-    """Arrays that hold the state of a link, the one-way connection from another arm's process.
+    """Arrays that hold the state of one network link, for compiled code.
+
+    A link is the one-way connection over which an arm's process receives the states of another
+    arm. Messages wait here until their simulated delay has passed.
 
     Attributes:
         state: State of the link, shape (1,), see `link_dtype`.
@@ -115,9 +118,10 @@ this, and LOST is above it.
 
 
 def span_ticks(span_ns: int, rate_hz: int) -> int:
-    """Returns how many ticks (control periods) a time takes, rounded up.
+    """Returns how many control periods (ticks) a duration takes, rounded up.
 
-    The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
+    For example, 2.5 ms take 3 ticks of a loop at 1000 Hz. Equal to `first_tick_at`, but in
+    plain Python, for callers that have not loaded the compiled code.
 
     Args:
         span_ns: The time, ns.
@@ -129,12 +133,11 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Computes how many entries the ring buffer needs in which delayed samples wait.
+    """Returns how many entries the ring buffer needs in which delayed messages wait.
 
-    A sample is the state that another arm's process sends. The ring buffer is called the
-    calendar, and its entries pages. There is one page for each period of the receiver's control
-    loop in which a sample may be used first. The default arguments give the largest number that
-    any link needs.
+    The buffer is called the calendar, and its entries pages. There is one page for each control
+    period of the receiver in which a message may be used first. The default arguments give the
+    largest number that any network link needs.
 
     Args:
         rate_hz: Rate of the receiver's control loop, Hz.
@@ -153,9 +156,9 @@ def calendar_pages(
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Computes in which period of the receiver's control loop a sample is used first.
+    """Computes in which control period of the receiver a message is used first.
 
-    A sample is the state that a sender publishes in one period of its own control loop.
+    A message (sample) is the state that a sender publishes in one period of its own loop.
 
     Args:
         tick: Number of the period in which the sample was sent.
@@ -190,9 +193,9 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 
 @leaf
 def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
-    """Returns True if a sample claims to have been sent more than AHEAD_LIMIT_S in the future.
+    """Returns True if a message claims to come from more than AHEAD_LIMIT_S in the future.
 
-    Such a sample is refused, because it would have to wait too long.
+    It is refused, because it would have to wait too long. The sender's clock may be wrong.
 
     Args:
         k: Present tick of the receiver.
@@ -208,10 +211,10 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Stores the numbers that the control law of another arm sent, until they may be used.
+    """Stores the numbers that the control law of another arm has sent, until they may be used.
 
-    The numbers came with a sample, the state of that arm. They wait together with the sample
-    until its simulated delay has passed.
+    The numbers, for example an energy, came in the same message as the state of the other arm,
+    and wait with it until its simulated delay has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
@@ -227,10 +230,10 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Passes the numbers that the control law of another arm sent to the law of this arm.
+    """Gives the control law of this arm the numbers that the law of another arm has sent.
 
-    The numbers came with a sample, the state of that arm. This function is called when the
-    simulated delay of the sample has passed.
+    The numbers, for example an energy, came in the same message as the state of the other arm.
+    The function is called when the simulated delay of this message has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
@@ -251,11 +254,11 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Stores a sample that arrived, until its simulated delay has passed.
+    """Stores a message that arrived from another arm, until its simulated delay has passed.
 
-    A sample is the state of a peer, the process of another arm. A sample that arrives after its
-    delivery time is used in the present tick, unless a newer sample is in use. Samples that
-    cannot be used are counted as refused, lost or duplicate.
+    A message (sample) is the state of the other arm. If it arrives after its delivery time, it
+    is used in the present control period, unless a newer one is in use. Messages that cannot be
+    used are counted as refused, lost or duplicate.
 
     Args:
         k: Present tick, the number of the receiver's control period.
@@ -317,15 +320,14 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Puts into use the newest sample of another arm whose simulated delay has passed.
+    """Puts into use the newest message of another arm whose simulated delay has passed.
 
-    A sample is the state that the other arm sent. If no sample is due in tick (control period)
-    k, the last one stays in use. This function must be called once in each tick of the
-    receiver, in order. Otherwise samples stay in the calendar, the ring buffer with a page per
-    tick in which `accept_sample` has put them.
+    If none is due in control period (tick) k, the last one stays in use. The function must be
+    called once in each period of the receiver, in order. Otherwise messages stay in the ring
+    buffer (calendar), which has a page per period. `accept_sample` has put them there.
 
-    The due times of all samples with a stamp up to the time t_k of the tick are computed here,
-    so that the first sample after a long silence costs no more than any other.
+    The delivery times of all messages that were sent up to the time t_k of the period are
+    computed here, so that the first message after a long silence costs no more than any other.
 
     Args:
         k: Tick of the receiver.

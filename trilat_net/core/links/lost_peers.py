@@ -126,11 +126,11 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
-    """Returns True if a returning peer moves the reference by at most the alignment limit.
+    """Returns True if an arm that comes back would move the reference only a little.
 
-    The reference, the position that the arm follows, is the mean of the positions of the other
-    arms, its peers, with their weights alpha. The limit applies to each linear coordinate, a
-    position or a joint angle, and to the orientation as a whole.
+    The reference, the position that this arm follows, is the mean of the positions of the other
+    arms with their weights alpha. The limit of the alignment applies to each linear coordinate,
+    a position or a joint angle, and to the orientation as a whole.
 
     Args:
         back: Index of the returning peer.
@@ -164,11 +164,10 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _redistribute_shares(links: RowArray) -> bool:
-    """Divides the weights of lost arms among the other arms that are followed.
+    """Divides the weights of lost arms among the other arms that this arm follows.
 
-    The followed arms are called peers, and the weight of a peer is its dominance factor alpha.
-    The present peers get the factors of the lost ones in proportion to their own, so that the
-    sum is 1 again:
+    The weight of a followed arm (peer) is its dominance factor alpha. The present peers get the
+    factors of the lost ones in proportion to their own, so that the sum is 1 again:
 
         alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
 

@@ -39,7 +39,10 @@ DrawKey = np.uint64
 
 
 def link_key(seed: int, link: str) -> int:
-    """Derives the seed of all random numbers of a network link.
+    """Returns the key from which all random numbers of a network link are computed.
+
+    It depends on the seed of the run and the name of the link. Two links therefore have
+    independent delays, and the same seed repeats them.
 
     Args:
         seed: Seed of the experiment.
@@ -102,10 +105,10 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 
 @leaf
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
-    """Returns two random numbers, uniform on the open interval (0, 1).
+    """Returns two random numbers with the uniform distribution on the open interval (0, 1).
 
-    The same arguments always give the same numbers, and draws with different arguments are
-    independent.
+    They are a function of the arguments, so that a run can be repeated. Draws with different
+    arguments are independent.
 
     Args:
         key: Key of the link for whose samples the numbers are drawn.

@@ -76,9 +76,9 @@ def compiled(law: T) -> T:
 
 
 def is_compiled(law: Any) -> bool:
-    """Returns True if the `torque` method of a law is compiled when a site is built.
+    """Returns True if a user's control law is compiled to machine code before a run starts.
 
-    The law's class must be marked with `compiled`. If Numba is disabled, nothing is compiled.
+    This is so if its class is marked with `compiled`, unless Numba, the compiler, is disabled.
     """
     config: Any = numba.config
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
@@ -95,7 +95,7 @@ def _all_finite(values: Array) -> bool:
 
 @leaf
 def finish_law(s: Row, law: Array, sent: Array) -> None:
-    """Checks the results of a control law, and limits its torque to the range of the motors.
+    """Checks the results of a user's control law, and limits its torque to the motors' range.
 
     Args:
         s: State of the site (the process that runs the arm), with the torque and the estimate;
@@ -130,10 +130,10 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Computes the torque of one tick by a compiled law (stage 6 of a tick).
+    """Computes the torque of an arm in one control period by a user's compiled law.
 
-    The row's field `asked` is 1 while the law runs. An exception that is raised meanwhile comes
-    from the law.
+    The field `asked` of the arm's state is 1 while the law runs, so that an exception can be
+    attributed to the law.
 
     Args:
         k: Number of the tick (control period).
@@ -158,9 +158,10 @@ def law_stage(
 
 
 class LawForm(NamedTuple):
-    """Data types for which a control law is compiled. Laws with equal types share the code.
+    """Data types for which a user's control law is compiled, such as its number of joints.
 
-    A peer is another arm, with which the law exchanges vectors.
+    Two laws of the same class with equal types share the compiled code. The other arms, with
+    which the law exchanges vectors, are called peers.
 
     Attributes:
         law: Names and shapes of the law's numbers: its gains and its memory.
@@ -182,10 +183,10 @@ class LawForm(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the data type with which a row of floats is read as vectors with names.
+    """Returns the NumPy data type that gives the numbers of an array the names of vectors.
 
-    A compiled law thus reads the vectors that other laws sent as fields, such as `received.F`.
-    The result is None if there are no vectors.
+    A compiled law thus reads vectors that other laws sent as fields, such as `received.F`. The
+    result is None if there are no vectors.
 
     Args:
         vectors: The vectors, one after another in the row.
@@ -211,7 +212,10 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 # Numba cannot return a record from a function, so the code becomes a part of each caller.
 @numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
 def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
-    """Returns the input of a control law in a control period, as views, without copying.
+    """Collects what a compiled control law may read and write in one control period.
+
+    The vectors are views of the arrays of the simulation, because copying would take time in
+    every period.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -437,7 +441,9 @@ def _reads_own_attribute(law: Any, name: str) -> bool:
 
 
 def _explain_field(name: str, kind: str, location: str) -> str:
-    """Tells a user that the input of a control law has no field with a name that the law uses.
+    """Explains to a user that the input of a control law has no field with a certain name.
+
+    The sentence suggests the field that was probably meant.
 
     Args:
         name: Name of the field.
@@ -477,9 +483,9 @@ def _explain_attribute(name: str, law: Any, location: str) -> str:
 
 
 class CompiledLaw:
-    """A user's compiled control law, with the arrays of the site that it controls.
+    """A user's control law as machine code, with the arrays of the arm that it controls.
 
-    `plug_law` creates the object. The site calls `compute` once per tick.
+    `plug_law` creates the object, and `compute` is called once per period of the control loop.
 
     Args:
         law: An instance of the law's class.
@@ -604,15 +610,15 @@ class CompiledLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law keeps from tick to tick, as they are now.
+        """Numbers that the control law keeps from this control period to the next.
 
-        A record contains them, so that `restore` can continue the run from there.
+        They are stored in the log, so that `restore` can continue a run from there.
         """
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the law to its state after a tick, from the record of that tick.
+        """Restores the control law to its state after a recorded control period.
 
         Args:
             memory: Numbers that `memory` returned after the tick.
@@ -620,7 +626,10 @@ class CompiledLaw:
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:
-        """Describes how the user's control law failed, if an exception came from the law.
+        """Describes how a user's control law failed, if an exception was raised by the law.
+
+        The result is None if the exception comes from the program itself, whose bugs must not
+        be blamed on the user.
 
         Args:
             error: An exception that was raised while the torque of a control period was

@@ -26,7 +26,9 @@ MAX_RECORD_SENT = 1024
 
 
 class SentVector(NamedTuple):
-    """Vector that a control law sends to other arms at every tick, for example energies.
+    """Vector that a control law sends to other arms in every control period, such as energies.
+
+    It travels in the same network message as the motion of the arm.
 
     Attributes:
         name: Name of the vector, as the law uses it.
@@ -42,7 +44,7 @@ class SentVector(NamedTuple):
 
 
 class _SentEntry(NamedTuple):
-    """One number that a law sends.
+    """One of the numbers that a control law sends to other arms, with its name and unit.
 
     Attributes:
         vector: Vector of the number.
@@ -68,9 +70,10 @@ class _SentEntry(NamedTuple):
 
 
 class LawChannel(NamedTuple):
-    """All vectors that the control law of an arm sends to the control laws of other arms.
+    """All vectors that the control law of one arm sends to the laws of other arms.
 
-    The vectors are in the order in which a record stores them.
+    Some laws send, besides the motion of the arm, vectors such as waves or energies. The
+    vectors are listed in the order in which the log stores them.
 
     Attributes:
         vectors: The vectors. Vectors that all peers (the other arms) receive come before
@@ -82,7 +85,10 @@ class LawChannel(NamedTuple):
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors that go to all peers, or those that go to each peer alone.
+        """Returns the vectors that a control law sends to all other arms, or to each arm alone.
+
+        A vector to each arm alone has a value of its own for each receiver, for example a wave.
+        The receivers are called peers.
 
         Args:
             per_peer: True: the vectors that go to each peer alone; false: those that go to all.
@@ -90,7 +96,9 @@ class LawChannel(NamedTuple):
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Counts the numbers of all vectors that have the same kind of receiver.
+        """Counts the numbers of all vectors that go to all peers, or to each peer alone.
+
+        A peer is another arm's process, which receives the vectors that the law sends.
 
         Args:
             per_peer: True for the vectors of which each peer (the process of another arm) gets
@@ -101,19 +109,19 @@ class LawChannel(NamedTuple):
 
     @property
     def received_size(self) -> int:
-        """Count of the numbers that one peer receives from the law with each sample.
+        """Count of the numbers that one other arm receives from the law with each message.
 
-        These are the vectors for all peers and one vector of each kind that is for a single
-        peer.
+        These are the vectors for all receivers, and one vector of each kind that has a value of
+        its own for each receiver.
         """
         return sum(vector.length for vector in self.vectors)
 
     @property
     def record_size(self) -> int:
-        """Number of floating-point numbers that the law sends in a period of the control loop.
+        """Count of the floats that the law sends to all receivers in a control period.
 
-        This is the length of the field `ch` of a record. A vector of which each peer (the
-        process of another arm) gets its own counts once for each peer.
+        This is the length of the field `ch` in the log. A vector with a value of its own for
+        each receiver counts once per receiver.
         """
         if not self.vectors:
             return 0
@@ -122,7 +130,9 @@ class LawChannel(NamedTuple):
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Finds the numbers that another control law reads, among those that this law sends.
+        """Finds the numbers that a receiving control law reads, in a message of this law.
+
+        The receiver may read fewer vectors, and in another order.
 
         Args:
             vectors: The vectors that the other law reads.
@@ -147,9 +157,9 @@ class LawChannel(NamedTuple):
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[_SentEntry]:
-        """Describes each number that the law sends in a period of the control loop.
+        """Describes each number that the law sends in a control period, one after another.
 
-        The numbers are in the order of the field `ch` of a record, which stores them.
+        The order is that of the field `ch` in the log.
 
         Args:
             peers: Names of the sites that run the other arms, in the order of the scenario.
@@ -167,7 +177,9 @@ class LawChannel(NamedTuple):
                     yield _SentEntry(vector, peer, n)
 
     def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
-        """Returns those of the sent numbers that one peer receives.
+        """Returns those of a law's sent numbers that one receiver (peer) gets.
+
+        They are the numbers for all receivers, and the numbers for this one alone.
 
         Args:
             sent: All numbers that the law sent in a tick, as the record contains them.
@@ -182,7 +194,7 @@ class LawChannel(NamedTuple):
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns all vectors that a control law may receive from the laws of other arms.
+    """Returns all vectors that the control law of an arm may receive from the other laws.
 
     A vector that several laws send, such as the energy E, appears once.
 

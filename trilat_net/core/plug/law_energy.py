@@ -21,10 +21,10 @@ from ..step.vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """Numbers that a control law received from another arm and sent to it, in K periods.
+    """Numbers that an arm's control law received from another arm and sent to it, in K periods.
 
-    In each period of its control loop, a site (the process that runs one arm) sends a sample
-    with its state. The law uses the newest sample that has arrived.
+    In each period of the control loop, every arm's process sends a message (sample) with its
+    state. The receiving law uses the newest message that has arrived.
 
     Attributes:
         tick: Number of the period in which the used sample was sent, shape (K,). -1 before the
@@ -40,7 +40,10 @@ class PeerRecords(NamedTuple):
 
 
 class LawRecords(NamedTuple):
-    """Recorded motion, torques and messages of a site in K ticks, for energy accounts.
+    """Recorded motion, torques and messages of one arm in K control periods.
+
+    From them, a control law computes an account of energies, which shows whether it was
+    passive.
 
     Attributes:
         h_s: The period, s.
@@ -64,12 +67,11 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Account of the energy that a control law gave, took, stored and dissipated in K ticks.
+    """Account of the energy that a control law gave, took, stored and dissipated.
 
-    All energies are in J and have the shape (K,) or (K, parts).
-
-    Flows are sums since the beginning. Each part, for instance that of a joint, must not be
-    below zero by itself.
+    It has K control periods. All energies are in J and have the shape (K,) or (K, parts). Flows
+    are sums since the beginning. Each part, for instance that of a joint, must not be below
+    zero by itself.
 
     Attributes:
         gave: Per peer, the energy that was sent to it.

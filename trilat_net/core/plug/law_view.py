@@ -28,7 +28,9 @@ from .user_law import LawInput, LawVector, PeerView, UserLaw, call_law, read_mem
 
 @leaf
 def _update_model(s: Row, chain: RowArray | None) -> None:
-    """Writes the gravity torque G, the inertia matrix M and the bias torque of the arm.
+    """Computes the gravity torque, inertia matrix and bias torque of an arm for a user's law.
+
+    The bias torque is that of Coriolis forces, gravity and friction, without acceleration.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -81,7 +83,9 @@ _FIRST_PEER_VECTOR = PeerView._fields.index("q")
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
-    """Divides a list of numbers into vectors with names, which a law reads as attributes.
+    """Divides a list of numbers into named vectors, which a control law reads as attributes.
+
+    For example, a law that receives the vector F reads it as `received.F`.
 
     Args:
         vectors: Names and lengths of the vectors.
@@ -97,9 +101,10 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 
 
 class PlainLaw:
-    """A user's control law in plain Python, with the arrays of the site that it controls.
+    """A user's control law in plain Python, with the arrays of the arm that it controls.
 
-    In each tick the law receives lists, and its results are written into the site's row.
+    In each control period, the law receives lists of numbers, and its results are written into
+    the arrays.
 
     Args:
         law: The law.
@@ -192,7 +197,7 @@ class PlainLaw:
         return read_memory(self._law)
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the law to its state after a tick, from the record of that tick.
+        """Restores the control law to its state after a recorded control period.
 
         Args:
             memory: Numbers that `memory` returned after the tick.
@@ -250,7 +255,7 @@ class PlainLaw:
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:
-        """Returns the numbers of all vectors that the law sends, in the order of the record.
+        """Returns all numbers that the law sends to other arms, in the order of the log.
 
         Args:
             now: Input of the tick, which contains the vectors that the law wrote.
@@ -265,7 +270,9 @@ class PlainLaw:
 
 
 def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) -> list[float]:
-    """Returns the numbers of the vectors that a law sends, one vector after another.
+    """Returns the numbers of the vectors that a control law sends, as one flat list.
+
+    The order and the lengths are those that the law has declared.
 
     Args:
         declared: Vectors that the law declares.

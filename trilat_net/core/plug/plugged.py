@@ -130,7 +130,7 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
 
 
 def find_address(compiled: Any) -> int:
-    """Returns the address of a compiled function, at which machine code can call it.
+    """Returns the memory address of a compiled function, at which machine code can call it.
 
     Args:
         compiled: Function that Numba compiled for one signature.
@@ -156,7 +156,9 @@ def _find_numbers(model: Any) -> dict[str, Array]:
 
 
 def list_numbers(model: Any) -> Array:
-    """Returns all parameters of a user's model in one array, in the order of its fields.
+    """Returns all numerical parameters of a user's model as one flat array of floats.
+
+    The compiled simulation stores the parameters of all models in this form.
 
     Args:
         model: A model of an operator, an environment or network delays.
@@ -196,8 +198,8 @@ def _compile(
     def call(numbers: Any, now: Any) -> None:
         """Calls the user's function with the parameters of its model as a record.
 
-        The kernel stores the parameters of all models as floats in one table. Their record
-        gives the function its field names back.
+        The simulation stores the parameters of all models as floats in one table. The record is
+        a view of the model's part of this table, with the names of the parameters.
 
         Args:
             numbers: The parameters, possibly followed by other floats.
@@ -224,6 +226,8 @@ def _compile(
 
 def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
     """Compiles a function of a user's model, and returns the address of its machine code.
+
+    The compiled simulation then calls the function by this address, without Python.
 
     Args:
         model: A model of an operator, an environment or network delays. The compiled function

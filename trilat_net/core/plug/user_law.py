@@ -25,7 +25,7 @@ from ..step.vectors import Vector
 
 
 class LawContext(NamedTuple):
-    """Facts about the arm and its peers that a control law receives when it is created.
+    """Facts about the arm and the other arms that a control law receives when it is created.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
@@ -66,7 +66,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """
 
     def compute(vector: "LawVector", other: Any) -> Any:
-        """Applies the operation `operate` to two vectors, or to a vector and a number.
+        """Applies an operation, such as addition, to two vectors or to a vector and a number.
 
         Args:
             vector: The first vector.
@@ -108,12 +108,10 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """What a control law knows about another arm (a peer) in a tick.
+    """What a control law knows about one of the other arms (a peer) in a control period.
 
-    This is the newest sample of the peer that the law may use, or the peer's start pose at rest
-    before the first sample.
-
-    A sample is the state that a peer published in one of its ticks.
+    It is the newest state that the other arm has sent and whose network delay has passed (its
+    sample). Before the first one, it is the start pose of the other arm, at rest.
 
     Attributes:
         alpha: Dominance factor of the peer now, the weight with which this site follows it.
@@ -138,7 +136,7 @@ class PeerView(NamedTuple):
 class LawInput(NamedTuple):
     """Input of a control law in one control period (tick), and the places for its results.
 
-    A vector has one number per joint, or one per coordinate that the sites share.
+    A vector has one number per joint, or one per coordinate that the arms share.
 
     >>> def torque(self, now: tn.LawInput) -> list[float]:
     ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
@@ -239,6 +237,8 @@ def call_law(
 ) -> "LawResults":
     """Calls a user's control law for one control period, and checks its results.
 
+    An exception or an unusable result is reported with the class, the arm and the period.
+
     Args:
         law: The law.
         site: Name of the site.
@@ -277,10 +277,10 @@ def call_law(
 
 
 class LawResults(NamedTuple):
-    """Results of a user's control law in one control period, as `call_law` returns them.
+    """Checked results of a user's control law in one control period.
 
-    They are the torque of each joint, the estimate of the arm's parameters, the memory that the
-    law keeps for the next tick, and the numbers that it sends to its peers.
+    They are the torque of each joint, the estimate of the arm's parameters, the numbers that
+    the law keeps for the next period, and those that it sends to other arms.
     """
 
     torque: list[float]
@@ -290,7 +290,10 @@ class LawResults(NamedTuple):
 
 
 def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
-    """Checks that the results of a law are finite and that its memory is not too large.
+    """Checks that the results of a user's control law are finite numbers, and not too many.
+
+    A torque that is NaN would make the simulation useless, and a large memory would fill the
+    log.
 
     Args:
         law: The law, for the error.
@@ -318,7 +321,9 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 def describe_failure(
     law: UserLaw, site: str, tick: int | None, error: BaseException
 ) -> LawFailed:
-    """Returns the error by which a site reports that its control law raised an exception.
+    """Converts an exception in a user's control law to an error with the class and the arm.
+
+    The message contains the line of the user's file.
 
     Args:
         law: The law.
@@ -333,10 +338,10 @@ def describe_failure(
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    """Yields the numbers of a value in order, for the memory of a law in the record.
+    """Yields the numbers of an attribute of a control law as floats, to store them in the log.
 
-    A number yields itself; nested lists yield their numbers row by row: [[1, 2], [3]] yields 1,
-    2 and 3, as floats.
+    A number yields itself; nested lists yield their numbers in order: [[1, 2], [3]] yields 1, 2
+    and 3.
     """
     if isinstance(value, Real):
         yield float(value)
@@ -368,10 +373,11 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
 
 
 def list_remembered(law: Any) -> tuple[str, ...]:
-    """Returns the names of the attributes that a law keeps from tick to tick.
+    """Returns the names of the attributes that a law keeps from one control period to the next.
 
-    The law's class lists them in `remembers`, for example `remembers = ("x",)`. The record of
-    each tick contains their values. Empty for a law without memory.
+    The law's class lists them in `remembers`, for example `remembers = ("x",)`. The log
+    contains their values, so that a run can be repeated. The result is empty for a law without
+    memory.
     """
     return tuple(getattr(law, "remembers", ()))
 
@@ -411,6 +417,8 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     """Restores the state that a control law had after a recorded control period.
 
+    A recorded run can then be continued or checked from that period on.
+
     Args:
         law: The law, which is changed.
         site: Name of the process that runs the arm, for the text of the exception.
@@ -426,12 +434,14 @@ def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
 
 
 def law_name(law: UserLaw) -> str:
-    """Returns the name of a law as a scenario writes it, "module:Class"."""
+    """Returns the name by which a scenario selects a user's law, as in "mylaws:Spring"."""
     return f"{type(law).__module__}:{type(law).__qualname__}"
 
 
 def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
-    """Returns the error for a problem with the results of a law.
+    """Returns the error for a problem with the results of a user's control law.
+
+    The error names the arm, the class and the control period.
 
     Args:
         law: The law.

@@ -65,6 +65,9 @@ def control_errors(
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
     """Computes Y' r, which drives the parameter estimate of the adaptive control law.
 
+    Y is the regressor, the 2 x 5 matrix that gives, times the five parameters of the planar
+    arm, its torque; r is the filtered tracking error.
+
     Args:
         Y: Regressor of the planar arm, two rows of five numbers. Y theta is the joint torque of
             an arm with the dynamic parameters theta.
@@ -87,9 +90,11 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
 
 @leaf
 def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
-    """Returns the estimate of the arm's parameters after a step of the adaptation, Eq. (15).
+    """Advances the adaptive law's estimate of the arm's parameters by one step, Eq. (15).
 
         theta_hat - gain_s Gamma Y' r
+
+    Gamma is the adaptation gain, Y the regressor and r the filtered tracking error.
 
     Args:
         theta_hat: Estimate of the parameters before the step, shape (5,).
@@ -108,7 +113,7 @@ def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector)
 
 @leaf
 def limit_torque(torque: float, limit: float) -> float:
-    """Returns a torque, limited to the range from -limit to limit."""
+    """Returns a torque limited to what a motor can exert, from -limit to limit."""
     return min(max(torque, -limit), limit)
 
 

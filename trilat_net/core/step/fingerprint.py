@@ -30,7 +30,9 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 
 @leaf
 def _compute_sines(angles: Array, results: Array) -> None:
-    """Writes the sine and the cosine of each angle into `results`, for the fingerprint.
+    """Computes the sine and the cosine of many angles, whose bits the fingerprint covers.
+
+    They are the operations in which platforms are most likely to differ.
 
     Args:
         angles: The angles, shape (n,), rad.
@@ -96,8 +98,8 @@ def compute_fingerprint() -> str:
     """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
 
     Two platforms with the same fingerprint can be expected to compute the same bits. It is a
-    hash of many sines and cosines, and of a short simulation of two arms. Each arm follows the
-    other, and receives its state of the previous tick.
+    hash of many sines and cosines, and of a short simulation of two arms that follow each
+    other.
     """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))

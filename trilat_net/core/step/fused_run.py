@@ -37,11 +37,11 @@ PROGRESS_DTYPE = row_dtype("progress", {})
 
 
 class RecentRecords(NamedTuple):
-    """Latest records of a site, kept as long as another site may still need them.
+    """Latest states that an arm's process has computed, for the other arms that receive them.
 
-    A site is the process that runs one arm. A record contains the numbers that a site computes
-    in one period of its control loop. The arrays are ring buffers. If they are for several
-    sites, they have an additional first axis for the site.
+    A record contains the numbers that are computed in one period of the control loop. It is
+    kept only as long as a delayed message may still need it. The arrays are ring buffers. For
+    several arms, they have an additional first axis.
 
     Attributes:
         t_ns: Times of the records, in ns since the start of the session. The length is a power
@@ -58,7 +58,7 @@ class RecentRecords(NamedTuple):
 
 @cache
 def sums_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the sums from which the metrics of a run are computed.
+    """Returns the NumPy data type of the sums from which the metrics of an arm are computed.
 
     `SumsRow` lists the sums, for example of squared errors and squared torques.
 
@@ -72,7 +72,10 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def max_over_joints(buckets: Array) -> Array:
-    """Computes the largest position error and joint speed of an arm in each interval of time.
+    """Returns the largest position error and joint speed of an arm in each interval of time.
+
+    The largest values are kept per joint during the simulation, and combined here for a figure
+    or table.
 
     Args:
         buckets: Statistics of an arm with n joints in K intervals of time, which are called
@@ -92,16 +95,18 @@ def max_over_joints(buckets: Array) -> Array:
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns where the numbers that a control law sends begin among all floats of a record."""
+    """Returns the column of a record at which the numbers begin that the control law sends.
+
+    A record is the row of floats that an arm's process computes in one control period.
+    """
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
 
 class ReplayedInputs(NamedTuple):
-    """Inputs of a recorded run, which a simulation of all N sites repeats.
+    """Inputs of a recorded run of N arms, with which a simulation repeats the run.
 
-    A site is a process that runs one arm. Each site has P peers, the other sites, whose samples
-    (states) it receives. A tick is one period of the control loop of a site.
+    Each arm receives the states of P other arms, its peers. A tick is one control period.
 
     Attributes:
         first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks
@@ -220,12 +225,12 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Repeats what a person did with the arm of a site in a tick of a recorded run.
+    """Repeats what a person did with an arm in one control period of a recorded run.
 
-    A live hand is a person or program that moves the arm during the run. A simulated spring
-    pulls the arm to the target of the hand. The grip, the target and the target one second
-    later are written into the row of the live hand. Nothing happens if the site has no live
-    hand, or after the end of the recorded run.
+    A person or program that moves the arm during the run is called a live hand. It is simulated
+    by a spring, which pulls the arm to a target. The grip (a factor of the force), the target,
+    and the target one second later are written into the data of the live hand. Nothing happens
+    without a live hand, or after the end of the recorded run.
 
     Args:
         i: Index of the site.
@@ -317,7 +322,7 @@ def _advance_bucket(progress: ProgressRow) -> None:
 
 @leaf
 def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
-    """Computes the gravity torque of an arm at the pose that a record contains.
+    """Computes the gravity torque of an arm at the pose in one of its records.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -342,7 +347,9 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments at the motion that a record contains.
+    """Computes the torque of operators and environments at the motion in an arm's record.
+
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -383,7 +390,7 @@ def update_sums(
     row: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the effort of an arm's motors, and the work of its environments, by a record.
+    """Adds a control period to the sums of an arm's motor effort and its environments' work.
 
     The effort is the sum of the squared torques beyond gravity. The work in a control period is
     the torque times the change of the joint angles q. The torque that varies during the period
@@ -448,9 +455,10 @@ def update_sums(
 
 
 class LawArrays(NamedTuple):
-    """Compiled control laws that users wrote, for all N sites of a simulation.
+    """Arrays by which the compiled simulation calls users' control laws, for all N arms.
 
-    A site is a process that runs one arm.
+    They contain the addresses of the compiled laws, and the numbers that the laws keep and
+    send.
 
     Attributes:
         addresses: Address of the machine code of each site's law, shape (N,), see
@@ -538,11 +546,11 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Computes the part of a site's next control period that comes before its control law.
+    """Computes the part of an arm's next control period that comes before its control law.
 
-    A site is a process that runs one arm. This part accepts the samples (states) of its peers,
-    the other sites, and computes the reference, the errors and the parameter estimate. The
-    samples arrive as in the recorded run. Without a recorded run they arrive without delay.
+    This part accepts the messages (states) of the other arms, and computes the reference, which
+    is the position to follow, the errors and the parameter estimate. The messages arrive as in
+    a recorded run, or without delay if there is none.
 
     Args:
         i: Index of the site.
@@ -624,7 +632,7 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Completes the control period of a site, whose first part `sense_site` computed.
+    """Completes a control period of one arm, after `sense_site` has computed its first part.
 
     The control law computes the torque, and the arm moves to the next period. The results of
     the period are added to statistics of the run.
@@ -710,8 +718,8 @@ def run_until(
 ) -> None:
     """Simulates all arms of an experiment up to a time, or until an arm diverges.
 
-    A site is the process that runs one arm. The control periods of all sites are computed in
-    the order of their times.
+    The control periods of all arms are computed in the order of their times, because each arm
+    receives the states of the others.
 
     Args:
         last_ns: Time of the last control period to compute, ns since the start of the session.

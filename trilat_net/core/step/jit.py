@@ -67,10 +67,10 @@ _CORE_PACKAGE = __package__.rpartition(".")[0]
 
 
 def _cache_root() -> Path:
-    """Returns the directory for the caches of this user's programs.
+    """Returns the directory in which programs of this user may keep files for faster starts.
 
-    It follows the convention of the platform: ~/.cache on Linux, unless XDG_CACHE_HOME names
-    another directory.
+    It is ~/.cache on Linux, unless XDG_CACHE_HOME names another directory, and the
+    corresponding directory on other platforms.
     """
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
@@ -80,10 +80,10 @@ def _cache_root() -> Path:
 
 
 def _core_digest() -> str:
-    """Returns a hash that changes if stored machine code is out of date.
+    """Returns a hash that shows whether machine code on disk was compiled from these sources.
 
-    It covers Numba's version and all sources of the code: the files of the core, and `records`,
-    whose constants the core contains.
+    It covers Numba's version, the files of the core, and `records`, whose constants the core
+    contains.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for source in (*sorted(_CORE.rglob("*.py")), _CORE.with_name("records.py")):
@@ -111,10 +111,10 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if the simulation can start at once, because its code was compiled before.
+    """Returns True if a simulation can start at once, because its code was compiled earlier.
 
-    The stored code must be of the present version of the sources. Only the function
-    `kernel.site_tick` is looked for. It is compiled last, so if it is stored, all others are.
+    Otherwise the first run takes longer, and a command can say so beforehand. Only the function
+    `kernel.site_tick` is looked for on disk: it is compiled last, so the others are there too.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -211,10 +211,10 @@ _INNER = "within"
 
 @cache
 def _hash_folder(folder: Path) -> str:
-    """Returns a hash of all Python files of a folder, for functions outside of the core.
+    """Returns a hash of all Python files of a folder, to detect outdated machine code.
 
-    If a file changes, so does the hash, and compiled code that was stored with the old hash is
-    not used any more. All functions of a folder ask for the same hash.
+    Functions outside of the core use it. If a file changes, so does the hash, and machine code
+    that was stored with the old hash is not used any more.
     """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):
@@ -397,6 +397,8 @@ class _LeafCache(FunctionCache):
     def load_inner(self, argument_types: Any, context: Any) -> Any:
         """Loads the LLVM code of a function that another compiled function calls.
 
+        LLVM code is the intermediate form from which the compiler makes machine code.
+
         Args:
             argument_types: Numba's types of the arguments.
             context: Numba's description of the target processor.
@@ -468,9 +470,10 @@ def _as_inner(result: Any) -> Any:
 
 
 class _LeafCompiler(Compiler):
-    """Compiles a numerical function (leaf), for calls from Python or from another leaf.
+    """Compiles a numerical function with Numba, for calls from Python or from compiled code.
 
-    A leaf that is compiled because another leaf calls it is called an inner leaf.
+    The functions are called leaves. A leaf that is compiled because another leaf calls it is an
+    inner leaf, and becomes a part of its caller.
 
     Attributes:
         depth: Number of leaves that are being compiled now, one within another.
@@ -548,10 +551,10 @@ def _prefer_wide_vectors(llvm_code: str) -> str:
 
 
 class _LaneLibrary(_LeafLibrary):
-    """Code of a function with a long loop, with all functions that it calls inlined.
+    """Machine code of a function with a long loop, with all functions that it calls inlined.
 
-    The loop computes many control periods, or a period of several runs side by side (lanes).
-    The compiler turns a loop into vector instructions only if the loop contains no calls.
+    The compiler turns a loop into SIMD instructions only if the loop contains no calls. Such a
+    loop computes many control periods, or several simulations side by side (lanes).
     """
 
     def _optimize_final_module(self) -> None:
@@ -564,15 +567,20 @@ class _LaneLibrary(_LeafLibrary):
 
 
 class _LoopCompiler(_LeafCompiler):
-    """Compiles a function with a long loop, and inlines all functions that it calls."""
+    """Compiles a function with a long loop together with all functions that it calls.
+
+    Calls within the loop would take much of its time. The technique is called inlining.
+    """
 
     library_class = _LaneLibrary
 
 
 class _LaneCompiler(_LeafCompiler):
-    """Compiles a function of lanes, which computes a tick of several runs side by side.
+    """Compiles a function that computes several simulations side by side, with SIMD.
 
-    The compiler may assume that the arguments do not overlap in memory.
+    SIMD instructions process vectors. Each simulation has a lane, a position in the vectors.
+    The compiler may assume that the arguments do not overlap in memory, without which it would
+    not use vector instructions.
     """
 
     library_class = _LaneLibrary
@@ -580,7 +588,9 @@ class _LaneCompiler(_LeafCompiler):
 
 
 def _is_in_lanes(numba_type: Any) -> bool:
-    """Returns True if a value has the numbers of several runs side by side (lanes).
+    """Returns True if a value has numbers of several simulations side by side (lanes).
+
+    A lane is one position in the vector registers of the processor (SIMD).
 
     Args:
         numba_type: Numba's type of the value. A type of rows in lanes has the attribute
@@ -616,8 +626,9 @@ class _Leaf(CPUDispatcher):
     def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
         """Returns the Python function to compile for given types of arguments. Numba calls it.
 
-        This is the leaf itself, unless an argument is a row in lanes (several runs side by
-        side) and the leaf has an implementation of its own for lanes, see `set_lane_form`.
+        This is the function (leaf) itself, unless the arguments belong to several simulations
+        side by side (lanes) and the function has another implementation for these, see
+        `set_lane_form`.
         """
         if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)
@@ -744,7 +755,7 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Callable[P, R]:
-    """Returns the object that replaces a numerical function, and compiles it when it is called.
+    """Wraps a numerical function in an object that compiles it at its first call.
 
     Args:
         function: The Python function.
@@ -767,32 +778,33 @@ def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function that computes several runs at once by vector instructions (decorator).
+    """Marks a function that computes several simulations at once, by SIMD (decorator).
 
-    Each run has a lane, a position in the vector registers.
-
-    The loops over the lanes use vector instructions. This needs two guarantees to the compiler,
-    which apply to the marked function only: all leaves that it calls become part of its code,
-    and no two of its arguments overlap in memory. The caller has to make sure of the latter.
-
-    Such a function is called from compiled code by its address, see `find_lane_address`.
+    Each simulation has a lane, a position in the processor's vector registers. The compiler
+    needs two guarantees, which apply to the marked function only: all functions that it calls
+    become part of its code, and no two of its arguments overlap in memory. The caller has to
+    make sure of the latter. Such a function is called from compiled code by its address
+    (`find_lane_address`).
     """
     return _make_leaf(function, _LaneCompiler)
 
 
 @cache
 def _make_unstored(function: Callable[..., Any]) -> Any:
-    """Returns Numba's dispatcher of a function of lanes whose code is not stored on disk."""
+    """Wraps a function for several simulations side by side whose code is not stored on disk.
+
+    It is compiled again in each process.
+    """
     dispatcher: Any = _make_leaf(function, _LaneCompiler)
     dispatcher._cache = NullCache()
     return dispatcher
 
 
 def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
-    """Returns the address of a function that computes several runs at once (`lane_leaf`).
+    """Returns the memory address of a function that computes several simulations side by side.
 
-    Compiled code calls the function by its address. It is compiled if needed. The code is not
-    stored on disk if the attribute `is_stored` of some type is False.
+    Other compiled code calls the function by this address. The function is compiled if needed.
+    Its code is not stored on disk if the attribute `is_stored` of some argument type is False.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -808,7 +820,7 @@ def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, .
 
 
 def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
-    """Returns True if the code of a function for several runs at once is on disk.
+    """Returns True if the machine code for several simulations side by side is on disk already.
 
     If not, its first use takes long, because it has to be compiled.
 
@@ -825,9 +837,10 @@ def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any,
 
 
 def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
-    """Returns the machine code of a function for several runs at once, as text.
+    """Returns the assembly code of a function that computes several simulations side by side.
 
-    A test checks that it contains vector instructions.
+    A test checks that it contains vector instructions, without which the function would be
+    slow.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -843,10 +856,10 @@ def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, 
 def set_lane_form(
     function: Callable[..., Any], choose: Callable[[tuple[Any, ...]], Callable[..., Any]]
 ) -> None:
-    """Registers another version of a function, for code that computes several runs at once.
+    """Registers another version of a function, for code that computes several simulations.
 
     For example, `compute_law` of `execution.lanes.lane_laws` has a version for each control
-    law.
+    law, because the simulations side by side all use the same law.
 
     Args:
         function: A function with the decorator `leaf`.
@@ -858,10 +871,10 @@ def set_lane_form(
 
 
 class _NamedCache(_LeafCache):
-    """Stores the machine code of a closure under a name, see `compile_named`.
+    """Stores the machine code of a closure on disk, under a name that the caller chooses.
 
-    The name identifies all that the code is compiled from. Numba's own key contains the values
-    that the closure captured instead.
+    A closure is a function that uses variables of an outer function. Numba would identify it by
+    the values of these variables. Here the name identifies all that the code depends on.
     """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:

@@ -55,10 +55,10 @@ _USER = int(Law.USER)
 def _place_arm(
     s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
 ) -> None:
-    """Computes where the links of an arm are, which the tracking errors depend on.
+    """Computes where the links of an arm are, before its tracking errors are computed.
 
-    The orientation that the end effector should follow can be computed in addition. The planar
-    arm needs neither: its equations contain the positions of its links.
+    If asked, it also computes the orientation that the end effector should follow. The planar
+    arm needs neither, because its equations contain the positions of its links.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -75,7 +75,10 @@ def _place_arm(
 
 @leaf
 def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
-    """Runs stage 4: writes the errors e, ed and r, and the dynamics that the law needs.
+    """Computes the tracking errors e, ed and r of an arm, and the dynamics that its law needs.
+
+    The error e is the position minus the reference, ed its derivative, and r the filtered
+    error. This is stage 4 of a control period.
 
     Args:
         s: State of the site (the process that runs the arm); changed.
@@ -89,7 +92,10 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate of the arm's parameters to theta_hat - gain_s Gamma Yr, in its box.
+    """Advances the estimate of the arm's parameters by theta_hat - gain_s Gamma Yr, in bounds.
+
+    Gamma is the adaptation gain, and Yr the product Y' r of the regressor and the filtered
+    error.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -141,19 +147,21 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def updates_estimate(k: int, s: SiteRow) -> bool:
-    """Returns True if an adaptive law integrates its estimate in stage 5 of this tick.
+    """Returns True if an adaptive law integrates its parameter estimate in this control period.
 
-    This is not so at the first tick of the site, nor under the scheme `digital`. Whether the
-    estimate adapts in the present mode is decided by `adapts`.
+    This is not so in the first period of an arm's process, nor under the scheme `digital`,
+    which integrates at the end of the period. `adapts` decides whether the mode allows
+    adaptation.
     """
     return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds Y' r of this tick to that of the previous tick, for the trapezoid rule.
+    """Adds the adaptation rate Y' r of this control period to that of the previous one.
 
-    The sum is written into `Yr_before`, see `_update_estimate`.
+    The estimate of the arm's parameters is integrated by the trapezoid rule, which needs this
+    sum. It is written into `Yr_before`, see `_update_estimate`.
     """
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -161,10 +169,9 @@ def sum_trapezoid(s: SiteRow) -> None:
 
 @leaf
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
-    """Computes the torque of a control law that is built in.
+    """Computes the torque of a control law that is built into the compiled simulation.
 
-    If the control law was written by a user, this function does nothing. `law_stage` computes
-    the torque of compiled user laws.
+    It does nothing for a law that was written as a Python class; `law_stage` calls such a law.
 
     Args:
         site: State of the site (the process that runs the arm), shape (1,). The torque is
@@ -205,9 +212,9 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
     """Turns the torque of the control law into the torque that the motors get.
 
-    This is the last part of stage 6 of a tick, after the law has written the torque `tau`. The
-    rate of every torque is limited. Under the rule `glide`, by which an arm comes to rest while
-    a peer (another arm) is silent, the torque is first modified in these cases:
+    It is called after the law has written the torque `tau`. The rate of every torque is
+    limited. Under the rule `glide`, by which an arm comes to rest while another arm is silent,
+    the torque is first modified in these cases:
 
     - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
     - The arm comes to rest or is at rest: damping and an integral term are added, see
@@ -241,11 +248,11 @@ def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _write_record(s: SiteRow, row: Array) -> None:
-    """Writes the results of the tick into its record (stage 7), as one vector of numbers.
+    """Writes the results of a control period as one vector of numbers, for the log.
 
     The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and
-    in task space the motion of the end effector. A number that is not finite becomes 0, and the
-    site enters the mode DIVERGED.
+    the motion of the end effector if arms follow each other's end effectors. A number that is
+    not finite becomes 0, and the arm enters the mode DIVERGED.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -287,7 +294,9 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque with which operators and environments act on the arm at a time.
+    """Computes the torque that operators and environments exert on the arm at a time.
+
+    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -313,7 +322,7 @@ def _advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Simulates the motion of the arm, its angles q and velocities qd, over one control period.
+    """Simulates the motion of the arm, joint angles and velocities, over one control period.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
@@ -362,7 +371,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
 @leaf
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
-    """Stores the torque and Y' r of this tick, which the next tick needs (end of stage 8).
+    """Stores the torque and the adaptation rate Y' r of this control period for the next one.
 
     Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
     estimate itself is advanced here.
@@ -390,7 +399,7 @@ def _advance(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> None:
-    """Simulates the arm until the next tick (stage 8), and stores what the next tick needs.
+    """Simulates the arm until the next control period, and stores what that period needs.
 
     Args:
         k: Number of the tick (control period).
@@ -415,10 +424,9 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Selects the arrays for the numbers that the control law of one peer sends.
+    """Returns the arrays for the numbers that the control law of one other arm (peer) sends.
 
-    A peer is another site (process that runs one arm). Some control laws send numbers in
-    addition to the motion of the arm, for example energies.
+    Some laws send numbers besides the motion of the arm, for example energies.
 
     Args:
         channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
@@ -435,13 +443,11 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 @leaf
 def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
-    """Returns the arrays of the link from one peer, as views of the arrays of the site.
+    """Returns the arrays of the network link from one other arm, as views without copying.
 
-    A site is the process that runs one arm, and a peer another site that sends its samples
-    (states). `LinkArrays` describes the arrays of a link. Nearly all of them are rows of the
-    site's arrays, one row per peer. `state` is a slice, because it must stay an array, of
-    shape (1,). `points` is the table of all links of the site, in which each link has rows of
-    its own.
+    `LinkArrays` describes the arrays of a link. Nearly all of them are rows of this arm's
+    arrays, one row per other arm (peer). `state` is a slice, because it must stay an array, of
+    shape (1,). `points` is the table of all links, in which each link has rows of its own.
 
     Args:
         arrays: Arrays of the site.
@@ -459,10 +465,9 @@ def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Finds the period of the site's control loop in which a sample of a peer is used first.
+    """Finds the control period of this arm in which a message of another arm is used first.
 
-    A site is the process that runs one arm, and a peer is another site. A sample is the state
-    that the peer sends in one period of its own control loop.
+    A message (sample) is the state that the other arm sends once per period of its own loop.
 
     Args:
         peer: Index of the peer.
@@ -478,10 +483,10 @@ def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stores the samples that arrived, until their simulated delay has passed.
+    """Stores the messages that arrived, until their simulated network delay has passed.
 
-    A sample is the state that another arm sends in one period of its control loop. Samples wait
-    in ring buffers, which are called calendars.
+    A message (sample) is the state that another arm sends once per control period. Messages
+    wait in ring buffers, which are called calendars.
 
     Args:
         k: Number of the present control period.
@@ -506,9 +511,9 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 @leaf
 def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
-    """Ends stage 3: stops the reference while peers are silent, and limits its speed.
+    """Stops the reference while other arms are silent, and limits its speed.
 
-    The reference is the position that the arm follows. It stops if no samples come from the
+    The reference is the position that the arm follows. It stops if no messages come from the
     other arms for too long.
 
     Args:
@@ -534,7 +539,10 @@ def error_stages(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> None:
-    """Computes tracking errors, parameter estimate and external torque (stages 4 and 5).
+    """Computes the tracking errors, the parameter estimate and the external torque of an arm.
+
+    These are stages 4 and 5 of a control period, after the reference is known and before the
+    control law.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -562,11 +570,11 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Computes reference, tracking errors and parameter estimate of a control period.
+    """Computes the reference, tracking errors and parameter estimate of a control period.
 
-    These are stages 3 to 5 of a tick. They use the newest samples (states) of the other arms
-    whose delay has passed. Finally, the external torque of operators and environments is
-    computed.
+    The reference is the position that the arm follows. It results from the newest states of the
+    other arms whose network delay has passed. Finally, the external torque of operators and
+    environments is computed.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -637,10 +645,10 @@ def sense_stages(
 
 @leaf
 def emit_stage(s: SiteRow, record: Array) -> None:
-    """Writes the record of a tick, stage 7.
+    """Writes the results of a control period into its record, which is logged (stage 7).
 
-    If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the rule
-    `glide` the arm comes to rest instead, see `session_life`.
+    If a joint is faster than its limit, the run of this arm ends in the mode DIVERGED. Under
+    the rule `glide`, the arm comes to rest instead, see `session_life`.
 
     Args:
         s: State of the site (the process that runs the arm), with the torque of the motors;
@@ -666,8 +674,8 @@ def act_stages(
 ) -> None:
     """Computes the part of a control period that follows the control law.
 
-    The torque is limited, the record is written, and the arm moves to the next period (stages 6
-    to 8). See `emit_stage` for a joint that is faster than its limit.
+    The torque is limited, the results are written for the log, and the arm moves to the next
+    period (stages 6 to 8). See `emit_stage` for a joint that is faster than its limit.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -709,11 +717,11 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes one whole tick of a site, with a control law that is built in.
+    """Computes one whole control period of an arm, with a control law that is built in.
 
-    A site is the process that runs one arm, and a tick is one period of its control loop. The
-    number of the tick is k, and its nominal time t_ns is in ns since the start of the session.
-    Only the first `count` rows of `arrivals` are read; they are the samples that arrived.
+    The number of the period (tick) is k, and its nominal time t_ns is in ns since the start of
+    the session. Only the first `count` rows of `arrivals` are read; they are the messages that
+    arrived.
 
     All other arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed one by
     one, because passing the two tuples from Python takes a microsecond longer.
@@ -747,11 +755,11 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Completes the state of a site that was restored from records, to continue the run.
+    """Completes the state of an arm that was restored from a log, to continue the run.
 
-    A site is the process that runs one arm. Some numbers that tick k + 1 (the next period of
-    the control loop) needs are not in the records. They are computed here from the restored
-    state: the tracking errors, the external torques, and the state of the arm at tick k + 1.
+    Some numbers that the next control period needs are not in the log. They are computed here
+    from the restored state: the tracking errors, the external torques, and the motion until
+    then. Control periods are called ticks.
 
     Args:
         k: The last tick that was recorded.

@@ -77,10 +77,10 @@ def _update_checksum(crc: int, word: int) -> int:
 
 
 class RecordedRows(NamedTuple):
-    """Records of consecutive ticks of a site, as numbers for the compiled loop.
+    """Results of consecutive control periods of an arm from a log, as arrays for compiled code.
 
-    K is the number of records, P the number of peers, m the number of coordinates that the
-    sites share, n the number of joints. A word is the bits of a floating-point number as an
+    K is the number of periods, P the number of other arms, m the number of coordinates that the
+    arms share, n the number of joints. A word is the bits of a floating-point number as an
     integer.
 
     Attributes:
@@ -113,10 +113,11 @@ class RecordedRows(NamedTuple):
 
 
 class SiteViews(NamedTuple):
-    """State of a site as integers, so that the compiled loop can compare all bits.
+    """State of an arm's process as 64-bit integers, to compare it bit by bit with a log.
 
-    Two floating-point numbers can be equal although their bits differ, such as 0.0 and -0.0,
-    and NaN is not equal to itself. A word is the bits of a number as an integer.
+    A comparison of floating-point numbers would miss differences: 0.0 equals -0.0 although
+    their bits differ, and NaN is not equal to itself. The bits of a number as an integer are
+    called a word.
 
     Attributes:
         site: State of the site (the process that runs the arm), as integers.
@@ -140,7 +141,7 @@ class SiteViews(NamedTuple):
 
 
 class TickRules(NamedTuple):
-    """Properties of an arm's control process (site) that stay the same during its run.
+    """Properties of an arm's process that stay the same during a run, for the compiled replay.
 
     Attributes:
         rate_hz: Tick rate, Hz.
@@ -174,11 +175,12 @@ def _has_room(
     rules: Any,
     rooms: IntArray,
 ) -> bool:
-    """Returns True if the samples that arrived in a tick fit into the buffers of their links.
+    """Returns True if the messages that arrived in a control period fit into their buffers.
 
-    Each link has such a ring buffer (calendar), with one entry (page) per tick. Compiled code
-    cannot enlarge the buffers. If a sample does not fit, the loop ends, and `Site.step`
-    executes the tick. The rule is that of `CalendarSizer.make_room`.
+    Messages wait in a ring buffer per network link until their simulated delay has passed, with
+    one entry (page) per control period. Compiled code cannot enlarge the buffers. If a message
+    does not fit, the compiled loop ends, and `Site.step` computes the period. The rule is that
+    of `CalendarSizer.make_room`.
 
     Args:
         k: Number of the tick (control period).
@@ -209,10 +211,10 @@ def _has_room(
 def _put_arrivals(
     first: int, last: int, arrivals: IntArray, samples: IntArray, rules: Any, views: Any
 ) -> int:
-    """Writes the samples that arrived in a tick into its input buffers, as `Site.step` does.
+    """Writes the messages that arrived in a control period into the input buffers.
 
-    A sample is the state that another arm sent, and a tick a control period. The checksum of
-    the samples is computed at the same time, to compare it with the record.
+    A message (sample) is the state that another arm sent. The checksum of the messages is
+    computed at the same time, to compare it with the log.
 
     Args:
         first: Index of the first arrival of the tick.
@@ -340,7 +342,9 @@ def _run_recorded_ticks(
     arrays: SiteArrays,
     buffers: TickBuffers,
 ) -> tuple[int, bool]:
-    """Computes recorded control periods (ticks) again, until a result differs from its record.
+    """Computes recorded control periods (ticks) again, until a result differs from the log.
+
+    One compiled call computes all of them, which is far faster than a call per tick.
 
     Args:
         first_tick: Number of the first tick.
@@ -392,7 +396,10 @@ _run_chain_ticks = leaf(_run_recorded_ticks)
 
 
 class TickRepeater:
-    """Computes recorded control periods (ticks) of an arm again, many at a time.
+    """Computes recorded control periods of an arm again, many in one compiled call.
+
+    Each result is compared with the log, to verify that the run can be reproduced. Control
+    periods are called ticks.
 
     Args:
         site: State of the arm and its controller. The control law must be built in.
@@ -425,7 +432,7 @@ class TickRepeater:
         self._saved = [np.empty_like(array) for array in self._list_arrays()]
 
     def repeat(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> int:
-        """Computes recorded control periods (ticks) again, until a result differs.
+        """Computes recorded control periods (ticks) again, until a result differs from the log.
 
         Args:
             first_tick: Number of the first tick. It must be the next tick of the site.
@@ -458,15 +465,19 @@ class TickRepeater:
         return repeated
 
     def _list_arrays(self) -> list[NDArray[Any]]:
-        """Returns the arrays of the site that its ticks change, to save and restore them."""
+        """Returns the arrays of the arm's process that a control period changes.
+
+        They are saved before a period and restored if it has to be computed again.
+        """
         a = self._site.arrays
         changed = [a.site, a.links, a.dues, a.calendars, a.ramps, a.actors, a.chain]
         return [array for array in changed if array is not None]
 
     def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
-        """Calls the compiled loop for the kind of arm, see `_run_recorded_ticks`.
+        """Calls the compiled loop over recorded control periods, for the kind of arm.
 
-        The loop and the object that enlarges the buffers exchange which samples fit into them.
+        The loop and `CalendarSizer`, which enlarges the buffers of waiting messages, tell each
+        other which messages fit into them.
         """
         site = self._site
         self._views.rooms[:] = self._parts.calendar_sizer.list_rooms()
@@ -507,10 +518,11 @@ def _view_words(array: NDArray[Any]) -> IntArray:
 
 
 def _list_memory_sources(site: Site) -> IntArray:
-    """Returns where the site stores the numbers that a record has in its field `mem`.
+    """Finds where an arm's process stores the numbers that the next control period needs.
 
-    These are the numbers that the next tick needs and no other field records. The order is that
-    of `Site.restore_state`, and `SiteViews.memory` describes the three columns of the result.
+    A record of the log contains them in its field `mem`, unless another field has them. The
+    order is that of `Site.restore_state`, and `SiteViews.memory` describes the three columns of
+    the result.
     """
     sources: list[tuple[int, int, int]] = []
     parts = site.parts
@@ -518,7 +530,7 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the positions of the numbers of a field, counted in words of eight bytes.
+        """Adds where the numbers of one field are stored, counted in words of eight bytes.
 
         Args:
             dtype: Type of the row, that of the site or that of a link.

@@ -23,7 +23,9 @@ from .vectors import Array
 
 
 class Field(NamedTuple):
-    """Describes a field of a structured array: its shape, unit and meaning, and who writes it.
+    """Description of one field of a structured array: its shape, unit, meaning and writer.
+
+    The data types of the arrays and their documentation are generated from these descriptions.
 
     Attributes:
         shape: Axes, joined by " x ". Each axis is a number, or a name such as "joints" whose
@@ -47,11 +49,12 @@ class Field(NamedTuple):
 
 
 class SiteRow(Protocol):
-    """State of a site, the process that runs one arm: settings, gains, motion and results.
+    """Whole state of one arm's process: settings, gains, motion and results, one field each.
 
-    The axis "shared" has one element for each coordinate that sites send each other. Users'
-    compiled control laws read this row through `LawInput`. Therefore the fields that both have
-    in common have the same names.
+    One structured array element has these fields, which compiled code reads and writes. The
+    axis "shared" has one element for each coordinate that arms send each other. Users' compiled
+    control laws read these fields through `LawInput`, so fields of both have the same names.
+    The process of an arm is called a site.
     """
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
@@ -316,11 +319,11 @@ class LinkRow(Protocol):
 
 
 class SampleRow(Protocol):
-    """Sample that waits until its simulated delay has passed.
+    """Message from another arm that waits until its simulated network delay has passed.
 
-    A sample is the state that another arm's process sends in one period of its control loop.
-    Each period of the receiver has an entry for the newest sample that is used from that period
-    on.
+    A message (sample) is the state that the other arm sends once per control period. A ring
+    buffer has one entry per control period of the receiver. The entry holds the newest message
+    that is used from that period on.
     """
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]
@@ -330,9 +333,9 @@ class SampleRow(Protocol):
 
 
 class ArrivalRow(Protocol):
-    """Sample that arrived from another arm's process since the previous control period.
+    """Message from another arm that arrived since the previous control period.
 
-    A sample is the state that a process sends in one period of its control loop.
+    A message (sample) is the state that the other arm sends once per control period.
     """
 
     peer: Annotated[int, Field("", "", "index of the link", "input")]
@@ -344,8 +347,8 @@ class ArrivalRow(Protocol):
 class ProgressRow(Protocol):
     """How far the simulation of one arm has advanced, and statistics of its motion.
 
-    A tick is one period of the control loop. A bucket is an interval of time, for which the
-    largest errors and speeds are collected.
+    The largest errors and speeds are collected for each interval of time, which is called a
+    bucket.
     """
 
     tick: Annotated[int, Field("", "tick", "next tick", "fused run")]
@@ -364,9 +367,9 @@ class ProgressRow(Protocol):
 
 
 class SumsRow(Protocol):
-    """Sums over the records of a simulated arm, from which metrics are computed.
+    """Sums over a simulated run of one arm, from which its metrics are computed at the end.
 
-    A record contains the results of one period of the control loop.
+    For example, the root mean square error follows from the sum of squared errors.
     """
 
     first_environment: Annotated[
@@ -392,9 +395,9 @@ _KINDS = {int: "i8", float: "f8", np.uint64: "u8", Array: "f8"}
 
 
 def _read_fields(row: type) -> dict[str, Field]:
-    """Reads the fields of a structured array from the class that describes its elements.
+    """Reads the fields of a structured array from the class that describes them.
 
-    The fields are in the order of the attributes of the class.
+    The fields have the order of the attributes of the class.
 
     Args:
         row: The class, for example `SiteRow`.
@@ -418,7 +421,7 @@ FIELDS: dict[str, dict[str, Field]] = {
 
 
 def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
-    """Computes the shape of a field for an arm with given numbers of joints and coordinates.
+    """Returns the shape of a field for a particular arm, for example (2,) for two joint angles.
 
     Args:
         field: The field, whose axes may be named, for example "joints".
@@ -437,7 +440,10 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
 def row_dtype(
     row: str, lengths: Mapping[str, int], *, chain: bool = False
 ) -> np.dtype[np.void]:
-    """Computes the NumPy data type of an array that stores one kind of row of this module.
+    """Returns the NumPy data type of an array whose elements are described by a class above.
+
+    The classes describe, for example, the state of an arm or of a network link. The length of
+    each vector depends on the arm.
 
     Args:
         row: Name of the kind in `FIELDS`, for example "site" or "link".

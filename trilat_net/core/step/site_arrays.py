@@ -48,7 +48,10 @@ _GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
 
 @cache
 def site_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the row that stores a site, see `SiteRow`.
+    """Returns the NumPy structured data type for the whole state of one arm's process (site).
+
+    Settings, gains, motion and results are its fields, which `SiteRow` lists. One array element
+    holds everything that the compiled control loop reads and writes about the arm.
 
     Args:
         layout: Lengths of the site's vectors.
@@ -58,7 +61,9 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
 
 @cache
 def arrival_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of a sample as it arrives at a site, see `ArrivalRow`.
+    """Returns the NumPy structured data type of a message that has just arrived.
+
+    `ArrivalRow` lists its fields: the sending arm, the control period, and the motion.
 
     Args:
         shared: Number of coordinates that sites share, the length of the sample's vectors.
@@ -67,7 +72,10 @@ def arrival_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class SiteArrays(NamedTuple):
-    """The arrays of one site, or of several sites stacked along an additional first axis.
+    """All arrays that the compiled control loop of one arm's process (site) reads and writes.
+
+    For a simulation of several arms, the arrays of all sites are stacked along an additional
+    first axis.
 
     Attributes:
         site: State and constants, shape (1,), see `site_dtype`.
@@ -108,7 +116,7 @@ class SiteArrays(NamedTuple):
         *,
         plugged: bool = False,
     ) -> "SiteArrays":
-        """Creates the arrays of a site (the process of one arm) before its first period.
+        """Creates all arrays of an arm's process (site), as before its first control period.
 
         Args:
             setup: Setup of the site.
@@ -210,9 +218,9 @@ class SiteArrays(NamedTuple):
         )
 
     def select(self, i: int, layout: Layout) -> "SiteArrays":
-        """Returns the arrays of one site (one arm) of a simulation of several sites, as views.
+        """Returns the arrays of one arm in a simulation of several arms, without copying.
 
-        Vectors may be longer than this site needs, because all sites have equally long ones.
+        Vectors may be longer than this arm needs, because all arms have equally long ones.
 
         Args:
             i: Index of the site.
@@ -241,10 +249,10 @@ class SiteArrays(NamedTuple):
 
 
 class TickBuffers(NamedTuple):
-    """Input and output of one period of the control loop.
+    """Arrays for the input and output of one control period: received messages and results.
 
-    The input consists of samples, the states that other sites (processes that run one arm each)
-    sent. A sample has m coordinates.
+    They are created once and reused in every period, because allocation takes time. A message
+    (sample) is the state of another arm, with m coordinates.
 
     Attributes:
         arrivals: Samples that arrived since the previous period, shape (MAX_ARRIVALS,), see
@@ -263,9 +271,9 @@ class TickBuffers(NamedTuple):
 
 
 def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
-    """Returns empty buffers for the inputs and the results of one control period (tick).
+    """Creates the arrays for the received messages and the results of a control period.
 
-    A site, the process of one arm, creates them once and uses them in all ticks.
+    An arm's process creates them once and reuses them in every period.
 
     Args:
         setup: Setup of the site, which determines the lengths of vectors.
@@ -283,11 +291,11 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Computes how many samples must be able to wait on each link of a site.
+    """Computes how many messages must be able to wait on each network link of an arm.
 
-    A site is a process that runs one arm. Its samples, the states of other sites, wait until
-    their simulated delay has passed. The result follows from the longest delay in the setup,
-    and from the time `_NEAR_NS` by which the clock of a sender may be ahead.
+    A message (the state of another arm) waits until its simulated delay has passed. The result
+    follows from the longest delay, and from the time `_NEAR_NS` by which the clock of a sender
+    may be ahead.
 
     Args:
         setup: Setup of the site.
@@ -301,9 +309,10 @@ def needed_pages(setup: SiteSetup) -> int:
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
-    """Returns the memory that the network links of an arm take, bytes.
+    """Returns how much memory the network links of an arm take in bytes, to limit it.
 
-    `CalendarSizer` uses this number to limit the length of the ring buffers.
+    Most of it are the ring buffers in which delayed messages wait. `CalendarSizer` limits their
+    length by this number.
 
     Args:
         setup: Setup of the arm.
@@ -320,9 +329,9 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
 
 def _count_kept_dues(setup: SiteSetup) -> int:
-    """Returns for how many samples a link stores when they are to be delivered.
+    """Returns for how many messages a link stores when they are to be delivered.
 
-    A delivery time (due time) is stored for as long as its sample may still arrive, late or as
+    A delivery time (due time) is stored for as long as its message may still arrive, late or as
     a duplicate. The longest possible delay, and the largest time by which the sender's clock
     may be ahead of the receiver's, bound this time.
 
@@ -336,9 +345,9 @@ def _count_kept_dues(setup: SiteSetup) -> int:
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
-    """Enlarges the ring buffers in which samples wait until their simulated delay has passed.
+    """Enlarges the ring buffers in which messages wait for their simulated delay to pass.
 
-    A sample is the state that another arm's process sends. All waiting samples are kept.
+    All waiting messages are kept. The buffers are called calendars.
 
     Args:
         arrays: Arrays of the site, the process that runs the arm.
@@ -391,14 +400,14 @@ class CalendarSizer:
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Forgets which samples are known to fit into the buffers.
+        """Forgets which messages are known to fit into the ring buffers of the links.
 
-        The next sample of each peer (another arm's process) is checked again.
+        The next message of each sender is then checked again.
         """
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Takes note of a new model of a link's delays, so that longer delays get room.
+        """Takes note of a new delay model of a link, to reserve room for longer delays.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -474,7 +483,7 @@ class CalendarSizer:
 def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     """Adds a planned change of the weights with which an arm follows the other arms.
 
-    The table of changes is sorted by their start times.
+    The changes stand in a table, which is sorted by their start times.
 
     Args:
         arrays: Arrays of the site (the process that runs the arm). Their table must have a free
@@ -494,9 +503,9 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 
 
 def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
-    """Adds a planned change of a link's delay and loss to the table of changes.
+    """Adds a planned change of a network link's delay and loss.
 
-    The table is sorted by the time from which a change applies.
+    The changes stand in a table, which is sorted by the time from which each applies.
 
     Args:
         arrays: Arrays of the site (the process that runs the arm). Their table must have a free
@@ -662,7 +671,7 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
-    """Returns the state of a site, the process of one arm, before its first tick, shape (1,).
+    """Creates the state of an arm's process (site) before its first control period.
 
     Args:
         setup: Setup of the site.
@@ -759,9 +768,10 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    """Returns empty arrays for the numbers that the control laws of other arms send.
+    """Creates the arrays for the numbers that the control laws of other arms send.
 
-    Some control laws send numbers besides the motion of the arm, for example energies.
+    Some control laws send numbers besides the motion of the arm, for example energies. The
+    arrays are empty for all other laws.
 
     Args:
         setup: Setup of the site that receives the numbers.
@@ -782,7 +792,7 @@ def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
 def _build_links(
     links: Sequence[LinkSetup], spare: int, shared: int
 ) -> tuple[RowArray, RowArray, Points]:
-    """Creates the arrays that describe the network links of an arm, before the first tick.
+    """Creates the arrays that describe all network links of an arm, before its first period.
 
     Args:
         links: Setups of the links.

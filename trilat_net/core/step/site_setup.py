@@ -82,10 +82,9 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """Rule of a site for a stale peer, from which no new sample has come for too long.
+    """What an arm does if no new message has come from another arm for too long.
 
-    A site is a process that runs one arm, and a peer is another site that it follows. A sample
-    is the state that a peer sends in each period of its control loop.
+    The other arm is called a stale peer. The process that runs an arm is called a site.
 
     Attributes:
         action: What the site does while a peer is stale.
@@ -107,9 +106,9 @@ class StaleRule(NamedTuple):
 
 
 class MotionLimits(NamedTuple):
-    """Limits of an arm's angles, and of the rates of its reference and torque.
+    """Limits of an arm's joint angles, and of how fast its reference and torque may change.
 
-    A limit is one number for all joints or coordinates, or one number per joint or coordinate.
+    A limit is one number for all joints or coordinates, or one number for each of them.
 
     Attributes:
         q_min: Least joint angles, rad.
@@ -125,9 +124,10 @@ class MotionLimits(NamedTuple):
 
 
 class RestGains(NamedTuple):
-    """Gains of the torque that brings an arm to rest, see `resting`.
+    """Gains of the controller that brings an arm to rest and holds it, see `resting`.
 
-    Each vector has either a single number or a number per joint.
+    It acts, for example, while another arm is silent. Each vector has a single number for all
+    joints, or a number per joint.
 
     Attributes:
         damping: Damping B of the joints, N m s/rad.
@@ -155,7 +155,7 @@ class RestGains(NamedTuple):
         }
 
     def stop_s(self, qd: Array) -> Array:
-        """Computes how long it takes to bring an arm to rest from given joint velocities.
+        """Returns how long it takes to bring an arm to rest from given joint velocities, s.
 
         Args:
             qd: Joint velocities of one or several arms, shape (..., n), rad/s.
@@ -171,7 +171,7 @@ class RestGains(NamedTuple):
 
 
 class LinkSetup(NamedTuple):
-    """Settings of the network link from another arm (a peer) to this one.
+    """Settings of the network link over which an arm receives the states of another arm.
 
     Attributes:
         peer: Name of the peer.
@@ -213,7 +213,7 @@ class LinkSetup(NamedTuple):
 def make_layout(
     chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
 ) -> Layout:
-    """Computes the lengths of the vectors that describe an arm, its parameters and its records.
+    """Returns the lengths of all vectors of an arm, such as joint angles and torques.
 
     Args:
         chain: The arm if it is a chain of joints. None for the planar two-link arm.
@@ -250,7 +250,9 @@ def make_layout(
 
 
 class TaskSetup(NamedTuple):
-    """Settings of an arm whose end effector follows the end effectors of other arms.
+    """Settings of an arm whose end effector follows other end effectors (task space).
+
+    For example, it may follow them in position along x and y only, while z is free.
 
     Attributes:
         axes: For each coordinate of the end effector 1 if it follows the other arms, otherwise
@@ -271,7 +273,7 @@ class TaskSetup(NamedTuple):
 
 
 class ChainSetup(NamedTuple):
-    """Settings of an arm that is a chain of joints, as from a URDF file.
+    """Settings of an arm that is a chain of joints, as read from a URDF file.
 
     Attributes:
         joints: The joints, from the base on.
@@ -333,9 +335,10 @@ class Gains(NamedTuple):
 
 
 class SiteSetup(NamedTuple):
-    """All settings of a site, the process that controls one arm, resolved to numbers.
+    """All settings of one arm and its controller, as numbers.
 
-    The state of the site before its first control period follows from them.
+    The state before the first control period follows from them. The process of an arm is called
+    a site.
 
     Attributes:
         name: The site's name.
@@ -392,7 +395,7 @@ class SiteSetup(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """Lengths of the vectors in the site's row, for example one number per joint.
+        """Lengths of the vectors in the state of this arm, for example one number per joint.
 
         Each body of the simulated scene adds seven numbers, its pose.
         """

@@ -68,7 +68,7 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class TickParts(NamedTuple):
-    """Parts of a `Site` with which `recorded_ticks` computes many control periods at once.
+    """Internal parts of a `Site` that compute many recorded control periods in one call.
 
     Attributes:
         buffers: Input and output of a tick.
@@ -93,10 +93,10 @@ class TickParts(NamedTuple):
 
 
 class Site:
-    """State of one arm with its controller and with the network links over which it receives.
+    """One arm with its controller, and with the network links over which it receives.
 
-    The process of a site creates this object and calls `step` once per tick. The simulation
-    in virtual time does the same for each site.
+    The process of an arm (site) creates this object and calls `step` once per control period. A
+    simulation in virtual time does the same for each arm.
 
     Args:
         setup: Setup of the site.
@@ -168,10 +168,10 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the inputs of the operator model that a person or program moves.
+        """Returns the inputs of the spring by which a person or program pulls the arm.
 
-        This operator model, the live hand, pulls the arm to a target by a simulated spring. The
-        grip multiplies the force. Grip and target change in each tick.
+        The inputs are the grip, which multiplies the force, and the target of the spring. They
+        change in each control period.
 
         Args:
             index: Index of the live hand among the operators and environments.
@@ -230,9 +230,9 @@ class Site:
         )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
-        """Applies a change to the running site, for example a new delay model of a link.
+        """Applies a change to an arm's process while it runs, for example a new network delay.
 
-        A change that starts later is added to the planned changes.
+        A change that starts later is stored until its time.
 
         Args:
             command: The change.
@@ -271,7 +271,10 @@ class Site:
         self._links["copies"] = 0
 
     def step(self, tick: TickInput) -> TickRecord:
-        """Computes one period of the control loop.
+        """Computes one period of the control loop: from messages to torque and motion.
+
+        This is the only way in which time advances, in live runs, simulations and replays
+        alike. Therefore the same input always gives the same results.
 
         Args:
             tick: Number of the period and its inputs. The number must follow that of the
@@ -332,9 +335,9 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Computes a whole control period: from the received samples to the record and motion.
+        """Computes a whole control period: from received messages to the results and motion.
 
-        Without a user's control law, one compiled function runs all eight stages (`kernel`
+        Without a user's control law, one compiled function computes all eight stages (`kernel`
         lists them). A user's law is called between two compiled functions, one for the stages
         before the torque and one for those after it.
 
@@ -371,7 +374,7 @@ class Site:
         return memory
 
     def _write_measurement(self, measured: PlantState) -> None:
-        """Applies the measured motion of a real arm, in place of a simulated motion.
+        """Stores the measured motion of a real arm, in place of a simulated motion.
 
         Args:
             measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque
@@ -427,22 +430,25 @@ class Site:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the site after the last tick, for example RUN while it follows others."""
+        """What the arm did in the last control period, for example RUN: it followed others."""
         return _MODES[self._mode.item()]
 
     @property
     def life_reason(self) -> LifeReason:
-        """Why the site last changed its mode under the rule `glide`, see `session_life`."""
+        """Why the arm last changed its mode, for example because another arm fell silent.
+
+        Reasons exist only under the rule `glide`, see `session_life`.
+        """
         return LifeReason(self._reason.item())
 
     @property
     def arrays(self) -> SiteArrays:
-        """Arrays with the present state of the site. They must not be changed."""
+        """Arrays with the present state of the arm's process. Callers must not change them."""
         return self._arrays
 
     @property
     def parts(self) -> "TickParts":
-        """Parts of the site by which `recorded_ticks` computes many control periods at once."""
+        """Internal parts by which `recorded_ticks` computes many control periods at once."""
         return TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
@@ -456,16 +462,16 @@ class Site:
 
     @property
     def q(self) -> list[float]:
-        """Joint angles at the next tick, rad, one per joint.
+        """Joint angles at the start of the next control period, one per joint, rad.
 
-        The last record has those of its own tick.
+        The last record has those at the start of its own period.
         """
         joints = self.layout.joints
         angles: list[float] = self._site[0]["q"][:joints].tolist()
         return angles
 
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
-        """Applies how a person or program pulls the arm in a control period (live hand).
+        """Applies how a person or program pulls the arm in this control period.
 
         Args:
             vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
@@ -549,9 +555,9 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns how many messages (samples) arrived, came late or were lost, for each link.
+        """Returns how many messages arrived, came late or were lost, for each network link.
 
-        The links are in scenario order. `LinkCounts` explains the counts.
+        The links are in the order of the scenario. `LinkCounts` explains the counts.
         """
         counts = []
         for link in self._links:
@@ -560,10 +566,10 @@ class Site:
         return tuple(counts)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Finds the control period of this site in which a sample of a peer is used first.
+        """Finds the control period of this arm in which a message of another arm is used first.
 
-        A peer is another site (process that runs one arm). A sample is the state that it sends
-        in one period of its own control loop.
+        Control periods are called ticks. A message (sample) is the state that the other arm
+        (peer) sends once per period of its own loop.
 
         Args:
             peer: Index of the peer.
@@ -578,7 +584,7 @@ class Site:
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if no delay is simulated on a link: only the real network delays it.
+        """Returns True if only the real network delays a link, and no delay is simulated.
 
         Args:
             peer: Index of the sender at the other end of the link.

@@ -29,7 +29,10 @@ BUCKETS_PER_S = 20
 
 @leaf
 def tick_ns(tick: int, rate_hz: int) -> int:
-    """Returns the nominal time of a tick, ns since the epoch, the common start of the session.
+    """Returns the nominal start of a control period (tick), ns since the start of the session.
+
+    It is exact in integers: tick * 10^9 // rate_hz. For example, tick 3 at 1000 Hz starts at
+    3000000 ns.
 
     Args:
         tick: Number of the tick (control period).
@@ -40,11 +43,11 @@ def tick_ns(tick: int, rate_hz: int) -> int:
 
 @leaf
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
-    """Returns the number of the first tick (control period) that begins at or after a time.
+    """Returns the number of the first control period (tick) that begins at or after a time.
 
-    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact:
-    floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The division of the negative
-    number rounds up.
+    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact: floor(k 10^9 /
+    rate) >= due if and only if k 10^9 >= due rate. The division of the negative number rounds
+    up.
 
     Args:
         due_ns: The time, ns since the epoch, the common start of the session.
@@ -58,11 +61,10 @@ MAX_ARRIVALS = 4096
 
 
 class LifeReason(IntEnum):
-    """Why a site last changed its mode, or what last happened to it.
+    """Why an arm last changed its mode, for example because another arm fell silent.
 
-    A site is the process that runs one arm. The reasons only exist under the rule `glide`, by
-    which an arm waits for the other arms and comes to rest while one of them is silent.
-    `session_life` explains this rule.
+    The reasons only exist under the rule `glide`, by which an arm waits for the others and
+    comes to rest while one of them is silent. `session_life` explains this rule.
     """
 
     START = 0
@@ -127,7 +129,9 @@ class LifeOrder(IntEnum):
 
 
 class DominanceRamp(NamedTuple):
-    """Linear change over time of a site's dominance factors, with which it follows other sites.
+    """Gradual change of the weights with which an arm follows the other arms, linear in time.
+
+    The weights are called dominance factors, and belong to one site, the process of an arm.
 
     Attributes:
         start_ns: Start of the change, ns since the start of the session.
@@ -141,9 +145,10 @@ class DominanceRamp(NamedTuple):
 
 
 class CoreChange(NamedTuple):
-    """Change of a running site by a command from outside.
+    """Change that takes effect in an arm's process while it runs, as the control loop reads it.
 
-    A command changes the model of a link or the dominance factors, or gives an order.
+    It changes the model of a network link or the weights with which the arm follows the others,
+    or it gives an order such as stop.
 
     Attributes:
         text: Text in the record, from which all readers derive the same change.
@@ -163,7 +168,7 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Measured state of an arm that the program does not simulate, for example of a real arm.
+    """Measured state of an arm that the program does not simulate itself, such as a real arm.
 
     Attributes:
         q: Joint angles, rad.
@@ -180,7 +185,10 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """Input of one period of the control loop, for `Site.step`.
+    """Everything from outside that may influence one period of the control loop.
+
+    `Site.step` receives it. Time, messages and measurements come in here, so that the same
+    input always gives the same results.
 
     Attributes:
         k: Number of the period.
@@ -201,10 +209,10 @@ class TickInput(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """Counts of the samples of one link since the start of the site.
+    """Counts of the messages on one network link since the start, such as late and lost ones.
 
-    A link is the directed connection from a peer, and a sample the state that the peer
-    published in one tick.
+    A link leads from another arm's process (peer) to this one. A message is a sample, the state
+    of the peer in one control period.
 
     Attributes:
         accepted: Samples that arrived.
@@ -246,10 +254,10 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns why an arm last changed its mode, for example from RUN to HOLD, from its record.
+    """Returns why an arm last changed its mode, for example from RUN to HOLD, from its log.
 
     The arm must be under the rule `glide`, by which it comes to rest while another arm is
-    silent. Only then does a record contain the reason.
+    silent. Only then does the log contain the reason.
 
     Args:
         output: Record of the arm, the result of one control period.
@@ -259,9 +267,9 @@ def find_life_reason(output: TickRecord) -> LifeReason:
 
 
 class LifeAlarm(NamedTuple):
-    """Alarm that tells people why a site does not follow its peers, and what they can do.
+    """Alarm for people: why an arm does not follow the others, and what they can do.
 
-    `LifeAlarm.find` creates it. Pages and terminals show it as long as the site is in this
+    `LifeAlarm.find` creates it. Pages and terminals show it as long as the arm stays in this
     mode.
 
     Attributes:
@@ -429,7 +437,7 @@ def describe_mode(
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
-    """Writes the sentence that a log contains if an arm moved faster than its limit.
+    """Writes the sentence for the log that an arm moved faster than its speed limit.
 
     Args:
         site: Name of the process that runs the arm.

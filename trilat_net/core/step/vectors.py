@@ -29,25 +29,27 @@ Vector = Sequence[float] | Any
 
 @leaf
 def pair(a: Vector) -> Pair:
-    """Returns the two numbers of an array as a tuple.
+    """Returns the first two numbers of an array as a tuple.
 
-    Compiled code handles a tuple without allocating memory.
+    Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
+    control loop.
     """
     return a[0], a[1]
 
 
 @leaf
 def five(a: Vector) -> Five:
-    """Returns the five numbers of an array as a tuple.
+    """Returns the first five numbers of an array as a tuple.
 
-    Compiled code handles a tuple without allocating memory.
+    Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
+    control loop.
     """
     return a[0], a[1], a[2], a[3], a[4]
 
 
 @leaf
 def put(a: Any, values: Any) -> None:
-    """Copies numbers into an array, one by one, because compiled code must not allocate memory.
+    """Copies numbers into an array, one by one, without allocating memory.
 
     Args:
         a: The array, which is changed.
@@ -60,14 +62,14 @@ def put(a: Any, values: Any) -> None:
 # A tuple is not indexed by the variable of a loop: the compiled code would branch on it.
 @leaf
 def put_pair(a: Any, values: Pair) -> None:
-    """Copies two numbers into an array, whose length is 2."""
+    """Overwrites an array of length 2 with two numbers, without allocating memory."""
     a[0] = values[0]
     a[1] = values[1]
 
 
 @leaf
 def put_five(a: Any, values: Five) -> None:
-    """Copies five numbers into an array, whose length is 5."""
+    """Overwrites an array of length 5 with five numbers, without allocating memory."""
     a[0] = values[0]
     a[1] = values[1]
     a[2] = values[2]
@@ -79,8 +81,9 @@ def put_five(a: Any, values: Five) -> None:
 def choose(condition: bool, if_true: float, if_false: float) -> float:
     """Returns one of two numbers, without a branch in the compiled code.
 
-    Both numbers are computed. Functions with `choose` in place of `if` can also be compiled for
-    the numbers of several runs side by side, see `execution/lanes`.
+    Both numbers are computed before. With `choose` in place of `if`, a function can also be
+    compiled for several simulations side by side (SIMD), where each may need another choice.
+    See `execution/lanes`.
 
     Args:
         condition: The condition.
@@ -92,31 +95,32 @@ def choose(condition: bool, if_true: float, if_false: float) -> float:
 
 @leaf
 def holds_anywhere(condition: bool) -> bool:
-    """Returns the condition. With the numbers of several runs, it must hold in one of them.
+    """Returns the condition itself; for several simulations, True if it holds in any of them.
 
-    Compiled code may skip an operation if no run needs it, see `choose`.
+    Code that is compiled for several simulations side by side may skip an operation only if
+    none of them needs it, see `choose`.
     """
     return condition
 
 
 @leaf
 def round_down(number: float) -> float:
-    """Returns the largest whole number that is not above a number."""
+    """Returns the largest whole number that is not above a number: -2.0 for -1.5."""
     return float(np.floor(number))
 
 
 @leaf
 def whole(number: float) -> int:
-    """Returns a number without a fractional part as an integer."""
+    """Converts a float without a fractional part to an integer: 3 for 3.0."""
     return int(number)
 
 
 @leaf
 def count_started(table: Any, first: int, count: int, now: float) -> int:
-    """Returns how many rows of a time table start at a given time or before.
+    """Returns how many rows of a table, sorted by time, begin at or before a given time.
 
-    For example, this finds the row of a recorded torque that applies now. The rows are sorted
-    by time, their first column, so that bisection finds the count.
+    For example, this finds the row of a recorded torque that applies now. The time of a row is
+    its first column, so that bisection finds the count.
 
     Args:
         table: The table.

@@ -70,7 +70,10 @@ _DETERMINISTIC_KINDS = (
 
 
 class _LossChain(NamedTuple):
-    """Markov chain with two states that decides which samples are lost (Gilbert's model).
+    """Markov chain that decides which messages a simulated network loses, in bursts.
+
+    The network is either in a good or in a bad state (Gilbert's model). From message to message
+    it may change its state, and each state has its own probability of losing a message.
 
     Attributes:
         loss_good: Probability that a sample is lost in the good state.
@@ -86,11 +89,11 @@ class _LossChain(NamedTuple):
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """Directed connection between two sites, with everything except the delay itself.
+    """Network link from one arm's process to another's, with everything except the delay.
 
-    A sample is the state that a site publishes in one tick; the link carries it to the
-    receiver. A subclass defines the delay by overriding the methods whose names begin with an
-    underscore.
+    Each process sends its state once per control period, as a sample. The link states how many
+    samples are lost, duplicated or reordered. A subclass defines the delay by overriding the
+    methods whose names begin with an underscore.
 
     Attributes:
         loss: Fraction of samples that are lost in the long run.
@@ -128,7 +131,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return {}
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model of the delay, without loss."""
+        """Returns the delay of the link in the form that the compiled simulation reads.
+
+        Losses are not included; `to_core_model` adds them.
+        """
         raise NotImplementedError
 
     def _moments(self) -> tuple[float, float]:
@@ -136,19 +142,20 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         raise NotImplementedError
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay, in ms.
+        """Returns the longest delay of a message on the link, ms.
 
-        An unbounded distribution is cut at three standard deviations above the mean.
+        A distribution without an upper limit is cut at three standard deviations above its
+        mean.
         """
         mean_ms, deviation_ms = self._moments()
         return mean_ms + 3.0 * deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem of the delay that involves several keys, or None."""
+        """Returns a contradiction between several keys of the delay, or None."""
         return None
 
     def _describe_delay(self) -> str:
-        """Returns the delay as a short text with its mean and standard deviation."""
+        """Returns a short text for users about the delay, with mean and standard deviation."""
         mean_ms, deviation_ms = self._moments()
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
@@ -164,10 +171,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @property
     def random(self) -> bool:
-        """True if the delay, the losses or the duplicates of the link are drawn at random.
+        """True if the network link draws its delays, losses or duplicates at random.
 
-        Then another seed of the scenario gives another run. Losses are drawn only if some
-        samples are lost, but not all.
+        Another seed then gives another run. Losses are random only if some messages are lost,
+        but not all.
         """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
@@ -191,9 +198,9 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the delay and losses of a link to the record of the compiled simulation.
+        """Converts the delay and losses of a link to numbers for the compiled simulation.
 
-        The compiled simulation draws the random delays and losses from this record.
+        The simulation draws the random delays and losses from them.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after
@@ -321,7 +328,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
     """
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one sample, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
 
         A sample is the state that a site publishes in one tick. This method is compiled. It may
         use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
@@ -346,7 +353,10 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model. Its location is the longest delay, in microseconds."""
+        """Returns the delay in the form that the compiled simulation reads.
+
+        The parameter `location` is the longest delay, in microseconds.
+        """
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:

@@ -40,9 +40,9 @@ def _normal_probability(x: float) -> float:
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """Delay with a uniform distribution between two limits.
+    """Delay of each message drawn uniformly between the mean minus and plus a half width.
 
-    The limits are the mean minus and plus the half width.
+    For example, a mean of 50 ms and a half width of 10 ms give delays from 40 to 60 ms.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -69,7 +69,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model: the mean and the half width, in microseconds."""
+        """Returns the mean and the half width in microseconds, for the compiled simulation."""
         return LinkModel(
             kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms
         )
@@ -81,24 +81,24 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return f"uniform {least_ms:.4g} to {most_ms:.4g} ms"
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments. The standard deviation is half_width / sqrt(3)."""
+        """Returns the mean and the standard deviation, half_width / sqrt(3), in ms."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
     def _reach_ms(self) -> float:
-        """Returns the upper end of the distribution, in ms."""
+        """Returns the longest delay, the upper end of the uniform distribution, in ms."""
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the distribution would include negative delays."""
+        """Returns a problem if the half width exceeds the mean, so that delays are negative."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """Delay with a normal distribution, without negative delays.
+    """Delay of each message drawn from a normal distribution that is cut off at zero.
 
-    If a negative delay is drawn, it is drawn again.
+    A message cannot arrive before it was sent. Therefore a negative delay is drawn again.
 
     Attributes:
         delay_ms: Mean of the normal distribution, before negative delays are excluded, in ms.
@@ -109,17 +109,18 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     deviation_ms: Deviation
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model: the mean and the standard deviation, in microseconds."""
+        """Returns the mean and the deviation in microseconds, for the compiled simulation."""
         return LinkModel(
             kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of the normal distribution truncated at zero.
+        """Returns the mean and the standard deviation of the delay, in ms.
 
-        Let m and s be the mean and the standard deviation before the truncation, a = -m / s,
-        phi the standard normal density, Phi its integral, and H = phi(a) / Phi(-a) the hazard.
-        Then the mean is m + s H, and the standard deviation is s sqrt(1 + a H - H^2).
+        They are those of the normal distribution truncated at zero. Let m and s be the mean and
+        the standard deviation before the truncation, a = -m / s, phi the standard normal
+        density, Phi its integral, and H = phi(a) / Phi(-a) the hazard. Then the mean is m + s
+        H, and the standard deviation is s sqrt(1 + a H - H^2).
         """
         a = -self.delay_ms / self.deviation_ms
         hazard = _normal_density(a) / _normal_probability(-a)
@@ -128,7 +129,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """Base of delay models that are described by a mean and a standard deviation.
+    """Base of the delay models whose author states the mean and the standard deviation.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -139,7 +140,7 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
     deviation_ms: Deviation
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the two keys, which are the moments."""
+        """Returns the mean and the standard deviation that the author stated, in ms."""
         return self.delay_ms, self.deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
@@ -157,13 +158,13 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Delay with a gamma distribution: never negative, with a long tail of large delays.
+    """Delay of each message drawn from a gamma distribution: never negative, with a long tail.
 
-    Its keys are the mean and the standard deviation.
+    The author of a scenario states the mean and the standard deviation.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model.
+        """Returns the distribution in the form in which the compiled simulation draws from it.
 
         For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
         / s^2, and its scale is s^2 / m.
@@ -173,13 +174,13 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay whose logarithm has a normal distribution. Very long delays occur at times.
+    """Delay of each message whose logarithm is normal: mostly short, at times very long.
 
-    Its keys are the mean and the standard deviation of the delay itself.
+    The author of a scenario states the mean and the standard deviation of the delay itself.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model.
+        """Returns the distribution in the form in which the compiled simulation draws from it.
 
         For the mean m and the standard deviation s, the logarithm of the delay is normal with
         the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.
@@ -194,7 +195,7 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
     """Fixed delay plus a random part from one of two exponential distributions.
 
-    Mobile networks have such delays: most samples are fast, and some wait much longer.
+    Mobile networks have such delays: most messages are fast, and some wait much longer.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
@@ -209,7 +210,7 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
     slow_share: Probability
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model, with times in microseconds."""
+        """Returns the fixed delay and both means in microseconds, for the simulation."""
         return LinkModel(
             kind=DelayKind.HYPER_EXPONENTIAL,
             location=1e3 * self.floor_ms,
@@ -219,10 +220,11 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of the mixture, plus the fixed delay.
+        """Returns the mean and the standard deviation of the delay, in ms.
 
-        The second moment of a mixture is the mixture of the second moments. Exponential
-        distributions with the means a and b have the second moments 2 a^2 and 2 b^2.
+        The delay is a fixed part plus a mixture of two exponential distributions. The second
+        moment of a mixture is the mixture of the second moments. Exponential distributions with
+        the means a and b have the second moments 2 a^2 and 2 b^2.
         """
         fast = self.fast_ms
         slow = self.slow_ms
@@ -233,9 +235,10 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Delay with a normal distribution that is correlated from sample to sample.
+    """Delay that changes slowly: if one message is slow, the next one probably is too.
 
-    If one sample is slow, the next one probably is too. Negative delays become zero.
+    The delays are normally distributed and correlated from message to message. Negative delays
+    become zero.
 
     Attributes:
         correlation: Correlation between the delays of two consecutive samples, before negative
@@ -245,11 +248,11 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
     correlation: Correlation
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model: a normal delay with the correlation as weight."""
+        """Returns mean, deviation and correlation of the delay, for the compiled simulation."""
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments of max(0, x) for a normal random number x.
+        """Returns the mean and standard deviation of the delay max(0, x) for a normal x, ms.
 
         The variance is written as a sum in which large terms do not cancel each other.
         """
@@ -266,28 +269,27 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """Link without artificial delay, the ideal network.
+    """Ideal network link, which delays and loses nothing.
 
-    The receiver uses a sample from its next tick on, since a sample cannot act in its own tick.
+    The receiver still uses a message from its next control period on, because a message cannot
+    act in the period in which it was sent.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model of a link without delay, which is its default."""
+        """Returns the settings of a link without delay, for the compiled simulation."""
         return LinkModel()
 
     def _moments(self) -> tuple[float, float]:
-        """Returns zero for the mean and the standard deviation."""
+        """Returns zero for the mean and for the standard deviation of the delay, in ms."""
         return 0.0, 0.0
 
     def _describe_delay(self) -> str:
-        """Returns the text for links without delay."""
+        """Returns the text that users read about a link without delay."""
         return "no delay"
 
 
 class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
-    """Link with the same delay for every sample.
-
-    A sample is the state that a site publishes in one tick.
+    """Network link that delays every message by the same time.
 
     Attributes:
         delay_ms: Delay, in ms. A delay of 0 still means one period, because the receiver uses a
@@ -297,11 +299,11 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
     delay_ms: Milliseconds
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model, with the delay in whole microseconds (L4)."""
+        """Returns the delay in whole microseconds, for the compiled simulation."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the delay, and zero for the standard deviation."""
+        """Returns the constant delay as the mean, and zero as the standard deviation, in ms."""
         return self.delay_ms, 0.0
 
     def _describe_delay(self) -> str:
@@ -310,7 +312,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
 
 class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
-    """Delay that varies sinusoidally with the send time t of a sample.
+    """Network delay that rises and falls as a sine of the time t at which a message is sent.
 
         T(t) = delay + amplitude sin(2 pi t / period + phase)
 
@@ -327,7 +329,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
     phase_rad: Annotated[float, Meta(ge=-1e3, le=1e3)] = 0.0
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model, with times in microseconds."""
+        """Returns the parameters of the sine in microseconds, for the compiled simulation."""
         return LinkModel(
             kind=DelayKind.SINE,
             location=1e3 * self.delay_ms,
@@ -337,24 +339,25 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over whole periods."""
+        """Returns the mean and the standard deviation over whole periods, in ms."""
         return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay, in ms."""
+        """Returns the longest delay, at the crest of the sine, in ms."""
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the delay would become negative."""
+        """Returns a problem if the amplitude exceeds the mean, so that delays are negative."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """Delay that follows a recorded table of send times and delays.
+    """Network delay that repeats a measurement: a table of sending times and delays.
 
-    An author names a file with the table. A resolved scenario contains the table itself.
+    An author names a file with the table. A resolved scenario contains the table itself, so
+    that the experiment can be repeated without the file.
 
     Attributes:
         trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
@@ -372,14 +375,17 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return parse_trace(self.trace)
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model. The points themselves are in a separate array."""
+        """Returns the settings of a recorded delay, for the compiled simulation.
+
+        The recorded points themselves are in a separate array, see `points`.
+        """
         return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over one pass of the table, without lost samples.
+        """Returns the mean and the standard deviation of the recorded delays, in ms.
 
-        The delay of each point is weighted by the time until the next point. NaN if all samples
-        of the table are lost.
+        The delay of each point of the table is weighted by the time until the next point, and
+        lost messages are left out. Both results are NaN if all messages were lost.
         """
         t_us, delay_us = self.points.T
         # The last point lasts as long as the point before it.
@@ -395,11 +401,11 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return mean_us / 1e3, math.sqrt(variance) / 1e3
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay of the table, in ms."""
+        """Returns the longest delay in the recorded table, in ms."""
         return float(self.points[:, 1].max()) / 1e3
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the text does not contain a table."""
+        """Returns a problem if the text of the recorded delays cannot be read as a table."""
         try:
             parse_trace(self.trace)
         except ValueError as error:
@@ -408,18 +414,18 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """Link of a live session to which the program adds no delay.
+    """Network link of a live session to which the program adds no artificial delay.
 
-    The receiver uses a sample as soon as it has arrived over the real network. A simulation
+    The receiver uses a message as soon as it has arrived over the real network. A simulation
     cannot know these arrivals.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the kernel's model."""
+        """Returns the settings of a link on which no delay is simulated."""
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN, because the delay of the real network is not known beforehand."""
+        """Returns NaN twice, because the delay of the real network is not known beforehand."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:

@@ -15,13 +15,13 @@ from . import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
-    """Delay of a network of low-orbit satellites.
+    """Delay of a network of low-orbit satellites, such as Starlink.
 
     Such networks assign terminals to satellites again every 15 s, all terminals at once. Delay
     and jitter change abruptly at these times: Mohan et al., "A Multifaceted Look at Starlink
     Performance", WWW (2024). The model is the sum of a fixed delay, an exponential random part
     that is drawn once per interval, and an exponential random part that is drawn for every
-    sample.
+    message.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
@@ -36,7 +36,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     slot_s: Annotated[float, Meta(gt=0.0, le=1e4)] = 15.0
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one sample, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
 
         It is the sum of the fixed part and two random parts. If x is uniform between 0 and 1,
         then -log(x) has an exponential distribution with mean 1.
@@ -54,9 +54,10 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the moments over many intervals.
+        """Returns the mean and the standard deviation of the delay, in ms, over many intervals.
 
-        The variances of the two independent random parts add up.
+        An interval is the time of 15 s or so for which a terminal keeps its satellite. The
+        variances of the two independent random parts add up.
         """
         mean_ms = self.floor_ms + self.path_ms + self.jitter_ms
         return mean_ms, math.hypot(self.path_ms, self.jitter_ms)
@@ -64,6 +65,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     def _reach_ms(self) -> float:
         """Returns the longest delay that can be drawn, in ms.
 
-        The smallest random number is 2^-53, and -log(2^-53) = 36.8.
+        The random parts are multiples of -log(x) with x of at least 2^-53, and -log(2^-53) =
+        36.8.
         """
         return self.floor_ms + 36.8 * (self.path_ms + self.jitter_ms)

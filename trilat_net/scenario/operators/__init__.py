@@ -57,10 +57,10 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """Base of all operators and environments, which exert torques or forces on an arm.
+    """Base of all operators (models of persons) and environments, which push an arm.
 
-    A subclass describes one kind by its keys in a scenario, and converts them to a record for
-    the compiled simulation. A file of this folder with such a class adds a kind.
+    A subclass describes one kind by its keys in a scenario file, and converts them to numbers
+    for the compiled simulation. A file of this folder with such a class adds a kind.
     """
 
     group: ClassVar[str] = "hands"
@@ -69,15 +69,14 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the actor as the record from which the kernel computes its torque."""
+        """Returns the operator or environment as the compiled simulation reads it."""
         raise NotImplementedError
 
     @property
     def actor(self) -> TorqueSource:
-        """Operator or environment, as a record for the compiled simulation.
+        """Operator or environment as numbers, from which compiled code computes its torque.
 
-        The kernel cannot use Python objects. From this record of numbers, it computes the
-        torque on the arm in every tick.
+        The compiled code cannot use Python objects.
         """
         return self._source()
 
@@ -120,7 +119,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """Operator or environment that acts only in an interval of time.
+    """Base of the operators and environments that act only between two times of a run.
 
     Attributes:
         start_s: Start of the interval, in s after the start of the run.
@@ -132,7 +131,10 @@ class TimedActor(ActorBase, frozen=True, kw_only=True):
 
 
 class SampledActor(TimedActor, frozen=True, kw_only=True):
-    """Operator or environment whose force can be held constant during a control period.
+    """Base of the operators and environments whose force may be held during a control period.
+
+    A force that is held is computed once per period, like that of a real device with a digital
+    controller. Otherwise it acts continuously.
 
     Attributes:
         sampled: If True, the force is computed once per control period and held, as by a real
@@ -186,7 +188,10 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
-        """Returns the actor for the kernel, which calls the compiled `act`."""
+        """Returns the operator or environment as the compiled simulation reads it.
+
+        The simulation calls its compiled method `act`.
+        """
         kind = TorqueKind.OWN_TIP if self.at_tip else TorqueKind.OWN_JOINTS
         return TorqueSource(kind, self.start_s, self.end_s, sampled=self.sampled, model=self)
 
@@ -284,7 +289,7 @@ def resolve_operators(
 def _find_kind(
     entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str
 ) -> type[ActorBase]:
-    """Returns the class that a table names by its key `kind`.
+    """Returns the class for the kind of operator or environment that a table names.
 
     Raises:
         ScenarioError: The key is missing or wrong, or the kind belongs to the other list.
@@ -304,7 +309,7 @@ def _find_kind(
 
 
 class _RefusedKey(NamedTuple):
-    """Key of an operator's table whose value is missing or not valid.
+    """Key of an operator's or environment's table whose value is missing or not valid.
 
     Attributes:
         key: The key.
@@ -325,7 +330,9 @@ def _check_values(
     path: str,
     counts: VectorCounts,
 ) -> None:
-    """Refuses a complete table if a value has a wrong type, range or length.
+    """Refuses the table of an operator or environment with a value of a wrong type or length.
+
+    The error says what its author may write instead.
 
     Args:
         table: Complete table.
@@ -377,9 +384,9 @@ def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: Vector
 def _find_refused_key(
     table: fields.TomlTable, kind: type[ActorBase], counts: VectorCounts
 ) -> _RefusedKey | None:
-    """Returns the first key of a complete table that is missing or not valid.
+    """Returns the first key of an operator's table whose value is missing or not valid.
 
-    None if the table is valid.
+    The table must be complete. The result is None if it is valid.
     """
     try:
         msgspec.convert(table, kind)

@@ -80,7 +80,9 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     # The force does not depend on the time.
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:  # noqa: ARG002
-        """Computes the contact force of a compliant body on the end effector.
+        """Computes the contact force of a compliant body on the end effector, in N.
+
+        It is the formula of `act` for many positions at once.
 
         Args:
             t_s: Times, in s. The force does not depend on them.

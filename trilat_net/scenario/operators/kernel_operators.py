@@ -73,7 +73,7 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
     peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
-        """Returns the pulse for the kernel."""
+        """Returns the pulse of torque as the compiled simulation reads it."""
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
@@ -145,7 +145,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring for the kernel."""
+        """Returns the spring and its moving target as the compiled simulation reads them."""
         end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
         return TorqueSource(
             TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
@@ -218,7 +218,9 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Checks that the recorded torques are in the order of time.
+        """Checks that the times in a table of recorded torques are in ascending order.
+
+        The simulation finds the torque of a time by bisection, which needs this order.
 
         Returns:
             The setting `points` and the reason. None if every time is later than the previous
@@ -229,14 +231,15 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         return None
 
     def _source(self) -> TorqueSource:
-        """Returns the table for the kernel."""
+        """Returns the recorded torques as the compiled simulation reads them."""
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """Operator whose torque is a sine, for example to measure a frequency response.
+    """Operator whose torque is a sine of changing frequency, for example to measure a response.
 
-    The frequency changes linearly from its first to its last value. This sweep is repeated.
+    The frequency changes linearly from its first to its last value, for example from 0.1 to 10
+    Hz. This sweep is repeated.
 
     Attributes:
         peak_nm: Amplitude on each joint, in N m.
@@ -251,7 +254,7 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
-        """Returns the chirp for the kernel."""
+        """Returns the sine of changing frequency as the compiled simulation reads it."""
         return TorqueSource(
             TorqueKind.CHIRP,
             start_s=self.start_s,
@@ -264,9 +267,10 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
 
 
 class Multisine(TimedActor, frozen=True, tag="multisine"):
-    """Operator whose torque is a sum of sines with equal amplitude.
+    """Operator whose torque is a sum of sines with equal amplitude, to excite an arm.
 
-    Such a torque excites several frequencies at once.
+    Such a torque excites several frequencies at once, so that the response of the arm at each
+    of them can be measured in one run.
 
     Attributes:
         amplitude_nm: Amplitude of each sine on each joint, in N m.
@@ -282,7 +286,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Checks that each sine has its phase, and that the operator lets go after taking hold.
+        """Checks that each sine has a phase, and that the end is not before the start.
 
         Returns:
             The setting that is wrong and the reason. None if there is no problem.
@@ -295,7 +299,10 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        """Returns the sines for the kernel: a row each of frequency and phase in turns."""
+        """Returns the sines in the form that the compiled simulation reads.
+
+        Each sine is a row of its frequency in Hz and its phase in turns.
+        """
         count = len(self.frequencies_hz)
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
         if not turns:
@@ -335,7 +342,10 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns the direction in which the user of a haptic device sees each axis of the arm.
+        """Returns how the axes of an arm correspond to those of a haptic device.
+
+        The result has, for each axis of the arm, the direction in which the user of the device
+        sees it.
 
         Args:
             axes: Number of axes of the arm: 2 for a planar arm, 3 in space. If the settings
@@ -437,9 +447,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
-        """Returns the rules that limit what an operator may command during a run.
+        """Returns the limits on what a person may command while moving an arm during a run.
 
-        They bound the speed and range of the targets, and the forces.
+        They bound the speed and range of the point to which the arm is pulled, and the forces.
 
         Args:
             rate_hz: Tick rate of the site, in Hz.
@@ -476,7 +486,10 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the operator for the kernel, without the target, which changes."""
+        """Returns the spring and limits of a person who moves the arm, for the simulation.
+
+        The point to which the arm is pulled is not included, because it changes during the run.
+        """
         stiffness = self.stiffness_n_m
         damping = self.damping_n_s_m
         limit = self.force_limit_n
@@ -489,7 +502,10 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 def _check_frame(frame: list[Any], axes: int, path: str) -> None:
-    """Refuses directions of axes that are unknown, too few, too many, or parallel.
+    """Refuses a stated view direction of a device that is not a valid choice of axes.
+
+    The author of a scenario states how the axes of a haptic device correspond to those of the
+    arm. Unknown, missing, superfluous or parallel axes are refused.
 
     Args:
         frame: Names of the directions, one per axis.
@@ -542,7 +558,7 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     damping_nm_s_rad: fields.NotNegativeJoints
 
     def _source(self) -> TorqueSource:
-        """Returns the environment for the kernel."""
+        """Returns the damping of the joints as the compiled simulation reads it."""
         return TorqueSource(
             TorqueKind.VISCOUS,
             self.start_s,
@@ -577,7 +593,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     damping_n_s_m: fields.NotNegative = 0.0
 
     def _source(self) -> TorqueSource:
-        """Returns the wall for the kernel, with a normal of length 1."""
+        """Returns the wall as the compiled simulation reads it, with a normal of length 1."""
         x, y, z = (*self.normal, 0.0)[:3]
         # Unlike that of two numbers, `math.hypot` of three rounds differently between machines.
         length = math.hypot(x, y) if len(self.normal) == 2 else math.sqrt(x * x + y * y + z * z)

@@ -154,7 +154,7 @@ class HandSite(NamedTuple):
     def program(self) -> str:
         """Name of the class that operates the arm, for example "my_policy:Reach".
 
-        If the scenario does not name a class, it is "a program".
+        If no class is named, it is "a program".
         """
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
@@ -169,9 +169,9 @@ class HandSite(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Text by which a site recognises the messages of this program.
+        """Text by which an arm's process recognises the messages of this program.
 
-        It consists of the class of the program and the hash of the scenario, for example
+        It consists of the class of the program and the hash of the experiment, for example
         "my_policy:Reach 5cfbf3f16ec0c567". Both are cut to fit into a message.
         """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
@@ -198,15 +198,18 @@ class HandSite(NamedTuple):
         )
 
     def make_rules(self) -> HandRules:
-        """Returns the limits of the actions of the program."""
+        """Returns the limits on what the program that moves this arm may command.
+
+        They bound the speed and range of the point to which the arm is pulled, and the forces.
+        """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         return self.spec.make_rules(tick_rate_hz, self.scenario.arms[self.name])
 
     def make_hand(self) -> OwnHand:
-        """Creates the object that calls the program and applies its actions at the right ticks.
+        """Creates the object that calls the program and applies its actions at the right times.
 
         The program is called `rate_hz` times a second. An action takes effect `delay_s` after
-        the observation on which it rests, rounded up to a whole tick.
+        the observation on which it rests, rounded up to a whole control period.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
@@ -217,7 +220,7 @@ class HandSite(NamedTuple):
 
     @classmethod
     def find(cls, scenario: "Scenario", site: str) -> "HandSite | None":
-        """Finds the program that operates the arm of a site, if the scenario has one.
+        """Finds the program that moves an arm in place of a person, if the arm has one.
 
         Args:
             scenario: Description of the experiment.
@@ -287,9 +290,7 @@ class HandPlayer:
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Computes the actions of a program that operates the arm, for several periods.
-
-        A period is one cycle of the control loop.
+        """Computes the actions of the program that moves the arm, for several control periods.
 
         The result ends before the first period in which the program must observe a state of the
         arm that has not been computed yet.
@@ -306,7 +307,7 @@ class HandPlayer:
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
     def _prepare(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
-        """Calls the program if it is due in tick `k`.
+        """Lets the program that moves the arm decide, if a decision is due in control period k.
 
         Returns:
             A function that returns the joint angles of the arm, in rad.
@@ -317,7 +318,7 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what the program observes in tick `k`, for example the states of the arms.
+        """Returns what the program observes in control period k, such as the arms' states.
 
         Args:
             k: Number of the tick.
@@ -326,10 +327,10 @@ class HandPlayer:
         return self.hand.build_view(k, arrays, self._layout)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Calls the program in tick `k`, and schedules the action that it returns.
+        """Calls the program that moves the arm, and schedules the action that it returns.
 
-        The program receives what it observes in this tick. Its action applies later, after the
-        delay that the scenario states.
+        The program receives what it observes in this control period. Its action applies later,
+        after the delay that its settings state.
 
         Args:
             k: Number of the tick.
@@ -357,13 +358,16 @@ class HandPlayer:
         self.hand.release(k)
 
     def _describe_change(self, k: int, change: str) -> str:
-        """Returns a sentence about a change in tick `k`, such as taking hold of the arm."""
+        """Returns a sentence about the program, such as that it takes hold of the arm."""
         t_s = tick_ns(k, self._rate_hz) / NS_PER_S
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
 
 def make_hand_program(hand_site: HandSite) -> HandProgram:
-    """Creates the program that operates the arm of a site, an instance of the user's class.
+    """Creates an object of the user's class that moves the arm of one site.
+
+    A site is the process that runs one arm. The class is imported here, if a person has
+    permitted it to run.
 
     Args:
         hand_site: The site and the settings of the program.
