@@ -55,11 +55,14 @@ RepairedMessage = tuple[str, SiteMessage, bytes]
 
 
 class _OpenRequest(NamedTuple):
-    """A request that waits for its reply.
+    """A request for missing messages that the recorder has sent and that is not yet answered.
+
+    Messages can get lost on the network. The recorder then requests them again from their
+    sender.
 
     Attributes:
-        request: The request.
-        replies: Inbox for the replies.
+        request: The request, which states the wanted message numbers.
+        replies: Inbox in which the network connection stores the replies to the request.
         sent_ns: Time at which the request was sent, on the monotonic clock, in ns.
     """
 

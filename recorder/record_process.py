@@ -182,7 +182,10 @@ class Recorder:
         return None
 
     def record(self, epoch: Epoch) -> Recording:
-        """Writes the messages of the session until it ends.
+        """Writes the messages of the session to the log file until the session ends.
+
+        A session is a group of processes that each control one arm. They publish their results
+        on the network, and the recorder stores them in a log, an MCAP file.
 
         Args:
             epoch: Common start time of the session.
@@ -267,12 +270,15 @@ class Recorder:
         return self._read_scenario(sender.scenario, sender.member)
 
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Announces that the recorder runs. If it joins late, it requests the earlier messages.
+        """Announces on the network that the recorder runs.
 
-        The other members then know that their messages are recorded.
+        A late one requests earlier messages.
+
+        The other processes of the session wait for this announcement, from which they know that
+        their messages are recorded.
 
         Args:
-            recording: The recording.
+            recording: The recording, which has just been created.
             epoch: Common start time of the session.
             path: The file, for the user.
         """
@@ -293,20 +299,23 @@ class Recorder:
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
-        """Tells the recording which members have appeared on the network or disappeared.
+        """Tells the recording which processes have joined the session's network or left it.
 
-        The recording decides from that which sites it still has to wait for.
+        Zenoh, the network library, reports both. From these reports the recording decides which
+        sites (processes that control an arm) it still has to wait for before it closes the log.
         """
         while (change := self._presence.poll()) is not None:
             key, alive = change
             recording.note_presence(key, alive)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
-        """Writes the messages periodically until the session is over or the recorder must end.
+        """Writes received messages to the log at regular intervals until the session is over.
+
+        The loop also ends if the recorder itself is told to end, for example by Ctrl-C.
 
         Args:
-            recording: The recording.
-            report: Publishes the statistics.
+            recording: The recording, whose log is written.
+            report: Publishes statistics of the recorder, such as the number of stored messages.
         """
         ending_since_ns: int | None = None
         while not (self._stopped() or recording.is_over(self._clock.monotonic_ns())):
@@ -366,7 +375,10 @@ def record_session(
     afterwards: Callable[[], None] = lambda: None,
     warn: Callable[[], None] = lambda: None,
 ) -> int:
-    """Records one session in this process, from its search on the network to the finished log.
+    """Records a session in this process, from finding it on the network to the finished log.
+
+    A session is a group of processes (sites) that each control one arm. They publish the
+    results of every control period, which the recorder writes to an MCAP file.
 
     Args:
         session: Name of the session.

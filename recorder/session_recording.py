@@ -171,8 +171,9 @@ class Recording:
     def assume_gone(self) -> None:
         """Regards every site as gone until the network reports that it is present.
 
-        A recorder that joins a running session cannot know which sites have left before it
-        came.
+        A site is a process that controls one arm. A recorder that joins a running session
+        cannot know which sites have left before. If it expected messages of such a site, it
+        would wait forever.
         """
         self._gone_sites = set(self._sites)
 
@@ -198,7 +199,11 @@ class Recording:
 
     @property
     def is_repairing(self) -> bool:
-        """True if messages are missing that a site may still have, or if a reply is awaited."""
+        """True while messages are missing that may still be obtained from their sender.
+
+        This is so if a site that has the messages is still present, or if the recorder waits
+        for its reply to a request. The log is not closed in the meantime.
+        """
         return any(repair.is_active for repair in self._repairs.values())
 
     @property
@@ -644,14 +649,17 @@ class Recording:
         return True
 
     def flush(self) -> None:
-        """Passes all written messages to the operating system.
+        """Passes all messages in the memory of this process to the operating system.
 
-        They are then in the file even if this process crashes.
+        After this call they are in the file even if this process crashes. Without it, a crash
+        would lose the messages since the last call.
         """
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
-        """Finishes the log with the counts of messages and the end mark.
+        """Closes the log: writes the numbers of messages and the mark of a complete file.
+
+        A log without this mark was cut off, for example by a power failure.
 
         Args:
             queue: Queue of the received messages.
@@ -689,9 +697,7 @@ class Recording:
         return texts
 
     def render_summary(self) -> list[str]:
-        """Summarises the recording for the user.
-
-        The user sees there whether the log is complete.
+        """Returns lines that tell the user at the end whether the log is complete.
 
         Returns:
             A line for each site with the numbers of its records, and a line for each reason why

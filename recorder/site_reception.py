@@ -65,11 +65,11 @@ _OTHER_KEYS = "others"
 
 
 class InboundMessage(NamedTuple):
-    """A message that has arrived over the network and waits to be written.
+    """A network message in the recorder's queue, which is not yet decoded or written to a log.
 
     Attributes:
-        key: Key under which the message was published. It names the session, the member and the
-            channel.
+        key: Network address ("key") under which the message was published. It names the
+            session, the member and the channel.
         payload: Bytes of the message.
         mono_ns: Time of the arrival on the monotonic clock, in ns.
     """
@@ -176,7 +176,10 @@ _LEAST_EVENT_BYTES = 128
 
 
 class SiteMessage(NamedTuple):
-    """A message of a site after it was decoded, with its number.
+    """A decoded message of a site, with the numbers under which the log stores it.
+
+    A site is a process that controls one arm. It publishes a record of each control period
+    (tick), statistics of its network links, and events.
 
     Attributes:
         number: Number of the message in its channel. It is -1 for an event without a number.
@@ -596,13 +599,18 @@ class SiteReception:
 
     @property
     def is_complete(self) -> bool:
-        """True if the site has ended and every message that it can still send has arrived."""
+        """True if the site has ended and the recorder has received all of its messages.
+
+        A site is a process that controls one arm. When it ends, it publishes how many control
+        periods it has executed, from which the recorder knows what to expect.
+        """
         return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:
-        """Gives up all messages that are missing, because the site cannot send them any more.
+        """Stops requesting missing messages of a site that can no longer send them.
 
-        They still count as missing, but are no longer requested.
+        A site is a process that controls one arm. If it has crashed, its buffer of sent
+        messages is lost. The messages remain counted as missing in the summary of the log.
         """
         for account in self.accounts.values():
             account.abandon_below(account.last + 1)

@@ -278,7 +278,9 @@ class ChangeServer:
         return to_core_change(self._scenario, change)
 
     def _schedule_stop(self, next_tick: int, stop_s: float) -> tuple[str, int]:
-        """Schedules the end of the run, unless an earlier end is scheduled already.
+        """Schedules the end of the run at a requested time, unless an earlier end is scheduled.
+
+        All arms of a session receive the same time, so that they stop together.
 
         Args:
             next_tick: Number of the next tick, a period of the control loop. It is executed in

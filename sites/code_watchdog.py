@@ -47,7 +47,10 @@ FIRST_CHECKS = 61
 
 
 def _read_thread_usage() -> tuple[int, int]:
-    """Returns how long this thread has computed, and how often it was interrupted.
+    """Returns the computing time of this thread, and how often the system interrupted it.
+
+    Two readings show whether a slow call has computed for long itself, or whether the operating
+    system ran other programs in the meantime.
 
     Returns:
         The computing time in ns, and the number of involuntary context switches. The values are
@@ -178,10 +181,14 @@ class WatchedCode:
             raise self._fail(tick, problem)
 
     def describe_hiccups(self) -> str:
-        """Describes the calls that took longer than a period of the control loop, for the user.
+        """Returns a sentence about slow calls of the user's code, for the end of the run.
+
+        A call is slow if it takes longer than a period of the control loop, for example 1 ms at
+        1 kHz. The arm then receives its torque too late.
 
         Returns:
-            A sentence with their number and the longest duration. Empty if there were none.
+            A sentence with the number of slow calls and the duration of the slowest. Empty if
+            no call was slow.
         """
         if not self.hiccups:
             return ""
@@ -192,14 +199,16 @@ class WatchedCode:
         )
 
     def check(self) -> None:
-        """Interrupts the code if the same call has been running for several checks in a row.
+        """Interrupts user code that does not return, such as a law with an endless loop.
 
-        The method is called by a signal handler every `_CHECK_S`, while the code runs. Checks
-        that are missed because the process was suspended do not count. A call is identified by
-        the number of finished calls before it.
+        A timer signal calls this method every second (`_CHECK_S`) while the code runs. If
+        several checks in a row see the same call, an error is raised inside of the call,
+        because otherwise the arm would never receive another torque. A call is identified by
+        the number of finished calls before it. Checks that were missed while the process was
+        suspended do not count.
 
         Raises:
-            Exception: The error of `fail`. It is raised inside of the user's code.
+            Exception: The error that the constructor's argument `fail` has made.
         """
         tick = self._running_tick
         is_running = tick >= 0

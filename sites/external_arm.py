@@ -114,7 +114,10 @@ class ExternalArm:
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement of the arm, without which the session cannot start.
+        """Waits for the first measurement of an arm outside of this program, such as a robot.
+
+        The session cannot start without it, because the controller would not know the arm's
+        pose.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -309,7 +312,10 @@ class ExternalArm:
 
 @dataclass
 class _Holder:
-    """Newest report of one program about whether somebody holds the dead-man switch.
+    """Newest report of one program on whether its user holds the dead-man switch of an arm.
+
+    An external arm (one outside of this program) moves only while somebody holds this switch,
+    for safety. Several programs may report for one arm.
 
     Attributes:
         n: Number of its newest message.
@@ -424,9 +430,10 @@ class DeadManSwitch:
         return "held" if is_stopped_by_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
-        """Marks the switch as released, because some programs have released it or are silent.
+        """Marks the dead-man switch of the arm as released, so that the arm stops.
 
-        All other programs that hold the switch must release it and press it again.
+        Programs that still hold the switch must release it and press it again. In this way,
+        nobody restarts an arm by accident that somebody else has stopped.
 
         Args:
             released: The programs that have released it or are silent. If there are none,
@@ -486,9 +493,10 @@ class DeadManSwitch:
         program.counts = True
 
     def _forget_program(self) -> None:
-        """Forgets the program that appeared first, to make room for a new one.
+        """Removes the oldest program from the list of switch holders, to make room for another.
 
-        Programs that do not press the switch are forgotten before those that do.
+        Every program that reports on the dead-man switch has an entry, and their number is
+        limited. Programs that do not press the switch are removed before those that do.
         """
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))

@@ -26,7 +26,10 @@ _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" incl
 
 
 class _ProcessorTimes(NamedTuple):
-    """Times that all processors of the machine have spent since its start, in system ticks.
+    """Idle and total time of all processors since the start of the machine.
+
+    Two readings give the load in between. The unit is the clock tick of the kernel, usually 10
+    ms.
 
     Attributes:
         idle: Time without work, summed over the processors.
@@ -97,7 +100,10 @@ def describe_load(busy_share: float | None) -> str:
 
 
 def check_machine_load(clock: Clock) -> str:
-    """Measures whether this machine is busy, and returns a warning if it is.
+    """Returns a warning if other programs keep this machine busy.
+
+    A control loop on a busy machine starts its periods late, which makes its arm move
+    differently.
 
     Args:
         clock: Clock of this process.

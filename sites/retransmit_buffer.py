@@ -86,9 +86,10 @@ class ChannelBuffer:
         self.oldest = number
 
     def store(self, payload: bytes) -> None:
-        """Stores a message under the next number.
+        """Stores a published message under the next number, so that it can be sent again.
 
-        If there is no room for it, the oldest messages are removed.
+        A recorder that finds a gap in the numbers requests the missing messages. If the buffer
+        is full, the oldest messages are removed.
 
         Args:
             payload: The encoded message.
@@ -219,7 +220,9 @@ class RetransmitBuffer:
         self.channels[topics.LINK].skip(unpublished_statistics)
 
     def answer_query(self) -> bool:
-        """Answers the oldest waiting query of a recorder.
+        """Answers the oldest request of a recorder for messages that it has missed.
+
+        One call answers one request, so that many requests do not delay the control loop.
 
         Returns:
             True if a query was answered. False if no query was waiting.
@@ -231,11 +234,10 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-        """Finds the messages that a query requests, as `answer_backfill` needs them.
+        """Finds the stored messages that a recorder has missed and requests again.
 
-        Returns:
-            Number of the first message, the messages, and the number of the next message that
-            will be published.
+        Args:
+            wanted: The request, with the channel and the numbers of the missing messages.
         """
         buffer = self.channels[wanted.channel]
         first, payloads = buffer.read_chunk(wanted.first, wanted.last)

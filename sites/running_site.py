@@ -117,7 +117,11 @@ class RunningSite:
 
     @property
     def link_monitors(self) -> Sequence[LinkTimingMonitor]:
-        """Timing monitors of the links from the peers, in the order of the peers."""
+        """Monitors that measure the delays and losses of the messages from each peer.
+
+        A peer is another site, a process that controls one arm. The monitors have the order of
+        the peers.
+        """
         return self._timing.monitors
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:

@@ -199,7 +199,10 @@ class PeerInbox:
         arrived_ns: int,
         since_epoch_ns: int,
     ) -> Arrival | None:
-        """Checks one sample, counts it if it is dropped, and measures its delay.
+        """Checks the state that another arm has sent, and measures its delay.
+
+        A message is dropped and counted if it cannot be decoded, comes from an unexpected
+        process, or lies too far in the future, so that a faulty sender cannot move this arm.
 
         Args:
             index: Index of the peer.
@@ -462,11 +465,12 @@ class _LoopSite(Protocol):
         """Returns True if the present tick must not be executed, because the run is over."""
 
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Executes one tick.
+        """Executes one period of the control loop: reference, control law and motion of an arm.
 
         Args:
             tick: Number of the tick.
-            arrivals: Samples of the peers that have arrived since the previous tick.
+            arrivals: Samples (states of the other arms) that have arrived since the previous
+                tick.
 
         Returns:
             The record of the tick. None if the run ends because the tick failed.
@@ -479,14 +483,21 @@ class _LoopSite(Protocol):
         """Publishes encoded statistics of the loop and its links, which the recorder stores."""
 
     def run_housekeeping(self, output: TickRecord, /) -> object:
-        """Does what is due ten times a second: replies to queries, clocks, members, news.
+        """Executes the slow tasks of the control process, ten times a second.
+
+        They are replies to queries, clock comparison, the list of present processes, and news
+        for the user. They are not part of the control period, because they would make it too
+        long.
 
         Args:
             output: Record of the newest tick.
         """
 
     def report_tick(self, output: TickRecord, /) -> object:
-        """Reports what has changed in a tick, such as a new mode, by events and alarms.
+        """Publishes events and alarms about what has changed in a control period.
+
+        An example is an arm that stopped following the others, because their messages were
+        missing.
 
         Args:
             output: Record of the tick.

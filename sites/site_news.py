@@ -175,7 +175,9 @@ class SiteNews:
             parts.say(self._describe_status(output))
 
     def _publish_entries(self, kind: str, news: list[tuple[int, str]]) -> None:
-        """Publishes an event for each entry of a list of news, and empties the list.
+        """Publishes one event for each entry of a list, and then empties the list.
+
+        The control loop only appends to the list, because publishing would take too long there.
 
         Args:
             kind: Kind of the events, for example "mark".

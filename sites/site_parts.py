@@ -101,9 +101,10 @@ class SiteOptions:
 
 
 class SiteParts:
-    """All parts of one site, a process that runs one arm and its control loop.
+    """All objects of which a site consists: arm, control law, network queues and buffers.
 
-    The constructor creates the parts that the scenario needs. All other parts are None.
+    A site is a process that runs one arm and its control loop. The constructor creates the
+    objects that the scenario needs. All others are None.
 
     Args:
         scenario: Scenario of the session.
@@ -196,11 +197,13 @@ class SiteParts:
         warm_up(scenario, name, clock)
 
     def _key(self, channel: str, member: str = "") -> str:
-        """Returns the network address ("key") of a channel of this site or of another member.
+        """Returns the network address ("key" in Zenoh) on which a process publishes a channel.
+
+        A key contains the names of the session, of the process, and of the channel.
 
         Args:
-            channel: Name of the channel, see `topics`.
-            member: Name of the other member. Empty for this site.
+            channel: Name of the channel, such as its records or events, see `topics`.
+            member: Name of another process of the session. Empty for this one.
         """
         return topics.key(self.options.session, member or self.name, channel)
 
@@ -315,9 +318,10 @@ class SiteParts:
             self.switch = DeadManSwitch(name, ring, self.clock, self.stats.dropped)
 
     def _make_storing_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
-        """Returns a function that publishes messages, and keeps them for later requests.
+        """Returns a function that publishes messages and also stores them for a while.
 
-        A recorder that missed a message on the network requests it again.
+        A recorder that missed a message on the network requests it again, and receives the
+        stored copy.
 
         Args:
             channel: Channel of the messages, records or statistics.

@@ -47,9 +47,11 @@ def run_site(
     options: SiteOptions,
     say: Callable[[str], None],
 ) -> int:
-    """Runs one site of a scenario from its start to its end.
+    """Runs the control loop of one arm as a member of a session, from its start to its end.
 
-    A site is a process that runs one arm and its control loop.
+    Such a process is called a site. It waits for the other sites of the scenario, exchanges the
+    state of its arm with them over the network in every control period, and publishes its
+    results for the recorder.
 
     Args:
         scenario: Scenario of the session.

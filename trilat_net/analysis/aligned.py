@@ -116,7 +116,7 @@ class AlignedRecords(NamedTuple):
 
     @property
     def h_s(self) -> float:
-        """The tick period, in s."""
+        """The period of the control loop (tick), in s: 0.001 at a rate of 1 kHz."""
         return 1.0 / self.rate_hz
 
     @property
@@ -462,11 +462,15 @@ class PeerTrajectory:
         return _PeerMotion(q, qd, squares, known)
 
     def _interpolate(self, row: Ints, fraction: Array) -> tuple[Array, Array, Array]:
-        """Returns the motion between two ticks: q, qd, and the integral of qd squared.
+        """Interpolates the recorded motion of another arm between two control periods (ticks).
 
         Args:
-            row: Row of the tick before each time, shape (K,).
-            fraction: Share of the tick period that has passed at each time, shape (K,).
+            row: Row of the record before each of K times, shape (K,).
+            fraction: Fraction of the period, 0 to 1, that has passed at each time, shape (K,).
+
+        Returns:
+            Joint angles q, in rad, joint velocities qd, in rad/s, and the integral of qd
+            squared over time, at each of the K times.
         """
         records = self.records
         h = records.h_s

@@ -66,7 +66,10 @@ B).
 
 
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
-    """Multiplies a matrix and a vector, separately for each of many records.
+    """Multiplies many matrices by many vectors in one call, one product per log record.
+
+    Numbers of the records are on the last axes, so that NumPy computes all records at once
+    instead of a slow Python loop.
 
     Args:
         matrix: Entries of the matrices, shape (a, b, ...). The axes "..." count the records.
@@ -80,7 +83,9 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
-    """Solves the linear systems A y = b, separately for each of many records.
+    """Solves many small linear systems A y = b in one call, one system per log record.
+
+    An example is the acceleration of an arm, where A is the inertia matrix and b the torque.
 
     Args:
         A: Square matrices, shape (m, m, ...). The axes "..." count the records.
@@ -344,9 +349,10 @@ class PlanarArmRows(NamedTuple):
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns an object that computes the dynamics of the arm in K poses.
+        """Returns the dynamics of the arm, such as its inertia matrix, in each of K poses.
 
-        Its arrays have the poses on their last axis.
+        Functions of the poses alone, such as sines of the angles, are computed only once. The
+        arrays of the returned object have the poses on their last axis.
 
         Args:
             q: Joint angles of the K poses, shape (K, 2), in rad.
@@ -433,7 +439,9 @@ class PlanarArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) that holds the arm against gravity in K poses, in N m.
+        """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
+
+        K poses are evaluated at once.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -488,7 +496,10 @@ class PlanarArmRows(NamedTuple):
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns position, velocity and Jacobian of the end effector in each of K poses.
+        """Returns position, velocity and Jacobian of the end effector (tip) of a planar arm.
+
+        The Jacobian is the matrix from joint velocities to the velocity of the end effector. K
+        poses are evaluated at once.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -802,7 +813,9 @@ class ChainArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) that holds the chain against gravity, in N m.
+        """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
+
+        The arm is a chain of n joints, and K poses are evaluated at once.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -820,13 +833,19 @@ class ChainArmRows(NamedTuple):
         )
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Computes the end effector's position and Jacobian, and the potential energy.
+        """Computes the end effector's position and Jacobian, and an arm's potential energy.
+
+        The Jacobian is the matrix from joint velocities to the velocity of the end effector. K
+        poses are evaluated at once.
+
+        Args:
+            q: Joint angles of n joints, shape (K, n), in rad.
 
         Returns:
             Position of the end effector, shape (K, 3), in m.
             Its Jacobian, with three rows for the velocity and three for the angular velocity,
             shape (K, 6, n).
-            Potential energy, shape (K,), in J.
+            Potential energy due to gravity, shape (K,), in J.
         """
         poses, joints = q.shape
         position = np.zeros((poses, 3))
@@ -854,7 +873,9 @@ class ChainArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that the joints need to overcome their friction, dry and viscous.
+        """Returns the torque that overcomes the dry and viscous friction of the joints.
+
+        Dry friction has a constant size, and viscous friction grows with the velocity.
 
         Args:
             speed: Joint velocities at K times, shape (K, n) for n joints, in rad/s.

@@ -53,7 +53,10 @@ class DominanceHistory(NamedTuple):
 
     @property
     def constant(self) -> bool:
-        """True if no factor ever changes."""
+        """True if no dominance factor changes during the run.
+
+        A dominance factor is the weight, from 0 to 1, with which one arm follows another.
+        """
         has_steps = bool(np.any(self.alpha != self.alpha[0]))
         has_ramps = bool(self.rate.any())
         return not has_steps and not has_ramps
@@ -219,9 +222,10 @@ def _is_held_by_policy(log: Log, site: str) -> bool:
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the weights with which the slave arm follows each of its users over time.
+    """Returns the weights with which the slave arm follows the arm of each user over time.
 
-    `find_users` determines the slave and the users.
+    The slave is the arm at the task, which several users guide together. `find_users`
+    determines the slave and the users.
 
     Args:
         scenario: The description of the experiment.
@@ -287,9 +291,10 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 class PeerLoss(NamedTuple):
-    """Span of time in which a site continued without a peer that it no longer heard.
+    """Interval of time in which an arm continued without another arm whose messages stopped.
 
-    The site then follows the remaining peers alone, which changes its dominance factors.
+    The arm then follows the remaining arms alone, which changes its dominance factors, the
+    weights with which it follows them.
 
     Attributes:
         site: Name of the site.
@@ -447,7 +452,10 @@ def evaluate_ramps(
 
 
 def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
-    """Returns the dominance factors of a site over time, as the scenario plans them.
+    """Returns the dominance factors of an arm over time, as its scenario plans them.
+
+    A dominance factor is the weight, from 0 to 1, with which an arm follows another one. A
+    scenario can shift these weights during the run, for example from a teacher to a student.
 
     Args:
         scenario: The description of the experiment.

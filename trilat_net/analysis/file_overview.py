@@ -64,7 +64,10 @@ Absences = Mapping[str, Sequence[tuple[int, int]]]
 
 
 class _Messages(NamedTuple):
-    """Numbers of all messages of a channel, in the order of the file.
+    """Times, numbers and sizes of all messages of one channel of an MCAP file.
+
+    Each array has one entry per message, in the order of the file. The contents of the messages
+    are not kept, because a log may be larger than the memory.
 
     Attributes:
         log_ns: Times at which the recorder received the messages, in ns.
@@ -115,7 +118,7 @@ class FileInventory:
             bytes_before += path.stat().st_size
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
-        """Adds the channels, the message numbers and the facts of a file, such as damage.
+        """Adds a file to the inventory: its channels, the numbers of its messages, its damage.
 
         Args:
             path: The file.
@@ -182,7 +185,7 @@ class FileInventory:
         return channels
 
     def _describe_channel(self, topic: str) -> JsonObject:
-        """Returns number, size, times and encoding of the messages of a channel.
+        """Returns the number, sizes, times and encoding of the messages of one channel.
 
         Args:
             topic: Topic of the channel.
@@ -276,7 +279,10 @@ class FileOverview(Result):
     facts: JsonObject
 
     def headline(self) -> str:
-        """Returns one line such as "run.mcap: 120345 messages", with the paths of all files."""
+        """One line with the paths of all files and the number of messages, for the user.
+
+        An example is "run.mcap: 120345 messages".
+        """
         channels = self.facts["channels"].values()
         messages = sum(channel["messages"] for channel in channels)
         message_count = count_nouns(messages, "message")
@@ -365,7 +371,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
 
 def _describe_log(log: Log) -> JsonObject:
-    """Returns the facts of a log of this program: of its session, its sites and its links.
+    """Returns the contents of a log as plain values: its session, its arms and network links.
 
     Args:
         log: The log.
@@ -519,7 +525,7 @@ def _compute_percentiles(
     shares: Mapping[str, float] = PERCENTILES,
     unit: float = 1.0,
 ) -> dict[str, float] | None:
-    """Computes some percentiles of a list of numbers.
+    """Computes percentiles, such as the median, of a list of numbers.
 
     Args:
         values: The numbers.
@@ -634,7 +640,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
-    """Returns the numbers of a site for `summary.json`, such as its largest errors and torques.
+    """Returns the most important numbers of one arm in a run, such as its largest error.
+
+    They are written to `summary.json`, so that other programs can read them.
 
     Args:
         log: The log of the run.

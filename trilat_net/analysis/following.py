@@ -197,6 +197,9 @@ class TaskFollowing:
     def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
         """Returns the joint velocity with which the end effector should reduce its error.
 
+        The end effector is the tip of the arm. The arm follows other arms with this tip, and
+        not joint by joint.
+
         Args:
             rows: Rows of the records whose pose is used.
             e: Differences between the position of the end effector and the position that it

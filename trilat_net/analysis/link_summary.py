@@ -144,7 +144,9 @@ def predict_delivery(
 
 
 class _Arrivals(NamedTuple):
-    """Samples that arrived at a site over a link, in the order in which they arrived.
+    """Messages ("samples") that arrived at an arm over one network link, in order of arrival.
+
+    A sample contains the state of the sending arm in one tick, a period of its control loop.
 
     Attributes:
         tick: Ticks in which the receiver accepted the samples, shape (A,).
@@ -284,7 +286,9 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """Mean, standard deviation, percentiles and extremes of some numbers, in their unit.
+    """Mean, standard deviation, percentiles and extremes of numbers, such as delays in ms.
+
+    All attributes have the unit of the numbers.
 
     Attributes:
         mean: Arithmetic mean.
@@ -470,7 +474,7 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link as in scenarios: "m1->s" for samples that m1 sends to s."""
+        """Name of the link as in scenarios: "m1->s" for messages from arm m1 to arm s."""
         return f"{self.peer}->{self.site}"
 
     @property
@@ -486,7 +490,9 @@ class LinkSummary(NamedTuple):
 
 
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """Returns True if a link gives every sample the same delay, and loses no sample.
+    """Returns True if a network link delays every message equally, and loses none.
+
+    The stability theorem requires constant delays.
 
     Args:
         states: Delay models of the link over time.
@@ -498,7 +504,9 @@ def has_one_constant_delay(states: list[StatedModel]) -> bool:
 
 
 def summarise_links(log: Log) -> list[LinkSummary]:
-    """Returns a summary of every link, by receiver and then by peer, in scenario order.
+    """Returns delays, losses and message counts of every network link of a run.
+
+    The summaries have the order of the receivers, and then of the senders, in the scenario.
 
     Args:
         log: The log of the run.
@@ -532,7 +540,9 @@ def summarise_links(log: Log) -> list[LinkSummary]:
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
-    """Returns how old the peer's state was that a site used, at every tick, in ns.
+    """Returns the age of the other arm's state that a control loop used, at every tick, in ns.
+
+    A state is older than the network delay if the next message is late or lost.
 
     Args:
         log: The log of the run.
@@ -550,7 +560,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Computes mean, standard deviation, percentiles and extremes, for example of the ages.
+    """Computes mean, standard deviation, percentiles and extremes of numbers, such as delays.
 
     Args:
         values: The numbers.
@@ -609,7 +619,7 @@ def _summarise_link(
     sent: int,
     arrivals: _Arrivals,
 ) -> LinkSummary:
-    """Returns the summary of the link from a peer to a site.
+    """Returns delays, losses and message counts of the network link from one arm to another.
 
     Args:
         log: The log of the run.
@@ -690,7 +700,9 @@ def _count_samples(
     sent: int,
     judged: int,
 ) -> SampleCounts:
-    """Counts the samples of a link by what happened to them, see `SampleCounts`.
+    """Counts the messages (samples) of a network link by their fate, see `SampleCounts`.
+
+    Examples are samples that were used, lost, or replaced by a newer one before their use.
 
     Args:
         site_log: Log of the receiver.
@@ -727,7 +739,10 @@ def _count_samples(
 
 
 class DelayDistribution(NamedTuple):
-    """Delays and ages of all samples on one link, for a histogram.
+    """Delays and ages of all messages (samples) on one network link, for a histogram.
+
+    The delay is the time from sending to the first use. The age is the time since a state was
+    measured, at a later tick at which it is still used.
 
     Attributes:
         peer: Name of the sender.
@@ -744,7 +759,9 @@ class DelayDistribution(NamedTuple):
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Collects the delays and ages of the samples on every link of a run, for histograms.
+    """Collects the delays of all messages on every network link of a run, for histograms.
+
+    The ages at which control loops used the messages are added.
 
     Args:
         log: Log of the run.

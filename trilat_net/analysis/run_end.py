@@ -1079,7 +1079,7 @@ def _find_last_change(scenario: Scenario, span_s: float) -> float:
 
 
 def _find_frequency_hz(site_logs: list[SiteLog]) -> float | None:
-    """Estimates the frequency of an oscillation from the changes of sign of the fastest joint.
+    """Estimates how fast the arms oscillate, from the changes of sign of the fastest joint.
 
     Args:
         site_logs: Logs of all sites. The second half of each is used.

@@ -31,7 +31,9 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """One arm in a recorded run: its motion, its torques, and how it follows the other arms.
+    """Motion and torques of one arm in a recorded run, and how the arm follows other arms.
+
+    A site is the process that controls the arm.
 
     Attributes:
         records: Records of the site, with one row for every tick.
@@ -46,9 +48,9 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A recorded run, with everything that several metrics need, computed at most once.
+    """A recorded run, with quantities that several metrics need, each computed at most once.
 
-    Every metric receives this object and reads sites, links and walls from it.
+    Every metric receives this object and reads arms, network links and walls from it.
 
     Args:
         log: The log of the run.
@@ -106,7 +108,7 @@ class RunView:
 
     @cached_property
     def absent(self) -> list[str]:
-        """Names of the sites without any record, which a log of a failed session may have."""
+        """Names of the arms without any record, which a log of a failed session may have."""
         return [site for site in self.log.sites if site not in self.sites]
 
     @cached_property
@@ -130,7 +132,7 @@ class RunView:
         return walls
 
     def list_subjects(self, kind: str) -> Iterable[str]:
-        """Lists the names of the sites, links or walls for which a metric is computed.
+        """Lists the names of all arms, network links or walls for which a metric is computed.
 
         Args:
             kind: "site", "link", "wall", or "run". For "run" the list has a single empty name.

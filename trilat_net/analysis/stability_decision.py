@@ -91,9 +91,9 @@ class LoopRoots(NamedTuple):
 
     @property
     def is_proof(self) -> bool:
-        """True if the roots prove that small motions about the final pose die away.
+        """True if the roots (growth rates) prove that small motions about the final pose decay.
 
-        This needs exact roots: those of a loop with its ticks and its repeating delays.
+        Only exact roots prove it: those of a loop with its ticks and its repeating delays.
         """
         return self.exact and self.verdict == "stable"
 
@@ -112,9 +112,9 @@ class LoopRoots(NamedTuple):
 
     @property
     def is_refutation(self) -> bool:
-        """True if the roots prove that small motions about the final pose grow.
+        """True if the roots (growth rates) prove that small motions about the final pose grow.
 
-        This needs exact roots: those of a loop with its ticks and its repeating delays.
+        Only exact roots prove it: those of a loop with its ticks and its repeating delays.
         """
         return self.exact and self.verdict == "unstable"
 
@@ -152,7 +152,7 @@ class LoopRoots(NamedTuple):
 
 
 class StabilityDecision(NamedTuple):
-    """Decision whether a run is stable, and what it rests on.
+    """Decision whether a run of coupled arms is stable, with the evidence for it.
 
     Attributes:
         stability: The decision.
@@ -168,7 +168,7 @@ class StabilityDecision(NamedTuple):
 
 
 class RunFindings(NamedTuple):
-    """Everything that is known about the stability of a run: the input of `decide_stability`.
+    """All evidence on the stability of a run, from which `decide_stability` decides.
 
     Attributes:
         end: How the motion ends.
@@ -287,7 +287,10 @@ def _list_reasons(run: RunFindings) -> tuple[str, ...]:
 
 
 def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDecision | None:
-    """Decides about a run by its end and its exact roots alone.
+    """Decides whether a run is stable from its end and its exact roots alone.
+
+    The roots are growth rates of small motions, computed from the linearised control loop. If
+    all of them are negative, small motions die away.
 
     Args:
         run: Everything that is known about the run.

@@ -110,9 +110,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def theta(self) -> Array:
-        """The arm's true parameters, which combine masses, inertias and lengths, shape (P,).
+        """True dynamic parameters of the arm, shape (P,), which the control law tries to learn.
 
-        V measures how far the estimates are from them.
+        They combine masses, inertias and lengths of the links. The stability proof measures how
+        far the learnt parameters are from the true ones.
         """
         return self.arm.theta
 
@@ -129,12 +130,14 @@ class SiteConstants(NamedTuple):
         return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the robust torque, which the law subtracts in addition to Kp r.
+        """Returns the robust torque, an extra term of the control law besides its damping Kp r.
 
-        It limits the effect of disturbances that the adaptation cannot learn.
+        It limits the effect of disturbances that the law's adaptation cannot learn, such as
+        noise.
 
         Args:
-            r: Filtered errors of the site, shape (K, n), in rad/s.
+            r: Filtered errors, velocity errors plus a multiple of the position errors, shape
+                (K, n), in rad/s.
 
         Returns:
             Torque with the sign of r, shape (K, n), in N m.
@@ -651,7 +654,7 @@ def _trapezoid(
 
 
 def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) -> Increment:
-    """Integrates a power that is known at every record, shape (K,), over every tick period.
+    """Integrates a power over each control period (tick), to obtain the energy in the period.
 
     Args:
         site: Motion of the site, with K records.
@@ -664,7 +667,9 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
 
 
 def _jump_alone(amount: Array) -> Increment:
-    """Returns an energy that changes only by jumps, when a new sample comes into use.
+    """Describes an energy that is constant between ticks, and changes only by jumps.
+
+    Such a jump occurs when a new message of another arm comes into use.
 
     Args:
         amount: The jump at the end of each period, shape (K - 1,), in J.

@@ -111,7 +111,10 @@ class _EnergyCurve(NamedTuple):
 
 
 class _LeastEnergy(NamedTuple):
-    """The minimum over time of an energy that must not be below zero.
+    """Smallest value over time of an energy that must never be negative.
+
+    An example is the level of an energy tank, from which a control law takes the energy that it
+    adds.
 
     Attributes:
         name: Name of the energy's curve.
@@ -125,10 +128,11 @@ class _LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Judgement of a run by the energies that its control laws declare.
+    """Judgement of a run by the energies that its control laws declare, such as an energy tank.
 
-    `ObservedEnergy.of_log` computes it, and compares the energies with recorded torques and
-    motion.
+    `ObservedEnergy.of_log` computes the declared energies, and compares them with recorded
+    torques and motion. A law that never gives back more energy than it took supports the
+    stability of the run.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
@@ -167,7 +171,11 @@ class ObservedEnergy(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, *, own_laws: bool = False) -> "ObservedEnergy | None":
-        """Checks the energies that the control laws of a log declare against the motion.
+        """Checks the energies that control laws declare against recorded torques and motion.
+
+        A control law may state how much energy it stores. This check shows whether the
+        statement is true, and whether the law produced energy, which can make the arms
+        unstable.
 
         Args:
             log: The log of the run.
@@ -228,7 +236,10 @@ class _SiteBooks(NamedTuple):
 
 
 def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that declare energies, such as the level of a tank, by site.
+    """Returns the control laws that state their stored and dissipated energy, by site.
+
+    An example is a law with an energy tank that declares the level of the tank. A site is a
+    process that controls one arm.
 
     Args:
         scenario: Scenario of the run.
@@ -313,9 +324,9 @@ def _read_law_records(
     law: Any,
     count: int,
 ) -> LawRecords:
-    """Collects the records of a site in the form in which its law reads them.
+    """Collects the recorded data of one arm in the form that its control law requires.
 
-    A law computes the energies that it declares from these records.
+    The law computes from these data the energies that it declares, such as its stored energy.
 
     Args:
         log: The log of the run.
@@ -343,13 +354,18 @@ def _read_law_memory(
     law: Any,
     count: int,
 ) -> dict[str, Array]:
-    """Returns the values that a law stores from tick to tick, by the attribute of the law.
+    """Returns the recorded values that a control law keeps from one tick to the next.
+
+    An integral of the error is such a value. A tick is a period of the control loop.
 
     Args:
         log: The log of the run.
-        site: Name of the site.
-        law: The law, which lists these attributes in `remembers`.
-        count: Number of records, from the first one on.
+        site: Name of the site, the process that controls the arm.
+        law: The law. Its attribute `remembers` lists the names of these values.
+        count: Number of records to read, from the first one on.
+
+    Returns:
+        For each name, the values in these records.
     """
     site_log = log[site]
     rule = log.scenario.sites[site].on_stale.rule
@@ -453,7 +469,10 @@ def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_Ener
 
 
 def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Judges the declared energies of all sites: contradictory, below zero, or passive.
+    """Judges the energies that control laws declare: contradictory, below zero, or passive.
+
+    A control law may state how much energy it stores and dissipates. It is passive if it never
+    gives back more energy than it received, which is a sign of stability.
 
     Args:
         log: The log of the run.

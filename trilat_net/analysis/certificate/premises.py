@@ -138,9 +138,10 @@ def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
 
 
 class FunctionalFacts(NamedTuple):
-    """What a log shows about the energy function V of its run.
+    """Quantities of a run that the checks of the stability theorem's conditions read.
 
-    `gather_facts` computes this object, and the checks of the premises read it.
+    They include V, the energy function of the stability proof, and the gaps in the log.
+    `gather_facts` computes this object once for all checks.
 
     Attributes:
         log: The log of the run.
@@ -432,7 +433,7 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
 
 
 def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
-    """Returns the names of affected joints.
+    """Returns the names of the joints that an effect, such as a torque limit, concerned.
 
     Args:
         run: Facts of the run.
@@ -583,9 +584,10 @@ def _check_operators(run: FunctionalFacts) -> Premise:
 
 
 def _check_records(run: FunctionalFacts) -> Premise:
-    """Checks that no records are missing while all sites were present.
+    """Checks that the log has all records of all arms while their processes were present.
 
-    Missing records leave the premise undecided, because V is unknown there.
+    Missing records leave the condition undecided, because the energy function V of the
+    stability proof is unknown there.
     """
     quantities = RecordQuantities(
         unjudged_s=tuple(run.unjudged),

@@ -121,7 +121,9 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores a record at the row of its tick. Records may arrive in any order.
+        """Stores the record of one control period at the row of its number.
+
+        Records come over the network, and may therefore arrive in any order.
 
         Args:
             record: The record.

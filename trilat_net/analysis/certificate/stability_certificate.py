@@ -88,7 +88,10 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 @dataclass(frozen=True, repr=False)
 class Certificate(Result):
-    """Stability certificate of a recorded run, created by `certify`.
+    """Judgement whether a recorded run was stable, with every reason. `certify` creates it.
+
+    It combines several kinds of evidence: the energy function V of the stability proof, the end
+    of the motion, the roots of the linearised loop, and repeated runs with a small push.
 
     Attributes:
         premises: The conditions of the stability theorem, each checked.
@@ -585,7 +588,7 @@ def find_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[Uns
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
-    """Returns the part of the JSON output about V, as plain values.
+    """Converts the results about the energy function V to plain values for JSON output.
 
     Args:
         certificate: The certificate.

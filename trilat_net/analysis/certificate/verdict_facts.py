@@ -84,9 +84,9 @@ class NoFunctional(NamedTuple):
 
 
 class RecordGap(Enum):
-    """Reason why the energy function V cannot be computed although it exists.
+    """Finding that the energy function V of a run cannot be computed, as records are missing.
 
-    Each reason is that records of the run are missing.
+    V, the energy of the stability proof, exists for the control laws of this run.
     """
 
     NO_COMMON_TIME = auto()
@@ -120,10 +120,12 @@ class UnclosedBalance(NamedTuple):
 
 
 class WrongTorque(NamedTuple):
-    """Finding that the recorded torques of an arm are not those of its control law, Eq. (13).
+    """Finding that recorded torques of an arm do not follow from its control law, Eq. (13).
+
+    The log is then not consistent, for example because it was changed or the law is another.
 
     Attributes:
-        site: Name of the site.
+        site: Name of the site, the process that controls the arm.
         from_s: Time from which they differ, in s.
         error_nm: Largest difference, in N m.
     """
@@ -147,7 +149,9 @@ class AmbiguousWeights(NamedTuple):
 
 
 class CoarseEnergies(NamedTuple):
-    """Finding that the energies are not known precisely enough to decide whether V rose.
+    """Finding that numerical errors of the energies are too large to decide whether V rose.
+
+    V is the energy function of the stability proof, which must never rise.
 
     Attributes:
         tolerance_j: Size that a rise must exceed to count, in J.
@@ -159,7 +163,9 @@ class CoarseEnergies(NamedTuple):
 
 
 class FunctionalCourse(NamedTuple):
-    """The energy function V over a run in which it can be judged: its values and largest rise.
+    """The energy function V during a run: first, last and largest value, and largest rise.
+
+    V is the energy of the stability proof. It must never rise by energy that nobody supplied.
 
     Attributes:
         failed: Names of the premises that fail. The theorem does not apply if there are any.
@@ -197,7 +203,10 @@ VerdictFacts = (
 
 
 class StabilityVerdict(NamedTuple):
-    """What V, the energy function of the stability proof, shows about a run, and the numbers.
+    """Result of the energy test of a run: whether the energy function V rose, and by how much.
+
+    V belongs to the stability proof. If it rises by energy that nobody supplied, the proof does
+    not hold for the run.
 
     Attributes:
         finding: The finding, such as that V never rose.
@@ -213,7 +222,10 @@ class StabilityVerdict(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The finding as a sentence for people, which the package `presentation` writes."""
+        """The finding as a sentence for the user, such as that V never rose.
+
+        The package `presentation` writes it. V is the energy function of the stability proof.
+        """
         return str(find_hook("describe a verdict")(self))
 
 

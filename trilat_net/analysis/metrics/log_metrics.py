@@ -57,7 +57,9 @@ METRICS_JSON_VERSION = 1
 
 @dataclass(frozen=True, repr=False)
 class LogMetrics(Result):
-    """All metrics of a log, computed by `compute_log_metrics`.
+    """All metrics of a run, such as the largest error of each arm and the delay of each link.
+
+    A metric is a number with a name and a unit. `compute_log_metrics` computes all metrics.
 
     Attributes:
         log: Name of the file of the log.
@@ -340,7 +342,9 @@ def _find_common_joint_names(scenario: Scenario) -> tuple[str, ...]:
 def _measure_subjects(
     view: RunView, selected_measures: Iterable[Measure]
 ) -> dict[str, _SubjectValues]:
-    """Computes metrics for the run and for all of its sites, links and walls.
+    """Computes the selected metrics for the run and for each of its arms, links and walls.
+
+    A metric is a number with a name and a unit, such as the largest error in rad.
 
     Args:
         view: The run.
@@ -362,10 +366,13 @@ def _measure_subjects(
 
 
 def find_quantity(key: str) -> Quantity:
-    """Returns the definition of the quantity with a key such as "rms_error_rad".
+    """Returns name, unit and meaning of the metric with a key such as "rms_error_rad".
+
+    Args:
+        key: Key of the metric, under which JSON output and tables contain it.
 
     Raises:
-        KeyError: No quantity has this key. The message names the most similar key.
+        KeyError: No metric has this key. The message names the most similar key.
     """
     known = {quantity.key: quantity for quantity in quantities()}
     if key not in known:

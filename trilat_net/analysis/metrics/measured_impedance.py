@@ -146,7 +146,10 @@ def estimate_responses(
 
 
 def _find_segments(usable: Bools, length: int) -> list[int]:
-    """Returns the first rows of all segments without an unusable row. They overlap by half.
+    """Divides records into segments for a spectrum, and returns their first rows.
+
+    Welch's method averages over segments that overlap by half. A segment with an unusable row
+    is left out.
 
     Args:
         usable: True for usable rows, shape (K,).
@@ -222,9 +225,10 @@ def _estimate_at_line(
 
 
 def _compute_coherence(D: Complex, X: Complex) -> float:
-    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals.
+    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals, from 0 to 1.
 
-    It is 0 if one of the signals vanishes.
+    A value near 1 means that one signal explains the other. Measurements with a low coherence
+    are not reliable. The coherence is 0 if one of the signals vanishes.
     """
     S_dd = np.vdot(D, D).real
     S_xx = np.vdot(X, X).real
@@ -259,7 +263,10 @@ def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
 
 
 class ImpedanceEstimate(NamedTuple):
-    """What an operator feels at one joint of an arm, as a function of frequency.
+    """Measured impedance or force reflection at one joint of an arm, over frequency.
+
+    The impedance describes how heavy, damped and stiff the arm feels to its operator. The
+    reflection describes how much of a distant force the operator feels.
 
     Attributes:
         kind: "impedance" or "reflection". An impedance is the operator's torque divided by the
@@ -317,7 +324,9 @@ def _estimate_joints(
     site: str,
     environment: str,
 ) -> Iterator[ImpedanceEstimate]:
-    """Yields the impedance of every joint of a site, or its reflection of an environment.
+    """Yields what an operator feels at each joint of an arm, as a function of frequency.
+
+    This is the impedance of the arm, or the reflection of the environment at another arm.
 
     Args:
         runs: All sites with records.
@@ -372,7 +381,9 @@ def _find_still_rows(
     *,
     alone: bool,
 ) -> Bools | None:
-    """Finds the ticks of a site at which no operator moves, so that nothing else drives.
+    """Finds the ticks (control periods) at which no operator moves an arm by a planned signal.
+
+    Impedance is measured only there, because other operators would disturb the measurement.
 
     Args:
         runs: All sites with records.

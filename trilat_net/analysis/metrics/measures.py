@@ -213,9 +213,9 @@ _DeclaredMeasuring = TypeVar("_DeclaredMeasuring", bound=Measuring)
 
 
 class Measure(NamedTuple):
-    """A function that measures some quantities, and how these are shown.
+    """A function that computes some metrics of a run, with the heading that tables show above.
 
-    Measures are registered with the decorator `measures`.
+    Modules of this folder register such functions with the decorator `measures`.
 
     Attributes:
         of: Kind of subject that is measured: "run", "site", "link" or "wall".
@@ -306,7 +306,7 @@ def list_measures() -> list[Measure]:
 
 
 def quantities() -> list[Quantity]:
-    """Returns the definitions of all quantities that any function of this folder measures.
+    """Returns name, unit and meaning of all metrics of a run, such as the largest error.
 
     Tables and docs/reference/metrics.md list them in this order.
     """

@@ -57,9 +57,9 @@ def held_work(torque: Array, q: Array) -> Array:
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work in each tick period of a torque that follows the motion.
+    """Returns the work of a torque in each control period (tick), by the trapezoid rule.
 
-    The trapezoid rule is used.
+    The torque is assumed to change linearly with the joint angle between two ticks.
 
     Args:
         torque: Torque at the ticks, shape (K, n), in N m.
@@ -340,7 +340,10 @@ def _compute_delay_torque(
 
 
 def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords) -> Array:
-    """Returns the torque that the peer reflected with delay, less its present torque.
+    """Returns the error of a fed-back torque that is due to the network delay.
+
+    A control law can feed back the external torque of another arm. This torque arrives late.
+    The error is the delayed torque minus the present one.
 
     Args:
         records: Records of a site whose law feeds back the external torque of its peer.

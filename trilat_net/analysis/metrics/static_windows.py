@@ -56,7 +56,9 @@ MIN_LOAD_SHARE = 0.02
 
 
 class _StaticWindow(NamedTuple):
-    """A window of time in which all arms rest, with means over the window for each site.
+    """Interval of time in which all arms rest, with mean torques and angles of each arm.
+
+    Stiffness and force sharing are measured in such intervals, because no inertia acts there.
 
     Attributes:
         from_s: Time of the first tick, in s.
@@ -130,7 +132,9 @@ def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
 
 
 def _find_resting_rows(run: SiteRun) -> Bools:
-    """Finds the ticks in which a site rests, while its weights and its operator do not change.
+    """Finds the ticks (control periods) at which an arm rests under constant conditions.
+
+    Neither the operator nor the weights with which the arm follows other arms may change.
 
     Args:
         run: Records and torques of the site.
@@ -159,7 +163,7 @@ def _average_window(
     rows: Mapping[str, Ints],
     t_s: Array,
 ) -> _StaticWindow:
-    """Returns the means of torques and angles over the ticks of a static window.
+    """Returns mean torques and joint angles of all arms over an interval in which they rest.
 
     Args:
         runs: All sites.
@@ -376,9 +380,9 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Counts the times of a run in which all arms rest under constant torques.
+    """Counts the intervals of a run in which all arms rest under constant torques.
 
-    Without such times, stiffness and force sharing cannot be measured.
+    Without such an interval, stiffness and force sharing cannot be measured.
 
     Args:
         view: The recorded run.
@@ -544,7 +548,10 @@ def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bo
 
 
 def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns the weights pi_i / K_i of the torques of all sites and joints.
+    """Returns the weights pi_i / K_i with which the torques on all arms balance at rest.
+
+    Here pi is the left eigenvector of the matrix alpha of dominance factors, and K_i the
+    stiffness of the control law of arm i.
 
     Args:
         scenario: Scenario of the run.
@@ -566,7 +573,11 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 
 def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
-    """Returns the stiffness with which a site's law pulls the arm to its reference at rest.
+    """Returns the stiffness with which a control law holds a resting arm at its reference.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site, the process that controls the arm.
 
     Returns:
         The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow.

@@ -107,9 +107,9 @@ class Pencil(NamedTuple):
         return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Evaluates the characteristic matrix Delta(s) of the loop and its derivative.
+        """Evaluates the characteristic matrix Delta(s) of the control loop and its derivative.
 
-        Newton's method needs both to refine a root, at which Delta(s) is singular.
+        Delta(s) is singular at a root of the loop. Newton's method needs both to refine a root.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -351,7 +351,9 @@ def _solve_for_root(
     guess: complex,
     names: Sequence[str],
 ) -> CharacteristicRoot | None:
-    """Returns the root to which Newton's method converges from a guess.
+    """Refines an approximate root of the control loop by Newton's method.
+
+    A root is a complex growth rate of small motions. A negative real part means decay.
 
     Args:
         pencil: Matrices of the loop.

@@ -70,7 +70,9 @@ class _AxisCrossing(NamedTuple):
 
 
 class _DelayInterval(NamedTuple):
-    """An interval of common delays for which a loop is stable.
+    """Interval of network delays, the same on all links, for which a control loop is stable.
+
+    A crossing is a delay at which a root of the loop reaches the imaginary axis.
 
     Attributes:
         low_s: Lower end, in s. 0 if the loop is stable without delay.
@@ -125,9 +127,9 @@ class DelayMargin(NamedTuple):
 
     @property
     def description(self) -> str:
-        """A phrase for the user that states for which common delays the control loop is stable.
+        """A phrase for the user that states for which network delays the arms are stable.
 
-        Common means that all links between the arms have this same delay.
+        The delay is assumed to be the same on all links between the arms.
         """
         if self.lossless:
             return (
@@ -149,7 +151,7 @@ class DelayMargin(NamedTuple):
 
 
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a loop with the same delay on all of its links, for example to check a margin.
+    """Returns a linear loop with one delay on all network links, for example to check a margin.
 
     Args:
         loop: The loop.
@@ -360,6 +362,8 @@ class _FrequencySweep:
 
     def compute_eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
         """Computes the eigenvalues of the open-loop frequency response G(j w).
+
+        The loop becomes unstable at a delay where an eigenvalue, turned by the delay, is 1.
 
         Args:
             omega: Frequencies w, shape (K,), in rad/s.

@@ -259,7 +259,10 @@ def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
 
 
 def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
-    """Raises an error if a site that follows in task space rests in a singular pose.
+    """Raises an error if an arm that follows with its end effector rests in a singular pose.
+
+    In such a pose, for example a stretched arm, the end effector cannot move in every
+    direction.
 
     Args:
         conditions: The sites and gains.
@@ -378,7 +381,9 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Finds a pose in which all arms of a scenario rest, near the end of a run or as given.
+    """Finds a pose in which all arms of a scenario rest, as a base for linear analysis.
+
+    It is the pose nearest to the end of a run, or a pose that the user gives.
 
     Args:
         scenario: Description of the experiment.
@@ -403,7 +408,7 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
 
 
 def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns an equilibrium with remarks on effects that its linear loop misses.
+    """Adds remarks about effects that a linear model at the pose of rest misses.
 
     Examples are torques at their limits and walls that are just touched.
 
@@ -415,7 +420,7 @@ def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equil
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Predicts by linear analysis at which equilibrium the arms come to rest.
+    """Predicts where the arms come to rest, by linear analysis without simulating the motion.
 
     They begin in the start poses of the scenario.
 
@@ -485,7 +490,7 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
 def _complete_estimates(
     conditions: OperatingConditions, theta_hat: Array | None = None
 ) -> Array:
-    """Returns the estimates of all sites, shape (N, P), padded with zeros.
+    """Returns the parameter estimates of all control laws in one array, padded with zeros.
 
     Args:
         conditions: The numbers of the loop.
@@ -544,7 +549,9 @@ def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equi
 
 
 def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
-    """Returns the pose that the user requests, with true estimates and its residual.
+    """Returns the pose that the user requests as an equilibrium of the arms.
+
+    The control laws are assumed to know the true parameters of their arms.
 
     Raises:
         ScenarioError: An end effector does not reach the pose, or the pose is singular.
@@ -694,7 +701,9 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
 
 
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium that it receives, unless its residual is too large.
+    """Checks that the arms rest in a pose, and returns the pose.
+
+    The residual is the acceleration that remains there. At an equilibrium it is 0.
 
     Raises:
         ScenarioError: The residual is too large, so that the pose is no equilibrium.
