@@ -740,7 +740,10 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Returns the first problem of the recording, for the error message at its end.
+        """Returns the first problem of the recording, which becomes the recorder's error text.
+
+        The recorder ends with an error if the log is not complete, so that nobody uses an
+        incomplete log unknowingly. A site is a process that controls one arm.
 
         Returns:
             A sentence about a site that disappeared or lacks messages. None if there is no

@@ -434,10 +434,10 @@ class StateBlock:
         self._waiting_records.clear()
 
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends everything that is waiting: the samples to the peers, then the records.
+        """Sends the waiting results of control periods over the network.
 
-        Records are the results of ticks, and samples are the parts of them that the peers need.
-        The records go to the recorders.
+        The other arms first receive their samples, the parts that their control laws need,
+        because they wait for these. The recorders then receive the complete records.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.

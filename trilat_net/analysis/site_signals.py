@@ -43,7 +43,7 @@ P is 5 for the planar arm and 10 n for a chain.
 def follows_in_task_space(log: Log) -> bool:
     """Returns True if the arms follow each other with their end effectors (tips).
 
-    Their errors are then positions in m along axes in space. Otherwise, they are joint angles.
+    Their errors are then measured along axes in space. Otherwise, they are joint angles.
 
     Args:
         log: The log of the run.

@@ -407,7 +407,7 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
 
 
 def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
-    """Returns a scripted torque over time, as if it never started or ended.
+    """Returns a planned torque signal over time, without regard to its start and end times.
 
     Args:
         source: A pulse, a recorded torque, a chirp or a multisine.

@@ -78,7 +78,9 @@ MIN_PUNCTUAL_SHARE = 0.99
 
 
 class DoctorFinding(NamedTuple):
-    """Result of one check of this machine, which `trilat doctor` prints as one line.
+    """Result of one check of this machine, for example of the free disk space.
+
+    `trilat doctor` prints it as one line.
 
     Attributes:
         check: Subject of the check, such as "keys" or "disk".
@@ -100,7 +102,7 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Performs all checks of this machine, and yields each result as soon as it is known.
+    """Checks whether this machine can run a session, and yields each result at once.
 
     Some checks take seconds, so that the user sees progress.
 
@@ -131,6 +133,8 @@ def examine_machine(
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
     """Checks if a member's keys are valid, for how long, and if other users can read them.
+
+    Keys encrypt the connections of a session, and prove which process a message comes from.
 
     Args:
         folder: Folder of a member's keys. None if there is none.
@@ -186,7 +190,9 @@ def examine_links(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Checks if each endpoint can be listened at or reached, and if it is encrypted.
+    """Checks if each network endpoint can be opened or reached, and if it is encrypted.
+
+    An endpoint is an address with a protocol, such as "tls/[::1]:7447".
 
     Args:
         connection: Endpoints to listen at and to connect to.
@@ -328,7 +334,7 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
 
 
 def _tls_context(folder: Path | None) -> ssl.SSLContext:
-    """Returns the TLS settings with which a member connects.
+    """Returns the settings of an encrypted (TLS) test connection to another machine.
 
     Args:
         folder: Folder of this member's keys. None accepts any certificate.
@@ -346,7 +352,7 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
 
 
 def _split_address(endpoint: str) -> tuple[str, int] | None:
-    """Splits an endpoint of TCP, TLS or QUIC into its host and its port.
+    """Splits a network endpoint such as "tls/[::1]:7447" into its host and its port.
 
     Args:
         endpoint: The endpoint, such as "tls/[::1]:7447".
@@ -512,7 +518,7 @@ def examine_rights() -> Iterator[DoctorFinding]:
 
 
 def examine_system() -> DoctorFinding:
-    """Reports which parts of the program are supported on this operating system.
+    """Reports which parts of the program work on this operating system.
 
     Returns:
         A single finding. It is "ok" on Linux. On other systems, it names what is missing.
@@ -657,7 +663,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """Result of `trilat doctor`: whether this machine is ready for a session.
+    """Result of `trilat doctor`: whether this machine is ready for a live session.
 
     Attributes:
         findings: Result of each check, in the order of the checks.
@@ -680,7 +686,10 @@ class DoctorReport(Result):
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one table row per check, with the fields of `DoctorFinding` as columns."""
+        """Converts the results to a table with a row per check, for example for pandas.
+
+        The fields of `DoctorFinding` are the columns.
+        """
         return [finding._asdict() for finding in self.findings]
 
     def blocks(self) -> Iterator[Any]:

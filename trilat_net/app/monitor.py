@@ -152,7 +152,7 @@ def _describe_hold(hand: HandInForce | None) -> str:
 
 
 def describe_angles(q: Sequence[float]) -> str:
-    """Formats the joint angles of an arm, so that many joints fit into a column of the table.
+    """Formats the joint angles of an arm so briefly that they fit into a table column.
 
     Args:
         q: Joint angles in rad.
@@ -244,7 +244,9 @@ class SessionDisplay:
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line, such as an event, that stays in the terminal above the table of sites.
+        """Prints a line, such as an event, that stays in the terminal above the table of arms.
+
+        The table below is refreshed all the time.
 
         Args:
             text: The line.

@@ -340,9 +340,10 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
 
 
 class _ScenarioNeeds(NamedTuple):
-    """Requirements of a scenario on the network.
+    """What a scenario demands of the network: message size, rate, and largest delay.
 
-    They follow from its message rate and from the delays for which its control loop is stable.
+    The demands follow from the rate of the control loops, and from the delays for which they
+    are stable.
 
     Attributes:
         sample_bytes: Size of a sample of the largest arm, in bytes.
@@ -623,10 +624,9 @@ def _measure_endpoint(
     needs: _ScenarioNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
-    """Measures the transport of one endpoint, with all message sizes and rates.
+    """Measures round trips to another machine, with all message sizes and rates.
 
-    A program on another machine (the far end) returns each message, so that round trips are
-    measured.
+    A program on that machine, the far end, returns each message.
 
     Args:
         endpoint: Endpoint of the far end.

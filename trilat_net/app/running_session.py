@@ -171,7 +171,9 @@ class RunningSession:
         self._blocks: list[tuple[ExitStack, Bus | None]] = []
 
     def __enter__(self) -> "RunningSession":
-        """Opens one connection to the session, which all calls in the `with` block use.
+        """Opens one network connection to the session, which all calls in the `with` block use.
+
+        Without a `with` block, each call opens a connection of its own, which takes longer.
 
         Raises:
             SessionError: No site of the session replies in time.
@@ -392,7 +394,15 @@ class RunningSession:
             return [self._send_change(bus, name, request) for name in addressed]
 
     def _send_change(self, bus: Bus, site: str, request: ChangeRequest) -> ChangeReply:
-        """Sends a request to one site, and returns its reply, accepted or refused.
+        """Sends a request to the process of one arm, and returns its reply.
+
+        Args:
+            bus: Network connection.
+            site: Name of the process, the site of the arm.
+            request: The requested change.
+
+        Returns:
+            The reply, which says whether the site accepts or refuses the change.
 
         Raises:
             SessionError: The site does not reply in time.
@@ -561,7 +571,14 @@ class RunningSession:
         return self._change(site, dominance=site, to=dict(shares), ramp_s=ramp_s)
 
     def _change(self, site: str, **change: Any) -> str:
-        """Requests a change from a site, and returns its reply.
+        """Requests a change from one running arm, and raises an error if it is refused.
+
+        Args:
+            site: Name of the site, the process that controls the arm.
+            **change: Fields of a `ChangeRequest`.
+
+        Returns:
+            The text of the reply.
 
         Raises:
             RunFailed: The site has refused the change.
@@ -572,7 +589,9 @@ class RunningSession:
         return reply.text
 
     def change(self, site: str, request: ChangeRequest) -> ChangeReply:
-        """Requests a change, such as another link delay, from the site that carries it out.
+        """Requests a change of a setting, such as another link delay, from one running arm.
+
+        An arm's process carries out the change at its next tick, a period of its control loop.
 
         Args:
             site: Name of the site.
@@ -914,7 +933,9 @@ def open_hand(
     *,
     repeats: bool = True,
 ) -> Hand:
-    """Opens a connection to an arm, through which a program moves the arm as its operator.
+    """Opens a connection through which a program moves an arm of a running session.
+
+    The program takes the place of the person who would otherwise hold the arm.
 
     Args:
         bus: Network connection that reaches the site.
@@ -953,7 +974,13 @@ def open_hand(
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
-    """Returns the texts of the replies if all sites have accepted.
+    """Returns the texts of the arms' replies, if all of them have accepted a request.
+
+    Args:
+        replies: Reply of each site, the process that controls an arm.
+
+    Returns:
+        The text of each reply.
 
     Raises:
         RunFailed: A site has refused. The message lists the refusals first.

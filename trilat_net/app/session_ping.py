@@ -54,7 +54,7 @@ ns.
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Measured round trips, clock offsets and delays of a session's network.
+    """Measured network delays between the processes of a session, and their clock offsets.
 
     Attributes:
         session: Name of the session.

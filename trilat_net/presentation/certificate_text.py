@@ -142,7 +142,7 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """A sentence of a stability certificate, with a mark such as "ok" or "FAIL".
+    """One line of a stability certificate: a sentence with a mark such as "ok" or "FAIL".
 
     Attributes:
         mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against
@@ -210,7 +210,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the lines that follow the judgement: its meaning and the remarks about the run.
+    """Explains in sentences what the judgement of a run means, with remarks about the run.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.

@@ -79,7 +79,9 @@ PICTURE_SIDE = 4.0
 
 
 class _PageCharts(NamedTuple):
-    """The charts of a report's page, as `ChartBuilder.build` returns them.
+    """All charts of a run's report, as `ChartBuilder.build` returns them.
+
+    The report is a web page whose scripts draw the charts.
 
     Attributes:
         data: Data that the scripts of the page draw.
@@ -401,7 +403,7 @@ class ChartBuilder:
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
     ) -> dict[str, list[TableSeries]]:
-        """Adds the values of a signal, such as joint torques, to the page for several sites.
+        """Adds the values of a signal, such as joint torques, to the report, for several arms.
 
         Args:
             signal: Function that computes the values of the signal, shape (K, C), from the K
@@ -446,7 +448,7 @@ class ChartBuilder:
         return [self._make_series(site, table, column) for column in columns]
 
     def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
-        """Returns a line in the colour of a site.
+        """Returns a line of a chart in the colour of an arm.
 
         Args:
             site: Name of the site.
@@ -466,7 +468,7 @@ class ChartBuilder:
         sites: Sequence[str] = (),
         **options: Any,
     ) -> TimeChart:
-        """Returns a chart over time, without the lines that have no value to draw.
+        """Returns a chart over time, without lines that have no value to draw.
 
         Args:
             section: Key of the section of the page, as in `report.toml`.
@@ -495,7 +497,7 @@ class ChartBuilder:
         series_by_site: dict[str, list[TableSeries]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
-        """Yields a chart per joint, each with a line per site.
+        """Yields one chart per joint, in which each arm has a line.
 
         Args:
             section: Key of the section of the page, as in `report.toml`.
@@ -828,7 +830,7 @@ def _lateness_ms(records: SiteLog) -> Values:
 
 
 def _encode(column: Values, kind: str) -> str:
-    """Returns numbers as base64 text.
+    """Encodes numbers as base64 text, so that a web page can contain them compactly.
 
     Args:
         column: The numbers, shape (P,).

@@ -218,7 +218,9 @@ def _compose_channels(
 
 
 def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
-    """Returns ranges of missing numbers as text, at most `_MAX_GAPS` of them.
+    """Writes the numbers of missing messages as ranges, for example "12-15, 20".
+
+    At most `_MAX_GAPS` ranges are listed.
 
     Args:
         gaps: First and last number of each range.
@@ -327,7 +329,7 @@ def _compose_line(heading: str, text: str) -> Iterator[Block]:
 def _tabulate(
     headers: Sequence[str], rows: Iterable[Sequence[object]], text_columns: int = 1
 ) -> Iterator[Block]:
-    """Yields an empty line and a table.
+    """Yields an empty line and then a table for the terminal.
 
     Args:
         headers: Header of each column.

@@ -102,7 +102,7 @@ def render_report(
     verdict: Markup = Markup(),  # noqa: B008
     reasons: Markup = Markup(),  # noqa: B008
 ) -> Markup:
-    """Composes the HTML page that reports a run.
+    """Composes the web page (HTML) that reports a run: judgement, charts and tables.
 
     Args:
         log: Log of the run.

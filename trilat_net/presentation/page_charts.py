@@ -131,7 +131,9 @@ def render_chart_groups(
 def _render_group(
     section: str, heading: str, note: str, count: int, is_open: bool, is_small: bool
 ) -> Markup:
-    """Returns a group of charts, as an empty container that unfolds.
+    """Renders a group of charts that readers can unfold.
+
+    It is an empty container, into which a script of the page draws the charts.
 
     Args:
         section: Key of the section, as in `report.toml`.

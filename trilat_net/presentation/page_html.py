@@ -21,7 +21,7 @@ NO_NUMBER = "–"
 
 
 def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Markup:
-    """Renders a section of the page: its heading, a sentence about its content, and the body.
+    """Renders a section of a report's web page: heading, explaining sentence and content.
 
     Args:
         heading: Heading, as plain text.
@@ -34,7 +34,7 @@ def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Ma
 
 
 def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Markup:
-    """Renders content that the reader can unfold, so that the page stays short at first.
+    """Renders content that readers can unfold, so that the page stays short at first.
 
     Args:
         summary: Line that is always visible, as plain text.
@@ -45,9 +45,9 @@ def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Mark
 
 
 def render_folds(folds: Iterable[Markup]) -> Markup:
-    """Renders parts that unfold, side by side while they are folded.
+    """Renders several parts that unfold side by side, for details that few readers need.
 
-    Details that few readers need take one line in this way.
+    While the parts are folded, they take one line.
 
     Args:
         folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
@@ -56,7 +56,11 @@ def render_folds(folds: Iterable[Markup]) -> Markup:
 
 
 def render_note(text: str) -> Markup:
-    """Renders a remark as a paragraph in small type, for example below a chart."""
+    """Renders a remark as an HTML paragraph in small type, for example below a chart.
+
+    Args:
+        text: The remark, as plain text.
+    """
     return _render("note", text=text)
 
 
@@ -71,7 +75,7 @@ def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
 def render_table(
     columns: Mapping[str, str], rows: Iterable[Sequence[str]], text_columns: Sequence[int] = ()
 ) -> Markup:
-    """Renders an HTML table, which scrolls sideways where it is wider than the screen.
+    """Renders a table as HTML, which scrolls sideways if the screen is too narrow.
 
     Args:
         columns: Meaning of each column, by its header. Both are plain text. The meaning is
@@ -114,7 +118,13 @@ def render_scrolling(content: Markup, label: str) -> Markup:
 
 
 def render_code(text: str) -> Markup:
-    """Renders commands or the content of a file in a fixed-width type, with its line breaks."""
+    """Renders commands or the content of a file as HTML in a fixed-width type.
+
+    Line breaks are kept.
+
+    Args:
+        text: The commands or the content, as plain text.
+    """
     return _render("code", text=text)
 
 

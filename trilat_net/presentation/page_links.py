@@ -186,9 +186,13 @@ def _render_samples(log: Log, facts: JsonObject) -> Markup:
 
 
 def _render_clocks(log: Log, facts: JsonObject) -> Markup:
-    """Returns the table that compares the clock of each sender with that of the receiver.
+    """Renders a table of the clock differences between the machines of a session.
 
-    Measured one-way delays are only as accurate as this comparison.
+    Measured one-way delays are only as accurate as these differences are known.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run.
 
     Returns:
         HTML of the table. Empty if all sites read the same clock.

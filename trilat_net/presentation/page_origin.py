@@ -180,7 +180,7 @@ def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
 
 
 def _list_commands(log: Log, scenario: str) -> str:
-    """Returns the commands with which a reader can check and repeat the run, a line each.
+    """Returns the shell commands with which a reader can check and repeat the run.
 
     Args:
         log: Log of the run.

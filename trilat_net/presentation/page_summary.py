@@ -126,9 +126,12 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
 
 
 def _start_sentence(text: str) -> str:
-    """Returns a clause as the beginning of a sentence.
+    """Capitalises a clause, so that it can begin a sentence.
 
-    Names of sites, which are written as they are, keep their first letter.
+    Names of arms such as "m1", which are written as they are, keep their first letter.
+
+    Args:
+        text: The clause.
     """
     first_word = text.split(" ", 1)[0]
     is_name = any(letter.isdigit() for letter in first_word) or len(first_word) == 1
@@ -241,7 +244,7 @@ def _list_pushed_sites(log: Log) -> list[str]:
 
 
 class _KeyNumber(NamedTuple):
-    """A number of the first lines.
+    """One of the most important numbers of a run, which a report shows at its top.
 
     Attributes:
         name: Name of the quantity.
@@ -272,7 +275,9 @@ def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
 
 
 def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
-    """Returns the largest error |e| of any joint in a run, with its joint and time.
+    """Finds the largest tracking error of any joint in a run, with its joint and time.
+
+    The tracking error is the difference between a joint angle and its reference.
 
     Args:
         log: Log of the run.

@@ -35,7 +35,7 @@ def reference_angles(part: SiteLog) -> Array:
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the rate of an arm's tracking error: its velocity minus the velocity to follow.
+    """Returns the velocity error of an arm: its velocity minus that of its reference.
 
     Args:
         part: The K records of the arm.

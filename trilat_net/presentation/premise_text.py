@@ -39,7 +39,9 @@ _PARAMETER_FAULTS = {
 
 
 def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str:
-    """Returns what the log of a run shows about a premise, as a sentence.
+    """Returns a sentence on what a run shows about a condition of the stability theorem.
+
+    An example of a condition is that all network delays are constant.
 
     Args:
         quantities: What was found about the premise.

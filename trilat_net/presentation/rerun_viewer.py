@@ -53,7 +53,7 @@ _QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 class ViewerOptions(NamedTuple):
-    """Options of the command that shows a log.
+    """Options of the command that shows a log in the viewer Rerun.
 
     Attributes:
         full: True to show every record instead of the decimated standard channels.
@@ -79,7 +79,7 @@ def open_rerun(
     print_line: Callable[[str], None],
     run_command: RunCommand = _run_process,
 ) -> None:
-    """Shows a log in the viewer Rerun, and returns when the viewer is closed.
+    """Shows a log in the viewer Rerun, and returns when the user closes the viewer.
 
     Args:
         paths: File of the log, or its parts.
@@ -238,9 +238,7 @@ PlotPage = list[list[CurvePlot]]
 
 
 class PlotLayout(NamedTuple):
-    """The layout of all views in which Rerun shows a log: pages, plots and arms.
-
-    `build_plot_layout` creates it, and `_save_blueprint` writes it for Rerun.
+    """Layout in which the viewer Rerun shows a log: pages, plots, and arms in space.
 
     Attributes:
         pages: Rows of plots on each page, by the name of the page.
@@ -254,7 +252,7 @@ class PlotLayout(NamedTuple):
 
 
 class _PlotRow(NamedTuple):
-    """A row of a page: a quantity with a plot per site.
+    """A row of plots on a page of the viewer Rerun: one quantity, with a plot for each arm.
 
     Attributes:
         quantity: Name of the quantity.
@@ -367,7 +365,7 @@ def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
 
 
 def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> list[CurvePlot]:
-    """Returns the plots of one quantity, such as the joint angles, for all sites that have it.
+    """Returns the plots of one quantity, such as the joint angles, one plot for each arm.
 
     Args:
         channels: Standard channels by topic.
@@ -570,7 +568,7 @@ def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
 
 
 def _style_curves(curves: _PlotCurves, first_color: int) -> Any:
-    """Returns the names and the colors of curves. References have pale colors.
+    """Returns the names and colors of curves in a plot. References have pale colors.
 
     Args:
         curves: The curves.

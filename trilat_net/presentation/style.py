@@ -135,7 +135,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels (parts of the figure with axes of their own) to a figure.
+    """Adds a grid of panels, parts with axes of their own, to a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -151,7 +151,7 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
 
 
 def site_colour(log: Log, site: str) -> str:
-    """Returns the colour of a site, which is the same in every figure of the log.
+    """Returns the colour of an arm, which is the same in every figure of the log.
 
     Args:
         log: Log with the site.
@@ -196,7 +196,7 @@ def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
 
 
 def site_title(log: Log, site: str) -> str:
-    """Returns the name of a site with its role, such as master or slave, for legends.
+    """Returns the name of an arm with its role, such as master or slave, for legends.
 
     Args:
         log: Log with the site.
@@ -331,7 +331,7 @@ def name_shared(log: Log) -> list[str]:
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes a title, such as the joint's name, above each panel of a row.
+    """Writes the name of a joint above each panel of a row, or another title.
 
     Args:
         log: Log with the joints.
@@ -371,7 +371,9 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class _JointPanels(NamedTuple):
-    """Panels of a figure in which each joint has a panel, as `add_joint_panels` creates them.
+    """Panels of a figure in which each joint of the arms has a panel of its own.
+
+    `add_joint_panels` creates them.
 
     Attributes:
         joints: A panel per joint.
@@ -500,7 +502,7 @@ _MAX_LEGEND_COLUMNS = 6
 
 
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
-    """Adds a legend of lines above the panels of a figure.
+    """Adds a legend, which names the lines, above the panels of a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -568,7 +570,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes into an empty panel why there is nothing to show.
+    """Writes into an empty panel of a figure why there is nothing to show.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -594,7 +596,7 @@ _UNDATED: dict[str, dict[str, Any]] = {
 
 
 def write_figure(figure: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure to a file, in the format that the suffix of the file names.
+    """Writes a figure to a file, in the format of the file's suffix, such as .pdf.
 
     Args:
         figure: The Matplotlib figure.
@@ -894,7 +896,9 @@ class TimeFigure:
             )
 
     def _explain_changes(self, *, links: bool) -> str:
-        """Returns a sentence that explains the numbered changes.
+        """Returns a sentence that explains the numbered marks of changes in a figure.
+
+        A change is for example another network delay from a certain time on.
 
         Args:
             links: True to explain changes of links only.

@@ -260,7 +260,7 @@ def _format_clock(use: link_summary.ClockSummary) -> str:
 
 
 def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -> str:
-    """Returns the mean, deviation, 99th percentile and largest value of times, in ms.
+    """Formats the mean, deviation, 99th percentile and largest value of times, in ms.
 
     Args:
         spread: Statistics of the times.
@@ -522,9 +522,13 @@ def _describe_link_effect(link: LinkEffect) -> str:
 
 
 def _format_difference(before: object, after: object) -> tuple[str, str]:
-    """Returns two different values as texts that differ.
+    """Formats two different values so that their texts differ.
 
-    Numbers have six digits. If these are equal, they have all digits.
+    Numbers have six digits. If the texts are then equal, they get all digits.
+
+    Args:
+        before: The value in the first log.
+        after: The value in the second log.
     """
     short_before = f"{before:.6g}" if isinstance(before, float) else str(before)
     short_after = f"{after:.6g}" if isinstance(after, float) else str(after)
@@ -962,7 +966,7 @@ def _format_value(value: float) -> str:
 def _tabulate(
     heads: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int
 ) -> Iterator[Block]:
-    """Yields a table and an empty line.
+    """Yields a table and then an empty line for the terminal.
 
     Args:
         heads: Header of each column. If the last one is empty, the last column has texts.

@@ -41,9 +41,9 @@ class TextConsole(Console):
     """
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Converts a string to the type of Rich, with names in place of control characters.
+        """Converts a string to Rich's type of text, with control characters replaced by names.
 
-        Rich calls this for every text that it prints.
+        Rich, the library that prints to the terminal, calls this for every text.
 
         Args:
             text: The text.
@@ -94,6 +94,8 @@ def print_note(text: object) -> None:
 def print_error(text: object) -> None:
     """Prints an error message to standard error, so that it does not disturb results.
 
+    Another program can then read the results from standard output.
+
     Args:
         text: The message.
     """
@@ -111,7 +113,9 @@ def print_marked(mark: str, text: object) -> None:
 
 
 def print_texts(texts: Iterable[object]) -> None:
-    """Prints several texts from an unknown source, a line each, as `print_text` does.
+    """Prints several texts of unknown origin, one per line, without harmful characters.
+
+    Control characters are shown by names, see `print_text`.
 
     Args:
         texts: The texts.
@@ -121,7 +125,7 @@ def print_texts(texts: Iterable[object]) -> None:
 
 
 def print_paths(paths: Iterable[Path]) -> None:
-    """Prints the paths of files that a command has written, a line each.
+    """Prints the paths of files that a command has written, one path per line.
 
     Args:
         paths: The paths.
@@ -130,7 +134,7 @@ def print_paths(paths: Iterable[Path]) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Prints a value as JSON to standard output, for other programs.
+    """Prints a value as JSON to standard output, for other programs to read.
 
     Args:
         value: Plain values, also in lists and dictionaries.
@@ -143,7 +147,7 @@ def print_json(value: Any) -> None:
 
 
 def print_line(text: str) -> None:
-    """Prints a line at once, so that a program that reads the output need not wait for it.
+    """Prints a line without buffering, so that a program that reads it need not wait.
 
     Args:
         text: The line.
@@ -310,7 +314,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
-    """Opens a log from its files with a progress bar, and warns of damage.
+    """Opens a log with a progress bar in the terminal, and warns of damaged parts.
 
     Args:
         first: File of the log, or its first part.
@@ -329,7 +333,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Tells the user which parts of a log are damaged, and which command recovers the rest.
+    """Tells the user which parts of a log are damaged, and which command saves the rest.
 
     Nothing is printed for an intact log.
 

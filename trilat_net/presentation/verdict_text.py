@@ -56,12 +56,14 @@ REQUIREMENTS = {
 
 
 def name_theorem() -> str:
-    """Returns the phrase by which a judgement says that it rests on the stability theorem."""
+    """Returns the phrase by which judgements of runs refer to the paper's stability theorem."""
     return THEOREM
 
 
 def describe_verdict(verdict: facts.StabilityVerdict) -> str:
-    """Returns a sentence on what the energy function V shows about a run.
+    """Returns a sentence on whether the energy function V of a run rose.
+
+    V is the energy of the stability proof, which must not rise.
 
     Args:
         verdict: The finding with its facts.
@@ -178,7 +180,7 @@ def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
 
 
 def describe_evidence(evidence: facts.Evidence) -> str:
-    """Returns how many records of a run exist, and whether its log is unchanged.
+    """Returns a sentence on how many records a run has, and whether its log is unchanged.
 
     Args:
         evidence: The records on which a certificate is based.

@@ -40,7 +40,7 @@ _PACKAGES = ("numpy", "numba", "scipy")
 
 
 def _import_distributed() -> Any:
-    """Imports the package `distributed`, which contains the client of Dask.
+    """Imports `distributed`, the package of Dask that runs work on a cluster of machines.
 
     Raises:
         UsageError: The package is not installed.
@@ -87,7 +87,10 @@ def _find_sources() -> list[Path]:
 
 
 class WorkerRequirements(NamedTuple):
-    """Program, arithmetic and files that a worker of a cluster must have for equal results.
+    """What a worker of a cluster must have to compute the same results as this machine.
+
+    The requirements are the version of the program, equal arithmetic, and equal files of users'
+    control laws.
 
     Attributes:
         identity: Properties that the worker must have.
@@ -313,10 +316,10 @@ class DaskCluster:
         return required
 
     def check_alive(self) -> None:
-        """Checks that the cluster can still run items.
+        """Checks that the cluster still has workers, and raises an error if it does not.
 
-        A study calls this regularly while it waits for results, so that it ends with an error
-        instead of waiting forever.
+        A parameter study calls this regularly while it waits for results, because otherwise it
+        could wait forever.
 
         Raises:
             RunFailed: The scheduler is gone, or had no worker for `NO_WORKER_S`.

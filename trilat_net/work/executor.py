@@ -68,11 +68,11 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Does nothing with a report of progress, for callers that do not display any."""
+    """Ignores a report of progress. It is the default for callers that do not display any."""
 
 
 class _BatchResult(NamedTuple):
-    """Results of a batch of items, which a worker process sends back to the study.
+    """Results of a group of items, which a worker process returns to the main process.
 
     Attributes:
         results: Results of the items, up to the first error.
@@ -364,7 +364,9 @@ class WorkerPool:
         together: Together[T, R] | None = None,
         together_count: int = 1,
     ) -> list[R]:
-        """Runs a function on each item with all workers, and returns all results.
+        """Runs a function on each item of a list in parallel, and returns all results.
+
+        Items are distributed to worker processes of this machine or of a cluster.
 
         Args:
             function: Function at module level, so that another process can import it.
@@ -433,7 +435,11 @@ class WorkerPool:
         feed: _Feed[T],
         lost: Callable[[T], R] | None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the results of a batch that ended, or returns its items to the queue.
+        """Yields the results of a finished batch.
+
+        If its worker died, the items are queued again.
+
+        A batch is a group of items that one worker process receives together.
 
         Args:
             future: Future of the batch.
@@ -567,7 +573,7 @@ def check_workers(jobs: int | None, on: Workers) -> None:
 
 
 def count_workers(jobs: int | None, on: Workers = None) -> int:
-    """Returns the number of items that will run at the same time.
+    """Returns how many items of a study will run at the same time.
 
     For a cluster, this connects to its scheduler and checks its workers.
 

@@ -110,11 +110,14 @@ class SiteEnergy:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The change of the site's energy that remains unexplained, shape (K,), in J.
+        """Change of the arm's energy that no known energy flow explains, shape (K,), in J.
+
+        A site is the process that controls the arm. The value is 0 up to numerical errors if
+        the records obey the model of the arm. A large value means that records are wrong, or
+        that the model is.
 
         It is `residual` minus the work that arises because the continuous control law is
-        executed only once per tick. It is 0 up to numerical errors if the records obey the
-        model of the site.
+        executed only once per tick, a period of the control loop.
         """
         sampling = _accumulate(self.sampling.total, self.judged)
         return self.residual - sampling
@@ -171,14 +174,17 @@ class SiteEnergy:
 
     @cached_property
     def uncertainty(self) -> float:
-        """Estimated numerical error of the site's energies, in J.
+        """Estimated numerical error of the arm's energies, in J.
 
-        Energies are integrated from records at the ticks. Therefore motion between the ticks
-        causes errors. The error of the trapezoid rule is estimated from the curvature of the
-        total power. The error of torques that are constant between ticks is estimated from the
-        changes of these torques, times the changes of the filtered error r = qd - v. Here qd is
-        the joint velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged
-        periods, the whole energy counts as uncertain.
+        A change of energy that is smaller than this error proves nothing. Energies are
+        integrated from records at the ticks (periods of the control loop), so that motion
+        between the ticks causes errors.
+
+        The error of the trapezoid rule is estimated from the curvature of the total power. The
+        error of torques that are constant between ticks is estimated from the changes of these
+        torques, times the changes of the filtered error r = qd - v. Here qd is the joint
+        velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged periods, the
+        whole energy counts as uncertain.
         """
         outflows = [self.transfer, *self.dissipation.values()]
         inflows = list(self.work.values())
@@ -394,11 +400,14 @@ class EnergyBalance:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The change of the group's energy that remains unexplained, shape (T,), in J.
+        """Change of the group's energy that no known energy flow explains, shape (T,), in J.
+
+        A group consists of arms that follow each other. A large value means that the log
+        contradicts the model of the arms, or that records are wrong.
 
         It is `residual` minus two known causes: the work that arises because control laws are
-        executed in ticks, and the energy transfers that the weights of the sites do not cancel.
-        A large value means that the log contradicts the model, or that records are wrong.
+        executed in ticks (periods of the control loop), and the energy transfers between arms
+        that the weights of the sites do not cancel.
         """
         explained = self._accumulate_judged(self.sampling - self.transfer)
         return self.residual - explained

@@ -152,7 +152,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of some numbers, for example the peak torque.
+    """Returns the largest absolute value of numbers, such as the peak torque: 3 for [1, -3].
 
     Args:
         values: The numbers, of any shape.

@@ -217,9 +217,10 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
 
 
 class CoupledTicks(NamedTuple):
-    """Linear model of all sites over one tick (period of their control loops).
+    """Linear model of all arms and their control loops over one tick, a period of the loops.
 
-    The model has n states, which belong to the sites (processes that each run one arm).
+    The eigenvalues of the model show whether small motions grow. The n states belong to sites,
+    the processes that each run one arm.
 
     Attributes:
         S: Matrix that maps the states of all sites to their next tick, without the effects of
@@ -406,7 +407,9 @@ class _TickRun(NamedTuple):
 
 
 class _SpanPart(NamedTuple):
-    """A part of a span, after which columns are scaled.
+    """A part of a span of time, after which the columns of states are scaled.
+
+    Scaling keeps fast growing motions within the range of floating-point numbers.
 
     Attributes:
         runs: Ticks in an order in which every sample is known before its use.
@@ -464,7 +467,9 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """The effect of one peer on a site, and which of its samples the site uses at each tick.
+    """Effect of one arm on another, and which of its messages the other uses at each tick.
+
+    A tick is a period of the control loop.
 
     Attributes:
         peer: Index of the peer.
@@ -478,7 +483,9 @@ class _PeerEffect(NamedTuple):
 
 
 class _Tracks(NamedTuple):
-    """Motion of one site over a span of time, with one motion per column.
+    """Simulated motion of one arm over a span of time, for several start states at once.
+
+    Each start state has its own column.
 
     Attributes:
         states: States from the start of the span on, shape (1 + ticks, n_i, columns).
@@ -599,7 +606,9 @@ class _SpanMap:
         return np.vstack(blocks)
 
     def divide_out_constant(self, V: Array) -> Array:
-        """Returns columns less their constant motions, whose multipliers are exactly 1.
+        """Removes motions that never change, such as a constant offset, from columns of states.
+
+        Their multipliers are exactly 1. Without them, the search finds the moving roots.
 
         Args:
             V: Columns, shape (size, columns).
@@ -608,7 +617,7 @@ class _SpanMap:
         return V - constant_part
 
     def _build_tracks(self, V: Array) -> list[_Tracks]:
-        """Returns the tracks of each site, with its past and with room for the span.
+        """Allocates the motion of each arm over the span, and copies the past into it.
 
         Args:
             V: Columns with the past, shape (size, columns).
@@ -626,7 +635,10 @@ class _SpanMap:
         return tracks
 
     def _list_blocks(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> list[Array]:
-        """Returns the parts of all tracks that a column contains at given ticks.
+        """Returns the recorded motion of all arms at given ticks, as blocks of one column.
+
+        A tick is a period of an arm's control loop. The blocks are stacked to the state vector
+        of the map from one span of time to the next.
 
         Args:
             tracks: Tracks of all sites.
@@ -796,6 +808,8 @@ def _find_multipliers(
 def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
     """Returns the indices of the largest multipliers, by falling modulus.
 
+    A multiplier is the factor by which a small motion grows over the span.
+
     Args:
         mu: The multipliers.
         wanted: Number of distinct moduli.
@@ -861,7 +875,10 @@ class SampledLoop:
 
     @limit_blas_threads()
     def compute_spectrum(self, rest: Equilibrium, wanted: int) -> Spectrum:
-        """Computes the rightmost roots about a rest, see `compute_sampled_spectrum`.
+        """Computes the fastest growing (rightmost) roots of small motions about a pose of rest.
+
+        The control loops with their ticks and delays are linearised, see
+        `compute_sampled_spectrum`.
 
         Args:
             rest: The pose of rest.
@@ -920,7 +937,7 @@ class SampledLoop:
 
     @limit_blas_threads()
     def measure_rightmost_rate(self, pose: Equilibrium, scale_per_s: float) -> float | None:
-        """Computes the real part of the rightmost root about a pose, with limited accuracy.
+        """Computes how fast the fastest small motion about a pose grows, with limited accuracy.
 
         Args:
             pose: The pose about which the loop is linearised.
@@ -947,7 +964,9 @@ class SampledLoop:
 
 
 def _draw_start(span: _SpanMap, n: int) -> Array:
-    """Returns random columns from which the search of modes starts, always the same ones.
+    """Returns random start columns for the search of eigenvectors, equal in every run.
+
+    A fixed seed makes results repeatable.
 
     Args:
         span: The map whose modes are searched.
@@ -965,7 +984,10 @@ def _find_roots(
     wanted: int,
     largest_residual: float,
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
-    """Returns the rightmost roots of a span map, with their vectors.
+    """Returns the fastest growing (rightmost) roots of the loop over a span of time.
+
+    A root is the complex growth rate of a small motion, which follows from an eigenvalue of the
+    map over the span.
 
     Args:
         span: The map.
@@ -1062,7 +1084,10 @@ def _describe_modes(
 
 
 def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
-    """Returns how far a mode's strongest frequency is from its principal value, in rad/s.
+    """Returns how far the strongest frequency of a motion is from its principal root.
+
+    The multiplier of a period determines a frequency only up to multiples of 2 pi / period. The
+    strongest frequency selects one of them.
 
     Args:
         velocity: Velocity of a joint in the mode, with one value per tick.
@@ -1080,7 +1105,9 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first known root that equals s, or None.
+    """Returns the index of the first known root that is equal to a new one, or None.
+
+    A root is a complex growth rate of small motions. Equal roots must not be counted twice.
 
     Args:
         roots: The known roots.

@@ -45,7 +45,7 @@ _SETTLED = 0.01
 
 
 class FrequencyBand(NamedTuple):
-    """A range of frequencies, in Hz."""
+    """A range of frequencies, in Hz, for example that in which a system is not passive."""
 
     from_hz: float
     to_hz: float
@@ -68,16 +68,16 @@ class Minima(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least value of the curve over all frequencies.
+        """Lowest value of the curve over all frequencies.
 
-        For an eigenvalue that must be positive, it is the margin, or a violation if it is
-        negative.
+        If the curve must be positive, such as an eigenvalue, this is the margin. A negative
+        value is a violation.
         """
         return float(self.values.min())
 
     @property
     def least_hz(self) -> float:
-        """Frequency of the deepest minimum of the curve, in Hz, for texts."""
+        """Frequency in Hz at which the curve has its lowest value."""
         least_index = self.values.argmin()
         w_rad_s = self.w_rad_s[least_index]
         return float(w_rad_s / (2.0 * np.pi))
@@ -168,6 +168,8 @@ def _refine(
 ) -> tuple[Array, NDArray[Any]]:
     """Adds frequencies to a grid where the values of a function require a finer step.
 
+    Resonances need a fine step, and a fine step everywhere would take too long.
+
     Args:
         function: Function that returns values, shape (F, ...), for frequencies, shape (F,).
         w_rad_s: First frequencies, rising, shape (F,).
@@ -223,6 +225,8 @@ def find_minima(
     tolerance: FrequencyCurve | None = None,
 ) -> Minima:
     """Evaluates a curve over frequency, and adds frequencies until its minima are resolved.
+
+    A narrow minimum between two frequencies of a fixed grid would be missed.
 
     Args:
         curve: Function that returns the values of the curve at given frequencies.
@@ -288,7 +292,9 @@ def _find_bands_below(
     values: Array,
     level: float,
 ) -> tuple[FrequencyBand, ...]:
-    """Returns the bands in which a curve is below a level. Bisection locates all edges.
+    """Returns the frequency bands in which a curve is below a level, such as zero.
+
+    The edges of the bands are located by bisection.
 
     Args:
         curve: The curve.

@@ -37,10 +37,13 @@ def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
 
 
 def _read_hand(file: Path) -> HandMatrices:
-    """Reads an identified hand from a JSON file.
+    """Reads the measured dynamics of a human hand from a JSON file.
+
+    Args:
+        file: Path of the file.
 
     Raises:
-        UsageError: The file does not contain a hand.
+        UsageError: The file does not contain the dynamics of a hand.
     """
     try:
         values = json.loads(file.read_text(encoding="utf-8"))

@@ -63,7 +63,10 @@ SAMPLED_ROOT_DIFFERENCE = 0.01
 
 @dataclass(frozen=True, repr=False)
 class LinearAnalysis(Result):
-    """Result of the linear stability analysis of a scenario, see `analyse_linear_loop`.
+    """Result of the linear stability analysis of coupled arms, see `analyse_linear_loop`.
+
+    The arms are linearised about a pose of rest. The roots of the loop show whether small
+    motions about this pose decay, and for which network delays.
 
     Attributes:
         scenario: The description of the experiment.
@@ -275,7 +278,7 @@ class LinearAnalysis(Result):
 
 
 class _AnalysedLoop(NamedTuple):
-    """The loop that is analysed.
+    """Control loop of all arms that is linearised, with its pose of rest and its delays.
 
     Attributes:
         scenario: The scenario.
@@ -390,7 +393,7 @@ def analyse_linear_loop(
 
 
 def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
-    """Returns the intervals of stable delays, and the crossings of roots, as plain values.
+    """Converts the network delays for which the arms are stable to plain values for JSON.
 
     Args:
         margin: The delays at which the loop is stable.
@@ -411,7 +414,7 @@ def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
-    """Returns the roots of a loop as plain values.
+    """Converts the roots of a control loop to plain values for JSON output.
 
     Args:
         spectrum: The rightmost roots of the loop.

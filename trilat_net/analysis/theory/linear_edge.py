@@ -190,13 +190,10 @@ class EdgeScan(NamedTuple):
 
 
 def parse_edge_range(text: str) -> tuple[str, float, float]:
-    """Parses a key and a range of values, such as "control.d=0.1:3".
+    """Parses the setting and the range of values in which a stability limit is searched.
 
-    Returns:
-        The key, the lower end and the upper end of the range.
-
-    Raises:
-        UsageError: The text is not a range.
+    Args:
+        text: The text, for example "control.d=0.1:3".
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
@@ -260,7 +257,9 @@ def iterate_linear_edges(
 
 
 class _GrowthPoint(NamedTuple):
-    """Growth rate of the loop at a value of a key.
+    """Growth rate of small motions for one value of the examined setting.
+
+    A positive rate means that the arms are not stable.
 
     Attributes:
         value: Value of the key.
@@ -460,6 +459,8 @@ def find_root_crossings(
 ) -> tuple[tuple[float, ...], str]:
     """Finds the values of one setting at which coupled arms become stable or unstable.
 
+    An example is the smallest damping gain with which the arms are stable.
+
     Args:
         scenario: Description of the experiment. The pose of rest is determined with its own
             value of the setting.
@@ -508,7 +509,7 @@ def _assume_equilibrium(
 
 
 def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
-    """Returns the equilibrium that is nearest to the mean of the start poses.
+    """Returns the pose of rest that is nearest to the mean of the arms' start poses.
 
     Args:
         scenario: The experiment.

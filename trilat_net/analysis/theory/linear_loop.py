@@ -219,9 +219,9 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that each site tries to reach at an equilibrium.
+    """Computes the pose that the control law of each arm tries to reach at rest.
 
-    It is the mean of its peers' poses, weighted with the dominance factors.
+    It is the mean of the other arms' poses, weighted with the dominance factors.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -451,7 +451,9 @@ def _replace_estimate(
     T: Array,
     names: tuple[str, ...],
 ) -> SiteJacobian:
-    """Replaces the estimates theta_hat of a site by the states z = T theta_hat.
+    """Replaces the parameter estimates of a control law by fewer states z = T theta_hat.
+
+    Estimates that influence the motion only through z would add roots that are always zero.
 
     Args:
         layout: Layout of the columns with theta_hat.
@@ -596,7 +598,7 @@ def _name_ports(
 
 
 def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, ...]:
-    """Returns the delayed terms by rising delay.
+    """Orders the terms of a delay-differential equation by their delay.
 
     Args:
         terms: Matrices of state and torque, by the delay in s.
@@ -743,7 +745,7 @@ def _add_form(
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    """Adds the linear form of site i's law to the matrices of the loop.
+    """Adds the linear equations of one arm's control law to the matrices of the whole loop.
 
     Args:
         conditions: The numbers of the loop.

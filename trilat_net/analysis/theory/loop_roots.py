@@ -61,7 +61,9 @@ _BATCH_RECORDS = 4096
 
 
 class _EndLoop(NamedTuple):
-    """The control loop at the end of a run, with the rest about which it is linearised.
+    """Control loop of all arms as it was at the end of a run, with its pose of rest.
+
+    The loop is linearised about this pose to decide whether small motions die away.
 
     Attributes:
         scenario: The scenario up to the end of the run. Delays that only the run shows are
@@ -272,7 +274,9 @@ def resolve_final_scenario(log: Log) -> Scenario:
 
 
 class _FixedDelays(NamedTuple):
-    """A scenario in which every delay is known.
+    """A scenario in which the delay of every network link is known at every time.
+
+    A linear analysis needs known delays, but measured delays are known only after the run.
 
     Attributes:
         scenario: The scenario up to the end of the run. A link whose delays only the records
@@ -289,7 +293,7 @@ class _FixedDelays(NamedTuple):
 
 
 class _EndState(NamedTuple):
-    """State of all arms at the end of a run, next to which a rest is sought.
+    """Poses of all arms at the end of a run, near which a pose of rest is searched.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad.
@@ -305,7 +309,7 @@ class _EndState(NamedTuple):
 def _build_end_loop(
     final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
 ) -> _EndLoop:
-    """Returns the final loop, with the equilibrium nearest to a state.
+    """Returns the control loop at the end of a run, with the nearest pose of rest.
 
     Args:
         final: The final loop.
@@ -335,7 +339,9 @@ def _build_end_loop(
 
 
 def _compute_roots(loop: _EndLoop) -> LoopRoots:
-    """Computes the rightmost roots of a loop, as a certificate states them.
+    """Computes the fastest growing (rightmost) roots of the loop at the end of a run.
+
+    A root is the complex growth rate of a small motion. A certificate of stability states them.
 
     Args:
         loop: The loop at the end of a run.
@@ -369,7 +375,10 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
 
 
 def _name_left_out(programs: Sequence[str]) -> str:
-    """Returns which reactions the linearised loop leaves out, as a phrase. Empty if none.
+    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
+
+    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
+    if there is no such program.
 
     Args:
         programs: Sites whose arms a program of the user moves.
@@ -403,7 +412,7 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
 
 
 def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots:
-    """Returns the rightmost root and the verdict, as a certificate states them.
+    """Returns the fastest growing root, and what it says about the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.
@@ -431,7 +440,7 @@ def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots
 
 
 def _explain_no_roots(reason: str) -> LoopRoots:
-    """Returns a result without roots, which says why they could not be computed.
+    """Returns a result without roots, with the reason why they could not be computed.
 
     Args:
         reason: The reason, as a phrase for the user.
@@ -462,10 +471,10 @@ def _end_traces(scenario: Scenario) -> Scenario:
 
 
 def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
-    """Returns for each link, by name, whether only a run shows the delays of its samples.
+    """Finds the network links whose delays are random or measured, so that only a run has them.
 
-    Args:
-        scenario: The scenario up to the end of the run.
+    Returns:
+        For each link, by its name, True if its delays are unknown before a run.
     """
     has_unknown_delay = {}
     for name in scenario.links:
@@ -569,7 +578,7 @@ def _choose_end_state(
 
 
 def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
-    """Returns the last recorded joint angles of all sites, shape (N, n), in rad.
+    """Returns the last recorded joint angles of all arms, shape (N, n), in rad.
 
     Args:
         scenario: Scenario of the run.
@@ -579,7 +588,7 @@ def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
 
 
 def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Array, Array]]:
-    """Yields the joint angles and the largest speeds of each site, in intervals of 50 ms.
+    """Yields the joint angles and largest speeds of each arm, in intervals of 50 ms.
 
     Args:
         scenario: Scenario of the run.
@@ -597,7 +606,7 @@ def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Arra
 
 
 class _SiteMotion(NamedTuple):
-    """Motion of a site, from its records.
+    """Recorded motion of one arm, and what its control law has learnt.
 
     Attributes:
         t_s: Times of the K records, shape (K,), in s.

@@ -250,7 +250,12 @@ class NumericLaw:
         return torque, change * self._rate_hz
 
     def _evaluate_tick(self, x: Array, previous: Array) -> Array:
-        """Returns the torque, and the numbers that the law itself remembers, after one tick.
+        """Evaluates a user's control law for one tick, a period of the control loop.
+
+        The result is differentiated numerically, because the code of the law is arbitrary.
+
+        Returns:
+            The torque, and the values that the law stores for its next tick.
 
         Args:
             x: Arguments, shape (arguments,).

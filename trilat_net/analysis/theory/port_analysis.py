@@ -231,7 +231,7 @@ class PortAnalysis(NamedTuple):
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """Names of the sites."""
+        """Names of the sites, the processes that each control one arm."""
         return self.scenario.names
 
     @property
@@ -248,7 +248,9 @@ class PortAnalysis(NamedTuple):
         return "xd" if self.axes else "qd"
 
     def name_port(self, number: int) -> str:
-        """Returns the name of the place where an operator acts, such as "joint 2" or "axis y".
+        """Returns a name for the user of the joint or axis at which an operator pushes an arm.
+
+        Examples are "joint 2" and "axis y".
 
         Args:
             number: Number of the joint, or of the axis of the end effector if end effectors
@@ -258,6 +260,8 @@ class PortAnalysis(NamedTuple):
 
     def impedance_unit(self, number: int = 0) -> str:
         """Returns the unit of the impedance that an operator feels, for tables and figures.
+
+        For a joint, it is N m s/rad.
 
         Args:
             number: Number of a joint, or of an axis of the end effector if end effectors follow
@@ -368,7 +372,10 @@ def _check_absolute_stability(
     Y: port_response.PortResponse,
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Returns the margin of absolute stability over frequency, with the best weights.
+    """Computes the margin of absolute stability over frequency.
+
+    Arms are absolutely stable if they remain stable with every passive hand or wall. The
+    weights of the ports are chosen so that the margin is as large as possible.
 
     Args:
         loop: The loop.
@@ -384,7 +391,9 @@ def _check_absolute_stability(
 
 
 class _HeldHands(NamedTuple):
-    """The end effectors of the masters, and the measured operators that may hold them.
+    """End effectors (tips) of the masters' arms, and the measured human hands that hold them.
+
+    A hand adds mass, damping and stiffness, which can make the arms stable or unstable.
 
     Attributes:
         hands: For each master, the operators that may hold its end effector.
@@ -404,7 +413,14 @@ def _locate_hands(
     loop: LinearLoop,
     hands: Sequence[HandMatrices],
 ) -> _HeldHands:
-    """Finds the end effectors of the masters, which measured operators may hold.
+    """Finds the end effectors of the masters' arms, at which measured human hands may act.
+
+    Args:
+        scenario: The experiment.
+        conditions: The coupled arms.
+        rest: Pose of rest of all arms.
+        loop: The loop, linearised at this pose.
+        hands: The measured hands.
 
     Raises:
         UsageError: An operator was measured along other axes than an end effector has.
@@ -449,7 +465,14 @@ def _check_proof(
     loop: LinearLoop,
     w_rad_s: Array,
 ) -> Passivity | None:
-    """Checks passivity with respect to the output r of the paper's proof.
+    """Checks over frequency the passivity on which the paper's stability proof rests.
+
+    The output of the proof is r, the velocity plus a multiple of the error.
+
+    Args:
+        conditions: The coupled arms.
+        loop: The linearised loop.
+        w_rad_s: Frequencies, in rad/s.
 
     Returns:
         The passivity under the weights of the proof. None if there is no proof for this loop,
@@ -472,9 +495,10 @@ def _check_two_ports(
     Y: port_response.PortResponse,
     w_rad_s: Array,
 ) -> tuple[TwoPort, ...]:
-    """Evaluates Llewellyn's criterion for every pair of sites, at each joint that both have.
+    """Checks for every pair of arms whether they are stable with every passive user and wall.
 
-    With three sites, the third one is once free and once clamped.
+    Llewellyn's criterion is evaluated at each joint that both arms have. With three arms, the
+    third one is once free and once clamped.
     """
     two_ports = []
     sites = port_response.list_port_sites(loop)
@@ -582,7 +606,7 @@ def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
 
 
 def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
-    """Returns what an operator feels of another arm, free and clamped, as plain values.
+    """Converts what an operator feels of another arm, free and clamped, to plain values.
 
     Args:
         transparency: The impedances that the operator feels.
@@ -604,7 +628,7 @@ def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
 
 
 def _list_followed_axes(site: SiteSetup) -> list[int]:
-    """Lists the coordinates along which a site follows its peers.
+    """Lists the joints, or the axes of the end effector, with which an arm follows the others.
 
     Args:
         site: Setup of the site.
@@ -618,7 +642,7 @@ def _list_followed_axes(site: SiteSetup) -> list[int]:
 
 
 def _name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns the names of the axes along which operators move the end effectors.
+    """Returns the names of the axes, such as "y", along which operators move end effectors.
 
     Args:
         conditions: The coupled arms.

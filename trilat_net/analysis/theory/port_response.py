@@ -215,6 +215,8 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
 def to_imaginary_axis(w_rad_s: Array) -> Complex:
     """Returns the points s = j w at which a frequency response is evaluated, in 1/s.
 
+    At 1 Hz, w is 6.28 rad/s.
+
     Args:
         w_rad_s: Frequencies w, in rad/s.
     """
@@ -222,10 +224,10 @@ def to_imaginary_axis(w_rad_s: Array) -> Complex:
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the arm's site to which an input or state of a linear model belongs.
+    """Returns the site (arm) in the name of a port or state, for example "m1" for "m1.tau2".
 
     Args:
-        port: Name of the port or state. For "m1.tau2" the site is "m1".
+        port: Name of the input or state of a linear model.
     """
     return port.partition(".")[0]
 
@@ -245,7 +247,9 @@ def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
 
 
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
-    """Finds the ports of a site, the joints at which its operator acts on the loop.
+    """Finds the ports of an arm, the joints at which its operator pushes.
+
+    In the linear model of all arms, each port is an input.
 
     Args:
         loop: The loop.
@@ -268,10 +272,12 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
 
 
 def _parse_port_joint(port: str) -> int:
-    """Returns the number of the joint to which a port belongs.
+    """Returns the joint number in the name of a port, for example 2 for "m1.tau2".
+
+    A port is a joint at which an operator or a wall pushes an arm.
 
     Args:
-        port: Name of the port. For "m1.tau2" the number is 2.
+        port: Name of the port.
     """
     _, _, number = port.rpartition("tau")
     return int(number)
@@ -315,9 +321,9 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
 
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of any link or signal in a linear loop, in s.
+    """Returns the longest delay of any network link or signal in a linear loop, in s.
 
-    Returns 0 for a loop without delays.
+    The result is 0 for a loop without delays.
     """
     delays_s = [term.delay_s for term in loop.delayed]
     return max(delays_s, default=0.0)
@@ -477,7 +483,10 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """Impedance that an operator feels at a joint, with another arm free and clamped.
+    """How much of another arm an operator feels: the impedance with it free and clamped.
+
+    A transparent system feels light while the other arm is free, and stiff while the other arm
+    is clamped.
 
     Attributes:
         operator_site: Site of the operator.

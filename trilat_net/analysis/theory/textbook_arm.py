@@ -287,7 +287,7 @@ class PlacedChain:
         return torque
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns the torque of the joints' friction, which opposes a motion, in N m.
+        """Returns the torque that overcomes the friction in the joints of the arm, in N m.
 
         Args:
             v: Joint velocities, shape (n, ...).
@@ -305,10 +305,13 @@ class PlacedChain:
         return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the torque G(q) that holds the chain against gravity, shape (n, ...), in N m.
+        """Returns the torque with which motors hold the arm still against gravity, in N m.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).
+
+        Returns:
+            Torque, shape (n, ...).
         """
         zeros = np.zeros_like(self._q)
         return self.required_torque(theta, zeros, zeros, zeros)
@@ -485,7 +488,9 @@ def _multiply_inertia_units(motion: Numbers) -> Numbers:
 
 
 def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
-    """Returns the matrix X that transforms spatial velocities into a link's frame.
+    """Returns the matrix that transforms a spatial velocity into the frame of the next link.
+
+    A spatial velocity has six components, three of rotation and three of translation.
 
     Args:
         R: Orientation of the link in the frame of the link before, shape (3, 3, ...).

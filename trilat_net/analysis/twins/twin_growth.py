@@ -614,7 +614,7 @@ def _running_maximum(values: Array) -> Array:
 
 
 def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
-    """Returns whether an amplitude grows, decays or stays, from its logarithm over time.
+    """Returns whether a small difference between two runs grows, decays or stays.
 
     Args:
         t_s: Times, shape (K,), in s.
@@ -967,13 +967,12 @@ def twin(
 
 
 def _parse_push(text: str) -> tuple[str, float]:
-    """Parses a push such as "m1.q1=1e-6".
+    """Parses the small push with which a run is repeated, such as "m1.q1=1e-6".
 
-    Returns:
-        The target and the size. The size may be missing and then has a default value.
+    The example moves joint 1 of arm m1 by 1e-6 rad.
 
-    Raises:
-        UsageError: The size is not a number.
+    Args:
+        text: The text that the user gave.
     """
     target, separator, size = text.partition("=")
     try:
@@ -988,11 +987,10 @@ def _parse_push(text: str) -> tuple[str, float]:
 def _parse_sizes(text: str) -> list[float]:
     """Parses a range of push sizes such as "1e-9:1e-3".
 
-    Returns:
-        The sizes from the lower to the upper end of the range, each ten times the one before.
+    A run is repeated with each size, to see whether the growth depends on it.
 
-    Raises:
-        UsageError: The text is no range, or the range is too short or too large.
+    Args:
+        text: The text that the user gave.
     """
     try:
         low, high = map(float, text.split(":"))

@@ -247,7 +247,7 @@ class _PackageCommand(TyperCommand):
 
     @cached_property
     def _command(self) -> Any:
-        """The imported command.
+        """The function of the command, which is imported from its package at the first use.
 
         Raises:
             UsageError: The package of the command is not installed or cannot be imported.
@@ -306,7 +306,7 @@ class _PackageCommand(TyperCommand):
 
 
 def _list_package_commands(group: str) -> Iterator[_PackageCommand]:
-    """Yields the commands of other packages that belong to a group.
+    """Yields the commands that other installed packages add to the command line.
 
     Args:
         group: Name of the group. Empty for commands without a group.
@@ -384,7 +384,7 @@ _GROUP_OPTIONS = {"set": "--session paper "}
 
 
 def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
-    """Adds a command to a group of commands, with its help and its examples.
+    """Adds a command to the command line, with its help and its examples.
 
     Args:
         group: The group.

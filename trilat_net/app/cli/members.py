@@ -249,7 +249,7 @@ def record_command(
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Returns the path of a session's log, and creates the folder for the log and its report.
+    """Chooses the file of a session's log, and creates the folder for it and its report.
 
     Args:
         output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
@@ -272,7 +272,7 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 
 def _conclude(files: list[Path], *, png: bool) -> None:
-    """Checks a finished log, and writes its report into the folder of the log.
+    """Checks a finished log, and writes a report about the run into the folder of the log.
 
     Args:
         files: Paths of all files into which the log was split.
@@ -429,7 +429,7 @@ def replay_command(
 def _announce_playback(
     header: "SessionHeader", name: str, rate: float, print_line: Callable[[str], None]
 ) -> None:
-    """Prints which sites of a log are replayed, as which session, and how fast.
+    """Prints which arms of a log are replayed, as which session, and how fast.
 
     A note warns if the messages have another version than those of this program.
 
@@ -579,7 +579,7 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
-    """Warns of files of a log that were not finished, for example because of a power failure.
+    """Warns the user of log files that were cut off, for example by a power failure.
 
     Args:
         torn: For each file the problem.
@@ -701,7 +701,9 @@ def _print_router_line(text: str) -> None:
 
 
 def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Returns the limit at which a log is split into parts, from an option like --split-size.
+    """Parses an option such as --split-size, the size or duration at which a log is split.
+
+    For example, 2 MB with the scale 1e6 gives 2000000 bytes.
 
     Args:
         option: Name of the option, for the error message.

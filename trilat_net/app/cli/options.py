@@ -79,7 +79,7 @@ def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
 
 
 def flag(names: str, text: str = "", **settings: Any) -> Any:
-    """Declares a command-line option without a value, as in `--json`.
+    """Declares a command-line option that is on or off, as in `--json`.
 
     Args:
         names: Names of the option, as in "--json" or "--ports/--no-ports".
@@ -178,7 +178,9 @@ def complete_scenarios(incomplete: str) -> list[str]:
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Lists the names of plots that begin with the letters that the user has typed in a shell.
+    """Lists the names of figures that begin with the letters that the user has typed.
+
+    The shell offers these names when the user presses the tab key.
 
     Args:
         incomplete: The letters before the completion.
@@ -189,7 +191,7 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Returns the names of arms (sites) with which a shell may complete the word of a user.
+    """Lists the names of arms that the shell offers when the user presses the tab key.
 
     Args:
         context: The command line, whose scenario or log has the sites.
@@ -502,7 +504,7 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Loads the scenario of a command, and applies the options that change it.
+    """Loads the scenario that a command names, with the changes that its options request.
 
     Args:
         source: Name of a shipped scenario, or path of a TOML file.
@@ -548,9 +550,9 @@ def _find_key(override: str) -> str:
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
-    """Returns the changes of the scenario that --set and --duration ask for, in this order.
+    """Returns the changes of a scenario that the options --set and --duration request.
 
-    An experiment is changed in this way without editing its file.
+    A user can in this way change an experiment for one run without editing its file.
 
     Args:
         overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
@@ -754,7 +756,7 @@ class RunOptions(NamedTuple):
     as_json: JsonOption = False
 
     def load(self, source: str, longest_s: float | None = None) -> "Scenario":
-        """Returns the scenario of the run, with the changes that the options ask for.
+        """Loads the scenario of the run, with the changes that the command's options request.
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
@@ -820,7 +822,9 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def parse_viz_rate(text: str) -> float:
-    """Parses the option `--views`, the rate of the messages for viewers such as Foxglove.
+    """Parses the option `--views`: how many messages per second viewers such as Foxglove get.
+
+    Fewer messages make the log smaller.
 
     Args:
         text: A number from 1 to 1e6, "off" or "full".

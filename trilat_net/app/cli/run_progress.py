@@ -79,7 +79,9 @@ def show_progress(
 
 
 def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, with its results in a new folder, for commands with several runs.
+    """Runs a scenario live, and stores its results in a new folder.
+
+    Commands that run several scenarios use it, so that results do not replace each other.
 
     Args:
         scenario: The scenario.

@@ -129,7 +129,10 @@ class MessageBatch:
 
     @property
     def channels(self) -> Ints:
-        """Channel of each message, shape (K,)."""
+        """Number of the channel of each message, shape (K,).
+
+        A channel is a topic of the log, such as the records of one arm.
+        """
         return self.rows[:, _CHANNEL]
 
     @property
@@ -147,7 +150,7 @@ class MessageBatch:
         return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
-        """Returns the encoded content of one message, exactly as it was published originally.
+        """Returns the encoded content of one message, exactly as it was first published.
 
         Args:
             index: Index of the message in this batch, 0 for the first one.
@@ -167,7 +170,7 @@ class MessageBatch:
             yield t_ns, channel, number, bytes(view[start:end])
 
     def part(self, indices: slice | Ints) -> "MessageBatch":
-        """Selects some of the messages, without copying their payloads.
+        """Selects some of the messages, without copying their contents.
 
         Args:
             indices: Which messages are selected, and in which order.
@@ -237,11 +240,16 @@ class BatchBuilder:
 
     @property
     def memory(self) -> int:
-        """Memory that the messages added so far need, in bytes."""
+        """Memory that the messages added so far occupy, in bytes.
+
+        The reader of a log limits it, because a log may be larger than the machine's memory.
+        """
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message, in the order of the file, to those that will be sorted for playing.
+        """Adds a message in the order of the log file.
+
+        All messages are sorted later for playing.
 
         Args:
             t_ns: Time of the message after the start of the session, in ns.

@@ -64,7 +64,9 @@ class _RoundEnd(NamedTuple):
 
 
 class _ReadPiece(NamedTuple):
-    """Piece of a log that the reader process sends to the player.
+    """A piece of a log that the process that reads the file sends to the player.
+
+    A separate process reads, so that decompression does not delay published messages.
 
     Attributes:
         topics: Topics of all channels that were found so far. The index of a topic is the
@@ -224,7 +226,7 @@ class MessageSource:
             self._ahead.append(_RoundEnd(0, {}))
 
     def close(self) -> None:
-        """Ends the reader process and its pipe, if they exist. Further calls have no effect."""
+        """Ends the process that reads the log file. Further calls have no effect."""
         if self._process is not None:
             self._process.terminate()
             self._process.join()
@@ -278,10 +280,10 @@ def sort_messages(
 
 
 class _MessageSorter:
-    """Messages that wait for their turn.
+    """Buffer that brings the messages of a log file into the order of their sending times.
 
-    It counts the strays, messages that arrive when a later message of their channel has been
-    released already.
+    Log files have the order of arrival. A message that comes too late for sorting, after a
+    later one of its channel was released, is a stray and is counted.
     """
 
     def __init__(self) -> None:
@@ -295,7 +297,7 @@ class _MessageSorter:
         return self._waiting.memory
 
     def add(self, message: PlayedMessage) -> None:
-        """Stores a message until it can be sorted and released to the player.
+        """Stores the next message of the file until it can be released in the right order.
 
         Args:
             message: The next message in the order of the file.
@@ -322,7 +324,7 @@ class _MessageSorter:
         return self._release(sorted_messages, due_count)
 
     def release_half(self) -> tuple[MessageBatch, int]:
-        """Removes the earlier half of the messages, because they need too much memory.
+        """Releases the earlier half of the waiting messages, because they need too much memory.
 
         Returns:
             The messages in play order, and the number of strays: messages that came too late,

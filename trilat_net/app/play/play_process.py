@@ -46,7 +46,7 @@ PROGRESS_EVERY_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """States how a log is played, as the options of the command line say.
+    """How a log is replayed over the network, as the options of the command line say.
 
     Attributes:
         session: Name of the session in which the log is played.
@@ -66,7 +66,7 @@ class PlayOptions:
 
 
 class PlaybackSummary(NamedTuple):
-    """Result of playing a log, from which the summary for the user is composed.
+    """Result of replaying a log: numbers of messages, duration and lateness, for the user.
 
     Attributes:
         counts: Number of published messages, by the topic in the file.

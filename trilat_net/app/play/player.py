@@ -58,6 +58,8 @@ class Pace:
     def due_ns(self, t_ns: int) -> int:
         """Computes the deadline of a message: the time on the player's clock when it is due.
 
+        At double speed, for example, a message 4 s after the start is due after 2 s.
+
         Args:
             t_ns: Time of the message in the log, in ns after the start of the recorded session.
 
@@ -162,7 +164,7 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Counts the lateness of one published message.
+        """Counts how late one message was published.
 
         The method is called for every message, and must therefore be fast.
 
@@ -222,7 +224,7 @@ Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """How far the playing of a log has come, for the line that the user sees.
+    """Progress of replaying a log, for the line that the user sees in the terminal.
 
     Attributes:
         position_ns: Time of the next message, in ns after the start of the recorded session.
@@ -236,7 +238,9 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """Publishes the messages of a log, each at its deadline, once or in a loop.
+    """Publishes the messages of a recorded log again, each at its deadline, once or in a loop.
+
+    Programs such as a monitor then work as if the session were running.
 
     Args:
         source: Supplies the messages in the order in which they are played.

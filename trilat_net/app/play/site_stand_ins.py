@@ -52,7 +52,7 @@ from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
 
 class _ChannelMessages(NamedTuple):
-    """The messages of one channel in a batch.
+    """Replayed messages of one channel (topic) that are stored for recorders.
 
     Attributes:
         numbers: Numbers of the messages in ascending order, shape (K,).
@@ -65,7 +65,7 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Lists the stored messages from a given number on, for one reply to a recorder.
+        """Lists the stored messages from a given number on, for a reply to a recorder.
 
         Args:
             number: Smallest number of a message in the list.
@@ -83,9 +83,9 @@ class _ChannelMessages(NamedTuple):
 
 
 class PlayedHistory:
-    """Stores the messages that were played, so that they can be sent again.
+    """Stores replayed messages, so that recorders that missed some can request them again.
 
-    A recorder requests them if it has missed some.
+    Recorders request lost messages of a real session in the same way.
 
     Args:
         kept_ns: Duration of the log for which messages are stored, in ns. None to store all
@@ -101,7 +101,7 @@ class PlayedHistory:
         self._messages: dict[int, deque[_ChannelMessages]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Stores messages that will be played next, so that recorders can request them again.
+        """Stores messages before they are played, so that recorders can request them again.
 
         Messages that are older than the limit `kept_ns` are removed.
 
@@ -320,7 +320,7 @@ class SiteStandIns:
         return identity
 
     def are_recorders_listening(self) -> bool:
-        """Queries the identities of all recorders that are present on the network.
+        """Checks whether all recorders on the network are ready to receive replayed messages.
 
         Returns:
             True if all of them have replied, so that they will receive the messages.

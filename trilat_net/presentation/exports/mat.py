@@ -28,7 +28,7 @@ _KEYWORDS = {
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
-    """Writes the tables of a log as structs, their description and the scenario as texts.
+    """Exports a log as a MATLAB file: tables as structs, with description and scenario.
 
     Args:
         log: Log of the run that is exported.

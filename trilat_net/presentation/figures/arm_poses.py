@@ -103,7 +103,7 @@ class _ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points that are drawn for this pose, to find the bounds of the picture.
+        """Returns all points that are drawn for this pose, from which the picture is scaled.
 
         Returns:
             The points of the arms, of their paths and of the touched bodies, shape (K, 2), in

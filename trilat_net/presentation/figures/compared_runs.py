@@ -32,7 +32,7 @@ _LETTERS_PER_IN = 15.0
 
 
 class _ComparedSignal(NamedTuple):
-    """A signal of the sites that can be drawn for several runs.
+    """A quantity of the arms, such as the error, that a figure compares between runs.
 
     Attributes:
         name: Name for the labels of the value axes.
@@ -148,7 +148,7 @@ def _style_run(number: int, form: FigureSize) -> style.LineOptions:
 
 
 def list_common_sites(logs: Mapping[str, Log]) -> list[str]:
-    """Lists the sites that all logs have, in the order of the first log.
+    """Lists the arms that all compared runs have, in the order of the first run.
 
     Args:
         logs: The logs, by their names.

@@ -30,7 +30,7 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A figure that can be drawn from a log, with a description and a drawing function.
+    """A kind of figure that can be drawn from any log, such as the joint angles over time.
 
     Attributes:
         about: Description of the contents, for lists of figures.

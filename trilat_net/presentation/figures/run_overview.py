@@ -45,7 +45,7 @@ _MAX_SPANS = 1_000
 
 
 class _Panel(NamedTuple):
-    """Description of one of the panels of the overview: the quantity that it shows.
+    """One panel of the overview of a run: the quantity that it shows for every arm.
 
     Attributes:
         name: Name of the quantity.
@@ -237,7 +237,7 @@ def _select_drawable(panel: _Panel, values: Array) -> Array:
 
 
 def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
-    """Scales the value axis of a panel to all of its lines.
+    """Scales the value axis of a panel so that all of its lines fit.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

@@ -67,7 +67,9 @@ _NOTE: dict[str, Any] = {
 
 
 class _DifferenceLine(NamedTuple):
-    """A line that shows the difference between a run and its repetition with a small push.
+    """A line that shows how far a run and its repetition with a small push are apart.
+
+    If the line grows, small pushes grow, and the run is not stable.
 
     Attributes:
         label: Text of the line in the legend.
@@ -179,7 +181,7 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Returns the line style of each joint: the colour of its arm and dashes for its number.
+    """Returns the line style of each joint: the colour of its arm, and dashes for its number.
 
     Args:
         log: Log with the arms.
