@@ -68,9 +68,10 @@ A longer period costs less computing time.
 
 
 class RecordedScenario(NamedTuple):
-    """Scenario of a session, as far as the recorder needs it.
+    """The parts of a session's scenario that the recorder needs.
 
-    The recorder does not import the scenario's own package, so the caller provides both parts.
+    A scenario is the TOML text that describes the arms, their control laws and the network. The
+    recorder does not import the code that interprets it, so its caller provides the parts.
 
     Attributes:
         scenario: Names, rates and sizes of the sites, from which the messages to expect follow.

@@ -53,7 +53,7 @@ LAST_NS = 6_000_000_000
 
 
 class Recording:
-    """Writes one log while it is recorded, and counts its received and missing messages.
+    """Writes the log (MCAP file) of a session, and counts received and missing messages.
 
     `Recorder` creates this object when the session begins, and calls `write` periodically.
 
@@ -242,10 +242,11 @@ class Recording:
             self._note_admission(message.content)
 
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
-        """Publishes the event "stored": the log has all messages of a site that it can get.
+        """Announces that the log has all messages of one site that can still be obtained.
 
-        The process of the site waits for this event before it ends. The text says what stays
-        missing.
+        A site is the process that controls one arm. Its process waits for this event before it
+        ends, because it keeps messages that the recorder may request again. The text says which
+        messages stay missing.
 
         Args:
             site: Reception of the site, which has ended.
@@ -381,10 +382,10 @@ class Recording:
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
-        """Decodes a message of a site.
+        """Decodes a message of a site, the process that controls one arm.
 
-        If the message is the first one of the site's next start, that start is recorded from
-        now on.
+        If the process has been restarted and this is its first message, the new start is
+        recorded from now on.
 
         Args:
             key: Key under which the message arrived.
@@ -671,7 +672,7 @@ class Recording:
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Formats the numbers of received and missing messages, as they are stored in the log.
+        """Formats the numbers of received and missing messages as text to be stored in the log.
 
         A reader of the log can see from these numbers whether the log is complete.
 
@@ -799,9 +800,9 @@ class RecorderReport:
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
     def note_flush(self, duration_ns: int) -> None:
-        """Notes how long it took to pass the written messages to the operating system.
+        """Notes how long the operating system took to accept the written messages.
 
-        The next statistics state the longest of these times.
+        A slow disk shows first in these times. The next statistics state the longest one.
 
         Args:
             duration_ns: The time, in ns.

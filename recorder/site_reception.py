@@ -80,10 +80,10 @@ class InboundMessage(NamedTuple):
 
 
 class InboundQueue:
-    """Bounded queue of messages from the network's threads to the thread that writes them.
+    """Bounded queue of messages between the threads of the network and the writing thread.
 
-    If the disk is slow, messages wait here. A message for which there is no room is dropped and
-    counted.
+    While the disk is slow, messages wait here. A message is dropped and counted if the queue is
+    full, because an unbounded queue could use up the memory.
 
     Args:
         clock: Clock that determines the times of arrival.
@@ -423,9 +423,10 @@ class SiteReception:
         return int(min(self._ticks, latest_ns * 1e-9 * self._rate_hz + 1.0))
 
     def _reserve_event_bytes(self, event: Event, size: int) -> None:
-        """Subtracts the size of an event from the bytes of events that are permitted.
+        """Limits how many bytes of events one site may add to the log.
 
-        Without this limit, a faulty site could fill the log with events.
+        Without this limit, a faulty site could fill the disk. The size of each event is
+        subtracted from the bytes that remain.
 
         Args:
             event: The event.
@@ -517,10 +518,11 @@ class SiteReception:
         self.accounts[channel].add_expected(min(count, largest))
 
     def count_previous_start(self, ticks: int) -> None:
-        """Takes into account how many ticks the previous start of the site executed at least.
+        """Notes how many control periods (ticks) a site executed at least before its restart.
 
-        The previous start may have been killed. In that case it could not state this number
-        itself, but other sites have received its samples (sent states).
+        A site is the process that controls one arm. If it was killed, it could not state this
+        number, but other sites have received its samples (sent states). Without the number,
+        records lost at the end of the previous start would not be counted as missing.
 
         Args:
             ticks: Number of ticks that another site reports.
@@ -529,10 +531,11 @@ class SiteReception:
             gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _count_implied(self, content: State | LinkStats | Event) -> None:
-        """Evaluates what a message shows about the existence of other messages.
+        """Finds out from a message which other messages of the sender exist.
 
-        A record states which ticks were skipped. Statistics show that all records up to their
-        tick exist. The events "join" and "end" state the first tick and the number of ticks.
+        A message that exists and did not arrive is counted as missing. A record states which
+        ticks were skipped. Statistics show that all records up to their tick exist. The events
+        "join" and "end" state the first tick and the number of ticks.
         """
         if isinstance(content, State):
             self._exclude_skipped_ticks(content)
@@ -616,9 +619,10 @@ class SiteReception:
             account.abandon_below(account.last + 1)
 
     def describe_missing(self) -> str:
-        """Describes for the user which messages of the site are missing.
+        """Returns a text for the user about the missing messages of one site.
 
-        Messages that were lost and could not be requested again leave gaps in the log.
+        A site is the process that controls one arm. Messages that were lost and could not be
+        requested again leave gaps in the log.
 
         Returns:
             The number of missing messages and their first ranges, for each channel. Empty if no

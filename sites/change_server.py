@@ -208,10 +208,11 @@ class ChangeServer:
         return query
 
     def _poll_stop(self) -> Query | None:
-        """Returns the next order to stop from a member that may send no other request.
+        """Returns the next order to stop from a process that may send no other request.
 
-        Any member of a session may stop an arm for safety, while only the operator may change
-        more. Other requests of such a member are refused here. The order may name its source.
+        Any process of a session may stop an arm for safety, while only the operator may change
+        settings. Other requests of such a process are refused here. The order may name its
+        source.
         """
         while self._stops is not None and (query := self._stops.poll()) is not None:
             with suppress(WireError):
@@ -300,17 +301,17 @@ class ChangeServer:
         return text, self._stop_tick
 
     def _update_stopped(self, next_tick: int) -> None:
-        """Sets `stopped` if the next tick is the last one before a requested end of the run.
+        """Sets the flag `stopped` if the run must end after the next tick, as a user requested.
 
-        If nobody has requested the end, nothing changes.
+        A tick is a period of the control loop.
         """
         if self._stop_tick is not None:
             self.stopped = next_tick + 1 >= self._stop_tick
 
     def _make_change(self, request: ChangeRequest, first: int) -> CoreChange:
-        """Returns the requested change of a link between sites, or of the weights of the peers.
+        """Converts a user's request into a change of a network link or of dominance factors.
 
-        The weights say how strongly the arm follows each of the other sites (peers).
+        Dominance factors say how strongly the arm follows each of the other arms.
 
         Args:
             request: The request.

@@ -112,10 +112,10 @@ class WatchedCode:
         self._checked_count = -1  # the number of finished calls at the last check
 
     def run(self, tick: int, call: Callable[[], T]) -> T:
-        """Calls the user's code, and measures how long it takes.
+        """Calls the user's code once, and measures its computing time.
 
-        If the operating system has interrupted the thread meanwhile, the time of other programs
-        does not count.
+        Time in which the operating system executed other programs does not count, because the
+        user's code is not to blame for it.
 
         Args:
             tick: Number of the tick, a period of the control loop, in which the code is called.
@@ -227,11 +227,10 @@ class WatchedCode:
 
 
 class CodeWatchdog:
-    """Interrupts a user's code that hangs, as a context manager.
+    """Context manager that interrupts a user's code if it hangs, such as in an endless loop.
 
-    The code is watched inside the `with` block. The object uses the signal SIGALRM, which
-    Python handles in the main thread only. In other threads, and on Windows, nothing is
-    interrupted.
+    The code is watched inside the `with` block. The timer uses the signal SIGALRM, which Python
+    handles in the main thread only. In other threads, and on Windows, nothing is interrupted.
 
     Args:
         *codes: The user's code to watch.

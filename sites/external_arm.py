@@ -362,9 +362,10 @@ class DeadManSwitch:
         self._was_released = False
 
     def _list_holders(self) -> list[_Holder]:
-        """Lists the programs whose switch is pressed, and was not released by another program.
+        """Lists the programs whose dead-man switch is pressed and counts.
 
-        After a program has released the switch, the others must release it and press it again.
+        After any program has released the switch, all programs must release it and press it
+        again, so that nobody restarts an arm by accident.
         """
         return [
             program

@@ -75,9 +75,9 @@ def measure_busy_share(clock: Clock) -> float | None:
 
 
 def describe_load(busy_share: float | None) -> str:
-    """Returns a warning about a busy machine, with a remedy.
+    """Returns a warning with a remedy if other programs keep the machine busy.
 
-    On a busy machine, the control loops of the sites may be late.
+    On a busy machine, control loops may begin their periods too late.
 
     Args:
         busy_share: Fraction of time in which the processors are busy. None if it is not known.

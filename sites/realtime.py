@@ -96,9 +96,10 @@ def _set_affinity(cpu: int | None) -> str:
 
 
 def _call_libc(setting: str, function: str, *arguments: int) -> str:
-    """Applies a real-time setting by calling a function of the C library.
+    """Calls a function of the C library that applies a real-time setting to this process.
 
-    The function must return 0 on success.
+    An example is `mlockall`, which keeps the memory of the process in RAM. The function must
+    return 0 on success.
 
     Args:
         setting: Description of the setting for the user, such as "locked" for memory.

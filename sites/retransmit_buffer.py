@@ -115,9 +115,10 @@ class ChannelBuffer:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Stores empty messages in place of numbers that the site never publishes.
+        """Stores empty messages for numbers that the site never publishes.
 
-        The numbers of later messages thus remain right.
+        Message numbers follow the control periods. A skipped period has no message, and without
+        the empty ones all later messages would have wrong numbers.
 
         Args:
             count: Number of empty messages.
@@ -126,10 +127,10 @@ class ChannelBuffer:
             self.store(b"")
 
     def read_chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns as many consecutive stored messages as one reply can contain.
+        """Returns as many consecutive stored messages as fit into one network reply.
 
-        A recorder that has missed messages requests them again. It sends a further request for
-        those that do not fit into the reply.
+        A recorder that has missed messages requests them again. For messages that do not fit,
+        it sends a further request.
 
         Args:
             first: Number of the first requested message. If it is no longer stored, the reply

@@ -61,7 +61,7 @@ class RunOutcome(NamedTuple):
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the last tick, in ns since the start of the session.
+        """Nominal time of the last control period (tick), in ns since the start of the session.
 
         It is -1 if no tick was executed.
         """
@@ -164,10 +164,11 @@ class SiteEnd:
         return code
 
     def _publish_end(self) -> None:
-        """Publishes the events at the end of a run.
+        """Publishes why and when the run of this arm ended.
 
-        They are the failure if there was one, delays of the user's own code, and the event
-        `end`, whose sentence says how many ticks were executed and why the run ended early.
+        A failure has an event of its own, and so have delays of the user's code. The last
+        event, `end`, says how many ticks (control periods) were executed and why the run ended
+        early.
         """
         parts = self._parts
         output = self._outcome.output

@@ -170,10 +170,10 @@ class PeerInbox:
         return last_tick
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
-        """Removes the samples that have arrived, and returns those that pass all checks.
+        """Returns the states of the other arms that have arrived and pass all checks.
 
-        The control loop calls this at the beginning of each tick. A sample is the state that a
-        peer, another site, has published.
+        The control loop calls this at the beginning of each tick (period). A state that another
+        arm has published is called a sample.
 
         Args:
             since_epoch_ns: Present time, in ns since the epoch (the common start of the
@@ -455,10 +455,10 @@ class StateBlock:
 
 
 class _LoopSite(Protocol):
-    """What the loop requires of a site: the methods that it calls in a tick and between ticks.
+    """The methods that the control loop calls in each period and between periods.
 
-    `RunningSite` has them in a session, and `loop_rehearsal` replaces them. The loop ignores
-    the results that are `object`.
+    `RunningSite` has them in a session, and `loop_rehearsal` replaces them for measuring the
+    machine. The loop ignores the results of the type `object`.
     """
 
     def should_stop(self) -> bool:
@@ -521,9 +521,9 @@ def _publish_sample(
     io: _LoopSite,
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    """Publishes the sample of a tick to the peers.
+    """Sends the state of this arm to the other arms after a control period (tick).
 
-    A sample is the part of the result that the peers (other sites) need for their control laws.
+    This message, the sample, has only the part of the result that their control laws need.
 
     Args:
         name: Name of this site.

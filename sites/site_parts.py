@@ -252,11 +252,11 @@ class SiteParts:
         return code.run
 
     def _connect_hand(self) -> None:
-        """Creates the live operator of the site, if the scenario has one.
+        """Creates the object through which people or programs move the arm, if there are any.
 
-        A user's class runs in this process (`HandPlayer`) or in a process of its own
-        (`RemoteHand`). Without such a class, people and programs may move the arm
-        (`HandServer`).
+        A user's operator class runs in this process (`HandPlayer`) or in a process of its own
+        (`RemoteHand`). Without such a class, people and programs may move the arm over the
+        network (`HandServer`).
         """
         name = self.name
         live_hand = self.scenario.sites[name].find_live_hand()

@@ -106,10 +106,10 @@ def run_site(
 
 
 def join_and_run(parts: SiteParts) -> int:
-    """Joins a session with the parts of a site, runs the site, and leaves the session.
+    """Joins a session, runs the control loop of the arm until its end, and leaves the session.
 
-    A site with an external arm, or with an operator program in another process, first waits for
-    the first message from there.
+    With an external arm, or with an operator program in another process, the first message from
+    there is awaited before.
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.
@@ -140,9 +140,9 @@ def join_and_run(parts: SiteParts) -> int:
 
 
 def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
-    """Announces the site, and waits for the other members and for the start of the session.
+    """Announces this process to the session, and waits for the others and for a common start.
 
-    The members agree on the epoch, the common start time of the session.
+    All processes agree on the epoch, the start time of the session.
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.

@@ -121,9 +121,10 @@ class AlignedRecords(NamedTuple):
 
     @property
     def t_s(self) -> Array:
-        """Time of every row on the ideal grid of ticks, tick / rate_hz, shape (K,), in s.
+        """Nominal time of every row, tick / rate_hz, shape (K,), in s.
 
-        A tick that was computed late has the same time as one that was computed punctually.
+        A tick is a period of the control loop. If it was computed late, its nominal time is the
+        same.
         """
         return self._ticks / self.rate_hz
 
@@ -178,7 +179,7 @@ class AlignedRecords(NamedTuple):
         return is_known_at_start & is_known_at_end
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Marks the rows in the last seconds of the run that are recorded, not interpolated.
+        """Marks the rows in the last seconds of a run that were recorded, not interpolated.
 
         Metrics of the end of a run, such as the last error, use these rows alone.
 

@@ -278,9 +278,9 @@ class PlacedArm:
 
 
 class EndEffectorRows(NamedTuple):
-    """Motion of an end effector over K poses.
+    """Position and velocity of an end effector (the tip of an arm) in K poses.
 
-    The planar arm moves in two coordinates, and a chain in three.
+    The planar arm moves in two coordinates, and a chain of joints in three.
 
     Attributes:
         position: Position in the frame of the base, shape (K, 2) or (K, 3), in m.
@@ -315,7 +315,7 @@ class EndEffectorRows(NamedTuple):
 
 
 class PlanarArmRows(NamedTuple):
-    """The planar arm with two joints, for computations over K poses at once.
+    """Model of the planar arm with two joints that is evaluated in K poses at once.
 
     In contrast to `PlacedArm`, every array has a row for each pose. `ChainArmRows` has the same
     methods for arms with more joints.
@@ -341,10 +341,10 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """Marks the parameters on which the gravity torque depends, shape (5,).
+        """Marks the parameters of the arm on which the gravity torque depends, shape (5,).
 
         The entries are True for theta_4 and theta_5, the products of masses and lever arms. The
-        other parameters describe inertia alone.
+        other three describe inertia alone.
         """
         return np.arange(5) >= 3
 
@@ -665,7 +665,7 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """Settings of an arm that follows the end effectors of other arms, such as its axes.
+        """Settings for following other arms with the end effector (tip), such as its axes.
 
         None if the arm follows other arms joint by joint.
         """
@@ -710,9 +710,10 @@ class ChainArmRows(NamedTuple):
         return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
-        """Returns the same chain without the inertia of the drives and without friction.
+        """Returns a model of the same arm without friction and without its motors' inertia.
 
-        The torque of this chain is linear in the parameters theta, as estimation requires.
+        The torque of this model is linear in the parameters theta (masses and inertias), which
+        is required for estimating them.
         """
         return self._replace_in_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
 
@@ -919,9 +920,10 @@ class ChainArmRows(NamedTuple):
         return lower_stop - upper_stop
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns position, velocity and Jacobian of the end effector in each of K poses.
+        """Returns position, velocity and Jacobian of the end effector (tip) in each of K poses.
 
-        All are expressed in the frame of the base.
+        The Jacobian is the matrix from joint velocities to the velocity of the end effector.
+        All are expressed in the frame of the arm's base.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -1046,7 +1048,7 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     """Returns the positions of the base, the joints and the end effector, for drawing an arm.
 
-    Lines through these points, in their order, are the links.
+    Lines between successive points are the links of the arm.
 
     Args:
         arm: The arm.
@@ -1173,9 +1175,10 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
-    """Returns the base parameters of a chain by a QR decomposition (Gautier 1991).
+    """Finds the base parameters of a serial arm by a QR decomposition (Gautier 1991).
 
-    A column of the stacked regressors that depends on the columns before it belongs to a
+    Base parameters are the combinations of masses and inertias that joint torques determine. A
+    column of the stacked regressors that depends on the columns before it belongs to a
     parameter that torques do not determine by itself.
 
     Args:

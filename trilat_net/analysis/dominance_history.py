@@ -34,10 +34,9 @@ RAMP_TIME_TOLERANCE_S = 5e-10
 
 
 class DominanceHistory(NamedTuple):
-    """Dominance factors with which a site follows its P peers, over time.
+    """Weights (dominance factors) over time with which an arm follows each of P other arms.
 
-    A dominance factor is the weight with which an arm follows a peer, another site. The peers
-    are in scenario order.
+    A factor lies between 0 and 1. The other arms (peers) are in scenario order.
 
     Attributes:
         alpha: Factors at every row, shape (K, P).
@@ -126,9 +125,9 @@ def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
-    """Finds the slave that several users control together, and the users.
+    """Finds the slave arm that several users control together, and these users.
 
-    A user moves the arm of a master.
+    Each user moves the arm of a master, and the slave follows the masters.
 
     Args:
         scenario: The description of the experiment.
@@ -344,9 +343,9 @@ def list_losses(log: Log) -> list[PeerLoss]:
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Lists how the scenario plans to change the dominance factors of a site.
+    """Lists the changes of dominance factors that the scenario plans for an arm.
 
-    They are the weights with which the site follows its P peers.
+    They are the weights with which the arm follows its P peers, the other arms.
 
     Args:
         scenario: The description of the experiment.
@@ -367,10 +366,10 @@ def drop_finished_ramps(
     ramps: Sequence[DominanceRamp],
     from_s: float,
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Simplifies the history of dominance factors before a given time.
+    """Removes changes of dominance factors that were complete before a given time.
 
-    Ramps that have finished before this time are left out, and the start factors are changed so
-    that the factors from this time on stay the same.
+    A ramp is a linear change of the factors, the weights with which an arm follows others. The
+    start factors are changed so that the factors from this time on stay the same.
 
     Args:
         start: Factors at the start of the session, shape (P,).
@@ -496,11 +495,10 @@ class _LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of sites that follow each other, and that follow nobody else.
+    """Finds the groups of arms that follow each other, and that follow nobody else.
 
-    A site is the process that runs one arm. It may follow another site directly or through
-    further sites. If there are several groups, the weights of the sites in the energy function
-    V are not unique.
+    An arm may follow another one directly or through further arms. If there are several groups,
+    the weights of the arms in the energy function V are not unique.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

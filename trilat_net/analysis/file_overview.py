@@ -81,7 +81,7 @@ class _Messages(NamedTuple):
 
 
 class FileInventory:
-    """What one or several MCAP files contain, apart from the meaning of their messages.
+    """Contents of one or several MCAP files: channels, message counts, times and damage.
 
     MCAP is the file format of the logs. Several files are treated as the parts of one log.
 
@@ -449,9 +449,9 @@ def _describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Collects how completely a site was recorded, and how punctual its control loop was.
+    """Collects how completely an arm was recorded, and how punctual its control loop was.
 
-    The timing is None in virtual time, in which no clock is read.
+    The timing is None in a simulation, in which no clock is read.
 
     Args:
         log: The log of the run.
@@ -544,9 +544,9 @@ def _compute_percentiles(
 
 
 def _count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks that a site executed, as the site itself reported.
+    """Returns how many control periods (ticks) an arm's process executed, by its own report.
 
-    The site reports it at the end of a run, in its event "end".
+    The process reports the number at the end of a run, in its event "end".
 
     Args:
         log: The log of the run.

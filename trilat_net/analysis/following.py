@@ -243,9 +243,10 @@ class TaskFollowing:
         return self.compute_joint_torque(rows, y)
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
-        """Returns the joint torque J'f that acts like a force f at the end effector.
+        """Returns the joint torque J'f that acts like a force f at the end effector (tip).
 
-        The shape is (K, n), in N m.
+        J is the Jacobian, from joint velocities to the velocity of the tip. The shape is (K,
+        n), in N m.
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -255,7 +256,7 @@ class TaskFollowing:
         return torque
 
     def project_torque(self, torque: Array) -> Array:
-        """Returns the force at the end effector that corresponds to a joint torque, in N.
+        """Returns the force at the end effector (tip) that corresponds to a joint torque, in N.
 
         `compute_joint_torque` is the reverse conversion.
 
@@ -319,9 +320,9 @@ def build_following(
     qd: Array,
     Lambda: Array,
 ) -> Following:
-    """Builds the object that computes how an arm moves its joints to follow other arms.
+    """Returns the object that computes how an arm moves its joints to follow other arms.
 
-    An arm follows either joint by joint or with its end effector.
+    An arm follows either joint by joint or with its end effector (tip).
 
     Args:
         arm: The arm. If it has a task for its end effector, it follows with the end effector.

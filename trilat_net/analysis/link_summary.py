@@ -174,10 +174,9 @@ class _Arrivals(NamedTuple):
 
 
 def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
-    """Reads from a log which samples of other sites arrived at a site, and when.
+    """Reads from a log which messages of other arms arrived at an arm, and when.
 
-    A site is the process that runs one arm, and a sample is the state that it sends in every
-    tick.
+    Such a message, called a sample, has the state that an arm sends in every control period.
 
     Args:
         log: The log of the run.
@@ -213,9 +212,7 @@ def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
 
 
 def _count_sent(log: Log, peer: str, newest_sample: int) -> int:
-    """Returns the number of samples that a peer has sent, as far as the log shows.
-
-    A sample is the state that a site publishes in one tick of its control loop.
+    """Returns how many messages with its state an arm has sent, as far as the log shows.
 
     Args:
         log: The log of the run.
@@ -310,7 +307,9 @@ class ValueStatistics(NamedTuple):
 
 
 class _AgeHistogram(NamedTuple):
-    """Number of ticks by the age of the sample in use, in bins of equal width.
+    """Number of control periods (ticks) by the age of the other arm's state that was used.
+
+    The bins have equal width.
 
     Attributes:
         first_ms: Lower edge of the first bin, in ms.
@@ -324,9 +323,10 @@ class _AgeHistogram(NamedTuple):
 
 
 class ClockSummary(NamedTuple):
-    """The clock of a link's sender, compared with the receiver's.
+    """Difference between the clocks of the two ends of a network link.
 
-    docs/reference/metrics.md defines the quantities under `clock.*`.
+    Measured one-way delays are only as accurate as this difference. docs/reference/metrics.md
+    defines the quantities under `clock.*`.
 
     Attributes:
         offset_us: Last estimate of the sender's clock minus the receiver's, in microseconds.
@@ -401,10 +401,10 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 
 
 class SampleCounts(NamedTuple):
-    """Numbers of samples of a link, counted from the receiver's records.
+    """Numbers of sent, used, lost and late messages of a network link, from the receiver's log.
 
-    A sample is the state that a site publishes in one tick. docs/reference/metrics.md
-    defines the numbers under `samples.*`.
+    Such a message, called a sample, has the state of an arm in one control period.
+    docs/reference/metrics.md defines the numbers under `samples.*`.
 
     Attributes:
         sent: Samples that the peer sent.

@@ -56,9 +56,9 @@ def list_remarks(log: Log) -> tuple[str, ...]:
 
 
 def _describe_programs(log: Log) -> str:
-    """Returns a remark that the judgement takes no account of how programs react to the arms.
+    """Returns a remark that programs moved arms, and that the judgement ignores how they react.
 
-    It is empty if no program moved an arm.
+    The remark is empty if no program moved an arm.
     """
     sites = list_program_sites(log)
     if not sites:

@@ -66,10 +66,10 @@ class RunView:
         self._results: dict[Callable[[RunView], Any], Any] = {}
 
     def compute_once(self, compute: Callable[["RunView"], T]) -> T:
-        """Returns the result of a function of this view, which is called only the first time.
+        """Returns the result of a function of this run, which is called only the first time.
 
-        Later calls with the same function return the stored result. Metrics share intermediate
-        results in this way.
+        Later calls with the same function return the stored result, so that several metrics
+        share intermediate results.
 
         Args:
             compute: The function.
@@ -80,9 +80,9 @@ class RunView:
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
-        """The sites with records, by name.
+        """Motion and torques of every arm with records, by the name of its site (process).
 
-        Metrics of the other sites have a reason in place of a value.
+        Metrics of the other arms have a reason in place of a value.
         """
         runs = {}
         for site, records in align_records(self.log).items():
@@ -113,9 +113,9 @@ class RunView:
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """Summaries of all links (delays, losses, clocks) by name, computed at first use.
+        """Summaries of network links (delays, losses, clocks) by name, computed at first use.
 
-        The name "m1->s" denotes the link from site m1 to site s.
+        The name "m1->s" denotes the link from arm m1 to arm s.
         """
         return {link.name: link for link in summarise_links(self.log)}
 

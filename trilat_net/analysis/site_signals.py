@@ -122,9 +122,9 @@ class JointError(NamedTuple):
 
 
 def find_last_error(log: Log) -> JointError | None:
-    """Finds the largest error |e| of all sites in the last second of their records.
+    """Finds the largest tracking error of all arms in the last second of their records.
 
-    It shows whether the arms agree at the end of the run.
+    This error shows whether the arms agree at the end of the run.
 
     Args:
         log: Log of the run.
@@ -171,9 +171,9 @@ def largest_remaining_error(site_log: SiteLog) -> Array:
 
 
 def settling_time_s(site_log: SiteLog) -> float | None:
-    """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
+    """Returns the time from which on the error of an arm stays small, its settling time, in s.
 
-    From this time on, the arm stays close to its reference for the rest of the run.
+    This is the last time at which an error exceeded `SETTLED_ERROR_RAD`.
 
     Returns:
         The time. 0 if no error ever exceeded the bound. None if the last record has an error

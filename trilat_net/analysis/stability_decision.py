@@ -190,9 +190,9 @@ class RunFindings(NamedTuple):
 
     @property
     def all_proofs(self) -> list[str]:
-        """Phrases for everything that proves the control loop stable, exact roots last.
+        """Phrases that name every proof that the control loop is stable, exact roots last.
 
-        Empty if there is no proof. A decision joins the phrases to the text after "rests on:".
+        Empty if there is no proof. The texts appear after "rests on:".
         """
         proofs = list(self.proofs)
         if self.has_stable_roots:
@@ -202,7 +202,7 @@ class RunFindings(NamedTuple):
 
     @property
     def has_stable_roots(self) -> bool:
-        """True if exact roots were computed, and prove that small motions die away.
+        """True if the exact roots (growth rates) of the loop prove that small motions die away.
 
         Roots that are not exact never count as a proof.
         """
@@ -210,9 +210,9 @@ class RunFindings(NamedTuple):
 
 
 def decide_stability(run: RunFindings) -> StabilityDecision:
-    """Decides whether a run is stable, settled, not stable, or open.
+    """Decides from all evidence whether a run is stable, settled, not stable, or open.
 
-    The module's docstring defines the words.
+    The module's docstring defines these words.
 
     Args:
         run: Everything that is known about the run.
@@ -451,7 +451,7 @@ def _describe_pushes(run: RunFindings) -> str:
 
 
 def _explain_open(run: RunFindings) -> str:
-    """Returns why a run is open although nothing contradicts a stable run.
+    """Returns the reason why the stability of a run stays open although nothing contradicts it.
 
     Several reasons may apply. The first that applies is stated, from proofs that disagree with
     the run to an end of the run that does not settle the question.
@@ -482,9 +482,10 @@ def _explain_open(run: RunFindings) -> str:
 
 
 def _estimate_needed_s(run: RunFindings) -> float | None:
-    """Returns the length of a run in which the slowest root decays clearly, in s.
+    """Returns how long a run must be so that its slowest motion decays clearly, in s.
 
-    The root decays by itself only after the last action of an operator and the last change.
+    The motion decays by itself only after the last action of an operator and the last change of
+    a setting.
     """
     roots = run.roots
     if roots is None or roots.rate_per_s is None or not roots.rate_per_s < 0.0:

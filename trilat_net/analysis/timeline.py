@@ -145,7 +145,7 @@ class _ModeInterval(NamedTuple):
 
 
 class StatedModel(NamedTuple):
-    """A delay model that the scenario, or a change during the run, prescribes for a link.
+    """Delay model that the scenario, or a change during the run, prescribes for a network link.
 
     Measured delays are compared with it.
 
@@ -223,7 +223,7 @@ def list_stated_models(
 
 
 def recorded_end_s(log: Log) -> float:
-    """Returns the time at which the last record's tick period ends, in s.
+    """Returns the time at which the last recorded control period of a run ends, in s.
 
     If there are no records, it is the planned end of the run.
 
@@ -290,9 +290,9 @@ class _RaisedAlarm(NamedTuple):
 
 
 def list_alarms(log: Log) -> list[_RaisedAlarm]:
-    """Lists the alarms of all sites, in the order of their start.
+    """Lists the alarms of all arms, in the order of their start.
 
-    If somebody ordered a site to stop, the reason of the alarm names this person.
+    If somebody ordered an arm to stop, the reason of the alarm names this person.
 
     Args:
         log: The log of the run.

@@ -228,7 +228,7 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Returns the running sum of the amounts of K - 1 tick periods, shape (K,), from 0 on.
+    """Sums amounts, such as energies per control period, up to each time, shape (K,), from 0.
 
     Args:
         amounts: Amount in each period, shape (K - 1,).
@@ -610,7 +610,9 @@ def _weigh_site(
 
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
-    """Interpolates a curve linearly at other times. At the same times it stays unchanged.
+    """Interpolates a curve linearly at other times, to add curves of arms with different rates.
+
+    At times that the curve has, its values stay unchanged.
 
     Args:
         times: Times of the result, shape (T,), in s.
@@ -629,9 +631,10 @@ def _trace_weights(
     *,
     paper_weights: bool,
 ) -> tuple[Array, Array]:
-    """Returns the weights beta of all N sites in the total energy V, at the ticks of one site.
+    """Returns the weight of each of N arms in the total energy V, at the ticks of one arm.
 
-    The weights follow from the dominance factors, which may change during the run.
+    V is the energy function of the stability proof. The weights beta follow from the dominance
+    factors, which may change during the run.
 
     Args:
         energies: Energies of the N sites.
@@ -693,7 +696,9 @@ def _interpolate_dominance(
     t_s: Array,
     ahead_s: float = 0.0,
 ) -> Array:
-    """Returns the matrix of dominance factors of a group of sites over time, shape (T, N, N).
+    """Returns the matrix of dominance factors of a group of arms over time, shape (T, N, N).
+
+    A dominance factor is the weight, from 0 to 1, with which one arm follows another.
 
     Args:
         energies: Energies of the N sites. Peers outside the group are left out.

@@ -161,7 +161,7 @@ class SiteConstants(NamedTuple):
 
     @property
     def adapts(self) -> Bools:
-        """Marks the parameters of the arm that the law estimates while it runs, shape (P,).
+        """Marks the parameters of the arm that the law learns while it runs, shape (P,).
 
         These are the parameters with a positive adaptation gain Gamma. The others keep the
         value that the scenario gives them.
@@ -266,10 +266,10 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """Functions that translate errors of the shared coordinates to the joints of the arm.
+        """Functions that convert errors between the arms to errors of this arm's joints.
 
-        Sites that follow each other with their end effectors use other functions than sites
-        that follow joint by joint.
+        Arms that follow each other with their end effectors need other functions than arms that
+        follow joint by joint.
         """
         records = self.records
         c = self.constants
@@ -535,7 +535,7 @@ class FunctionalParts(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """Energy V_i of the site in the stability proof: the sum of its parts, in J.
+        """Energy V_i of one arm in the stability proof: the sum of its parts, in J.
 
         The shape is (K,), with one entry per record.
         """
@@ -584,7 +584,8 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
 def _dot_rows(x: Array, y: Array) -> Array:
     """Returns the scalar product of two vectors in each of K rows, shape (K,).
 
-    Both arguments have the shape (K, n), or one of them (n,) if it is the same in all rows.
+    An example is the power, joint torque times joint velocity. Both arguments have the shape
+    (K, n), or one of them (n,) if it is the same in all rows.
     """
     return sum_rows(x * y)
 
@@ -1083,8 +1084,8 @@ def _singular_pose_power(
 def measure_torque_error(site: SiteMotion) -> Array:
     """Computes how much the recorded torques differ from those that the control law demands.
 
-    The law is evaluated from the recorded motion, within its limits. A large error means that
-    the site ran another law than the scenario states.
+    The law is evaluated again from the recorded motion. A large error means that the log was
+    changed, or that the arm ran another law than the scenario states.
 
     Args:
         site: Motion of the site, with K records.
@@ -1198,9 +1199,10 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
-    """Evaluates the control law at the end of every period, before the error e jumps.
+    """Evaluates the control law at the end of every control period, before its error jumps.
 
-    The records contain only the values after the jump, which the next sample of a peer causes.
+    The error e jumps when the next message of another arm comes into use. Records contain only
+    the values after the jump.
 
     Returns:
         Torque of the law, Eq. (13), within its limit, shape (K - 1, n), in N m.

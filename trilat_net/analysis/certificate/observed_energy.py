@@ -71,9 +71,9 @@ class ObservedFinding(StrEnum):
 
 
 class _EnergyCurve(NamedTuple):
-    """An energy over time, of a kind that a control law declares.
+    """One kind of energy over time that a control law declares, such as a stored energy.
 
-    Some laws store energy, or keep account of the energy on the way between sites.
+    Some laws also keep account of the energy that is on its way to another arm.
 
     Attributes:
         kind: "line" for the energy on the way from a peer to the site, "known" for the part of
@@ -214,9 +214,9 @@ class ObservedEnergy(NamedTuple):
 
 
 class _SiteBooks(NamedTuple):
-    """The energies that a law declares at its ticks, and those that the records show.
+    """Energies that a control law declares, next to those that follow from the records.
 
-    Arrays have the shape (K,) and are in J. They start at the first tick of the site.
+    Arrays have the shape (K,) and are in J. They start at the first tick (control period).
 
     Attributes:
         t_s: Times of the ticks, in s.
@@ -261,7 +261,7 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
-    """Computes the energies that a site's law declares, and the same energies from the records.
+    """Computes the energies that a control law declares, and the same energies from records.
 
     A law that is wrong may declare energies that did not flow. The comparison reveals this.
 
@@ -534,10 +534,9 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
 
 
 def _largest_residual_j(account: _SiteBooks) -> float:
-    """Returns the largest error over time in the energies that a law declares, in J.
+    """Returns the largest error in the energies that a control law declares, in J.
 
-    The error is the difference between the energy that the law dissipated and the sum of its
-    other energies.
+    The energies must add up: the dissipated energy equals the sum of the others.
     """
     return float(np.abs(account.residual).max())
 

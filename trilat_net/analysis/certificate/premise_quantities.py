@@ -53,9 +53,9 @@ class MissingFunctional(NamedTuple):
 
 
 class LawQuantities(NamedTuple):
-    """Evidence for the condition that every control law is one for which V exists.
+    """Evidence on whether the energy function V exists for the control law of every arm.
 
-    V, the energy function of the stability proof, exists for adaptive laws only.
+    V, the energy of the stability proof, exists for adaptive laws only.
 
     Attributes:
         missing: Sites without V, grouped by the reason. The premise holds if there are none.
@@ -154,7 +154,7 @@ class DominanceQuantities(NamedTuple):
 
 
 class AgeRange(NamedTuple):
-    """Range of the ages of the states that one site uses of another one.
+    """Smallest and largest age of the states of another arm that a control loop used.
 
     The age is the time since the state was sent: the delay that the control law experiences.
 
@@ -236,10 +236,9 @@ class CutTorque(NamedTuple):
 
 
 class TorqueQuantities(NamedTuple):
-    """Evidence for the premise that every arm received the whole torque of its control law.
+    """Evidence on whether every motor delivered the torque that its control law demanded.
 
-    An actuator cuts off a torque above its limit. The arm then receives another torque than the
-    proof assumes.
+    A motor cuts off a torque above its limit. The stability theorem assumes that it does not.
 
     Attributes:
         cut: Sites whose torque was cut off. The premise holds if there are none.
@@ -291,10 +290,10 @@ class AxisQuantities(NamedTuple):
 
 
 class SingularPoseQuantities(NamedTuple):
-    """Evidence for the premise that no arm came near a singular pose.
+    """Evidence on whether any arm came near a singular pose, such as a stretched arm.
 
-    In such a pose the end effector cannot move in every direction, however fast the joints
-    turn.
+    The end effector cannot move in every direction there, however fast the joints turn. The
+    stability theorem does not cover such poses.
 
     Attributes:
         near_s: Time from which the arm of a site was near a singular pose, in s, by site.

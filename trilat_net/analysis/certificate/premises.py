@@ -166,7 +166,7 @@ class FunctionalFacts(NamedTuple):
 
 
 class _RunFacts(NamedTuple):
-    """Everything from a log that is needed to check the conditions of the stability theorem.
+    """Quantities of a run that are needed to check the conditions of the stability theorem.
 
     The theorem says that an energy function V of all arms does not rise by itself.
 
@@ -670,10 +670,10 @@ FUNCTIONAL_CHECKS = (
 def _examine_stretch(
     energies: Mapping[str, SiteEnergy], from_s: float, to_s: float
 ) -> PresentStretch:
-    """Finds from when on all sites follow in a span without absences, and which delays vary.
+    """Finds from when on all arms followed each other in an interval, and which delays varied.
 
-    The stability theorem applies to such a span if all sites follow their peers with constant
-    delays.
+    The stability theorem applies if all arms follow with constant delays. During the interval,
+    no process was absent.
 
     Args:
         energies: Energies of every site.

@@ -189,8 +189,8 @@ class Certificate(Result):
     def _doubts(self) -> tuple[str, ...]:
         """Sentences on findings that contradict a stable run. Empty if there are none.
 
-        Such findings are a rise of V, declared energies that are wrong or negative, and a
-        damaged or incomplete log.
+        Such findings are a rise of the energy function V, declared energies that are wrong or
+        negative, and a damaged or incomplete log.
         """
         doubts = []
         if self.verdict.finding is StabilityFinding.BROKEN:
@@ -231,10 +231,9 @@ class Certificate(Result):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run as a whole: stable, settled, not stable, or open.
+        """The judgement of the run in one word: stable, settled, not stable, or open.
 
-        `stability_decision` explains how the findings of the certificate lead to this
-        judgement.
+        `stability_decision` explains how the findings lead to this judgement.
         """
         return self.decision.stability
 
@@ -242,7 +241,8 @@ class Certificate(Result):
     def passed(self) -> bool:
         """True if the run is judged stable, in the strict sense.
 
-        A run that merely settled has not passed. `accepts` is less strict.
+        A run that merely settled, so that its motion became slow, has not passed. `accepts` is
+        less strict.
         """
         return self.accepts(())
 
@@ -303,7 +303,8 @@ class Certificate(Result):
     def accepts(self, accepted: Collection[str]) -> bool:
         """Returns True if the run is stable, or has another judgement that the user accepts.
 
-        A run with a broken energy balance or a changed log is never accepted.
+        For example, a user may accept "settled". A run with a broken energy balance or a
+        changed log is never accepted.
 
         Args:
             accepted: Further judgements to accept: "settled" for a run that slowed down and
@@ -330,7 +331,7 @@ def certify(
     min_coverage: float = MIN_COVERAGE,
     own_laws: bool = False,
 ) -> Certificate:
-    """Issues the stability certificate of a recorded run.
+    """Judges from a log whether a run was stable, and collects every reason.
 
     The log may be incomplete or empty. The run is not repeated with small disturbances, and the
     characteristic roots of its linearised loop are not computed. These checks can be added
@@ -510,9 +511,10 @@ They decide whether the records are false, whether V can be judged, and whether 
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
-    """Finds the largest rise of V above an earlier minimum, and the sources of its energy.
+    """Finds the largest rise of the energy function V above an earlier minimum.
 
-    The work of operators and environments is subtracted from V before.
+    The work of operators and environments is subtracted before, because V may rise by it. The
+    sources of the remaining energy are also found.
 
     Args:
         balance: Energy balance of all sites.

@@ -22,7 +22,7 @@ from .premise_quantities import MissingFunctional, PremiseQuantities
 class StabilityFinding(Enum):
     """Possible results of examining V, the energy function of the stability proof, over a run.
 
-    The names of the members, in small letters, are the values of `verdict` in the JSON output.
+    JSON output has the names of the members, in small letters, as values of `verdict`.
     """
 
     COVERED = auto()
@@ -38,10 +38,10 @@ class StabilityFinding(Enum):
 
 
 class FunctionalRise(NamedTuple):
-    """Largest rise of the energy function V that nobody supplied from outside.
+    """Largest rise of the energy function V by energy that nobody supplied from outside.
 
-    The work of operators and environments is subtracted from V, the total energy of the arms in
-    the stability proof. What remains must not rise by itself.
+    V is the total energy of the arms in the stability proof. The work of operators and walls is
+    subtracted from it. What remains must not rise.
 
     Attributes:
         from_s: Time of the minimum of V before the rise, in s.
@@ -58,9 +58,9 @@ class FunctionalRise(NamedTuple):
 
 
 class UnsuppliedGrowth(NamedTuple):
-    """Finding that V grew at the end of a run by energy that nobody supplied from outside.
+    """Finding that the energy function V grew at the end of a run without supplied energy.
 
-    V is the energy function of the stability proof, which must not rise by itself.
+    V belongs to the stability proof, and must not rise unless an operator or wall does work.
 
     Attributes:
         energy_j: Size of the growth, in J.
@@ -254,10 +254,10 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Sentences that say why the records do not suffice to judge the run.
+        """Sentences that say why the log does not suffice to call the run stable.
 
-        Examples are a log that was changed after the run, or too many missing records. A run
-        with such a reason is not called stable. Empty if the records suffice.
+        Examples are a log that was changed after the run, or too many missing records. Empty if
+        the records suffice.
         """
         return list(find_hook("doubt evidence")(self))
 

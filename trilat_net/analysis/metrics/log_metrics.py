@@ -180,9 +180,9 @@ class LogMetrics(Result):
         }
 
     def _list_reasons(self) -> dict[str, str]:
-        """Returns the reason for each missing number, by the path of the number in the JSON.
+        """Returns the reason why each missing number is missing, by its path in the JSON.
 
-        A missing number is null in the JSON, which does not tell why it is missing.
+        The number itself is null in the JSON.
         """
         metrics_by_path = {"run.": self.run}
         for kind, metrics_by_name in self._subjects.items():
@@ -238,9 +238,9 @@ class LogMetrics(Result):
         return {name: metrics[key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
-        """Returns one number of a quantity for the whole run.
+        """Returns one number of a metric for the whole run, such as the largest of all errors.
 
-        The numbers of sites, links or walls are reduced to their maximum or sum, see
+        Numbers of arms, network links or walls are reduced to their maximum or sum, see
         `_reduce_to_run`.
 
         Args:
@@ -287,10 +287,10 @@ def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) 
 # overflow and NaN do not warn: a metric that is not finite becomes a reason
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def compute_log_metrics(log: Log) -> LogMetrics:
-    """Computes all metrics of a recorded run.
+    """Computes all metrics of a recorded run, such as the largest error of each arm.
 
-    The log may be torn, short or empty. A number that it does not determine is replaced by the
-    reason.
+    The log may be torn, short or empty. A number that the log does not determine is replaced by
+    the reason.
 
     Args:
         log: The log of the run.

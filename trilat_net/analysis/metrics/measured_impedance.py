@@ -171,7 +171,9 @@ def _estimate_at_line(
     X: Complex,
     Y: Complex,
 ) -> FrequencyResponse:
-    """Returns the ratio of Y to X at one frequency, from the spectra of the segments.
+    """Estimates the ratio of two signals at one frequency, for example torque to velocity.
+
+    The spectra of several segments are averaged, which reduces the effect of noise.
 
     Args:
         frequency_hz: The frequency.
@@ -289,7 +291,7 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the ratio at a joint: "N m s/rad" for an impedance (torque per velocity).
+        """Unit of the ratio: "N m s/rad" for an impedance, which is torque per velocity.
 
         Empty for a reflection, which is a ratio of two torques.
         """

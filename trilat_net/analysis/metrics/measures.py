@@ -24,7 +24,7 @@ from ..run_view import RunView
 
 
 class Metric(NamedTuple):
-    """The value of a metric for one arm, link, wall or run: a number, or why there is none.
+    """Value of one metric, such as the largest error of an arm, or the reason for having none.
 
     Attributes:
         value: The number, which is finite. None if there is none.

@@ -453,9 +453,9 @@ class ParameterEstimates(NamedTuple):
     base: _BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
-        """Returns the parameter estimates of the arm as plain values, ready for JSON.
+        """Converts what the control law learnt about the arm to plain values for JSON.
 
-        The key "base" is left out if these values do not exist.
+        The key "base" is left out if there are no base parameters.
         """
         content = self._asdict()
         del content["base"]
@@ -676,9 +676,9 @@ def _compute_parameter_energy(
     Quantity("late_samples", "late samples", "", "sum"),
 )
 def _measure_network(view: RunView, name: str) -> MetricValues:
-    """Measures a link: the effective delay, lost samples and bursts of losses.
+    """Measures a network link: the effective delay, lost messages and bursts of losses.
 
-    The effective delay is the age of the sample that the receiver uses.
+    The effective delay is the age of the other arm's state that the receiver uses.
 
     Args:
         view: The run.

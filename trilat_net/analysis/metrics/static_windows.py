@@ -282,10 +282,9 @@ def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
 
 
 class SharingRatio(NamedTuple):
-    """Force sharing at a joint: what one operator feels of a torque at another site.
+    """Measured force sharing at a joint: how much one operator feels of a torque elsewhere.
 
-    It is measured in a static window, a time in which all arms rest, at a joint at which
-    exactly two sites are loaded.
+    It is measured while all arms rest, at a joint at which exactly two arms are loaded.
 
     Attributes:
         from_s: Time of the window's first tick, in s.
@@ -326,7 +325,7 @@ class SharingRatio(NamedTuple):
 
 
 class JointLoad(NamedTuple):
-    """The torques of all loaded sites at a joint, while all arms rest.
+    """External torques on all arms at one joint, while all arms rest.
 
     At rest the weighted sum of these torques should be zero, by the equation of the module's
     docstring.
@@ -403,10 +402,10 @@ def count_static_windows(view: RunView) -> Metric:
     Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
 )
 def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
-    """Measures how well operators feel the torque that the sharing of forces predicts.
+    """Measures how well the torques that operators feel agree with the predicted sharing.
 
-    Operators feel the torques on other arms according to the dominance factors, which are the
-    weights with which the arms follow each other.
+    Operators feel torques on other arms according to the dominance factors, the weights with
+    which the arms follow each other.
 
     Args:
         view: The recorded run.

@@ -97,10 +97,11 @@ class Pencil(NamedTuple):
 
     @property
     def rate_matrix(self) -> Array:
-        """The matrix E of the loop E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
+        """Matrix E of the loop equation E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
 
-        x is the state, with n entries, and T_k are the delays. E is diagonal. An entry is 1 if
-        the state has a rate of change, and 0 if an algebraic equation determines the state.
+        x is the state of all arms, with n entries, and T_k are the network delays. E is
+        diagonal. An entry is 1 if the state has a rate of change, and 0 if an algebraic
+        equation determines the state.
         """
         if self.E is None:
             return np.eye(len(self.A))
@@ -227,9 +228,10 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 
 
 class CharacteristicRoot(NamedTuple):
-    """A characteristic root s of a loop: small motions may be proportional to exp(s t).
+    """A characteristic root s of the control loop: small motions may change like exp(s t).
 
-    A complex root comes with its conjugate, which is not listed.
+    They grow if the real part of s is positive. A complex root comes with its conjugate, which
+    is not listed.
 
     Attributes:
         s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
@@ -616,9 +618,9 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 
 
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
-    """Returns guesses of the nonzero roots, by falling real part.
+    """Returns approximations of the roots of the control loop, by falling real part.
 
-    They are eigenvalues of the discretised loop, of which the smallest are left out: these
+    They are eigenvalues of the discretised loop. The smallest are left out, as these
     approximate the roots that are zero by structure.
 
     Args:
@@ -659,9 +661,9 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
 
 
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
-    """Returns True if every root is close to a root of the previous order.
+    """Returns True if two successive approximations of the roots agree.
 
-    The order of the discretisation is doubled until two successive results agree.
+    The order of the approximation is doubled until this is so.
 
     Args:
         previous: Roots from the previous order.
@@ -719,9 +721,9 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
 
 
 def chebyshev_nodes(order: int) -> Array:
-    """Returns the points of [-1, 1] at which the discretisation evaluates delayed states.
+    """Returns the points in [-1, 1] at which delayed states are evaluated.
 
-    These are the extremal nodes cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
+    These Chebyshev nodes are cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
 
     Args:
         order: Degree of the polynomial through the points.
@@ -734,9 +736,9 @@ def chebyshev_nodes(order: int) -> Array:
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix that interpolates values at the Chebyshev nodes at other points.
+    """Returns the matrix that interpolates a polynomial between the Chebyshev nodes.
 
-    Its product with the values at the nodes is the value of the polynomial at the points.
+    Multiplied by the values at the nodes, it gives the values at the points x.
 
     Args:
         order: Degree of the polynomial.

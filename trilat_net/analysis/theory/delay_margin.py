@@ -56,7 +56,9 @@ frequency.
 
 
 class _AxisCrossing(NamedTuple):
-    """A crossing of the imaginary axis by one or more pairs of roots, as the delay increases.
+    """Network delay at which roots of the loop cross the imaginary axis, as the delay grows.
+
+    The loop becomes stable or unstable there.
 
     Attributes:
         delay_s: The common delay, in s.
@@ -107,10 +109,10 @@ class _DelayInterval(NamedTuple):
 
 
 class DelayMargin(NamedTuple):
-    """The delays for which a control loop is stable if all its links have the same delay.
+    """Network delays, equal on all links, for which the coupled arms are stable.
 
-    As the delay grows, characteristic roots of the loop may cross the imaginary axis. The loop
-    becomes unstable if roots cross to the right, and may become stable if they return.
+    As the delay grows, characteristic roots of the loop may cross the imaginary axis. The arms
+    become unstable if roots cross to the right, and may become stable if they return.
 
     Attributes:
         intervals: Intervals of stable delays, by rising delay. Empty if the loop is unstable
@@ -219,7 +221,7 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
-    """Returns the number of roots with a positive real part.
+    """Returns how many roots of the loop have a positive real part, so that motions grow.
 
     More and more of the rightmost roots are computed, until one of them is stable.
     """
@@ -241,9 +243,9 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 
 def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
-    """Finds the delays, common to all links, at which roots cross the imaginary axis.
+    """Finds the network delays, equal on all links, at which stability can change.
 
-    The stability of a loop can change only at such delays.
+    At such a delay, a root of the loop crosses the imaginary axis.
 
     Args:
         loop: The loop. Its own delays are ignored.
@@ -312,7 +314,8 @@ def _is_same_crossing(last: _AxisCrossing, crossing: _AxisCrossing) -> bool:
 class _FrequencySweep:
     """Eigenvalues of the open-loop frequency response G(j w) over the frequency w.
 
-    `_find_axis_crossings` uses them to find the frequencies at which a modulus is 1.
+    `_find_axis_crossings` searches them for the frequencies at which a modulus is 1, because
+    the loop can become unstable only there.
 
     Args:
         pencil: Matrices of the loop, with a single delay.

@@ -139,8 +139,7 @@ def _find_nearest_equilibrium(
 ) -> Equilibrium:
     """Finds the pose nearest to a given pose in which all arms rest.
 
-    It is found by Gauss-Newton iteration. Each step is the smallest step that solves the
-    linearised equations of the equilibrium.
+    Each Gauss-Newton step is the smallest step that solves the linearised equations of rest.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
@@ -246,7 +245,8 @@ def _shift_equilibrium(
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
     """Returns vectors of different lengths as the rows of one array, padded with zeros.
 
-    Arms with different numbers of joints can then share an array.
+    Arms with different numbers of joints can then share an array. For example, (1, 2) and (3,)
+    give [[1, 2], [3, 0]].
 
     Args:
         rows: The vectors.
@@ -335,7 +335,7 @@ def _compute_deviation(
     start: Equilibrium,
     rest: Equilibrium,
 ) -> Array:
-    """Returns how far the start poses are from an equilibrium, as states of the loop.
+    """Returns how far the start poses of the arms are from a pose of rest, as loop states.
 
     All velocities are zero. The shape is (states,).
     """
@@ -353,10 +353,10 @@ def _compute_deviation(
 
 
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
-    """Returns the part of a constant deviation that remains for ever, shape (states,).
+    """Returns the part of an initial deviation that never decays, shape (states,).
 
-    `_predict_from_start` has the equation. The result is None if the loop has no roots at zero,
-    or too few vectors for them.
+    This part belongs to the roots at zero. `_predict_from_start` has the equation. The result
+    is None if the loop has no roots at zero, or too few vectors for them.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
     is_zero = values <= _FLAT * values[0]
@@ -593,9 +593,10 @@ def _describe_pose(coordinates: int, *, task: bool) -> str:
 
 
 def _reach_pose(site: SiteSetup, pose: Array) -> Array:
-    """Returns joint angles at which a site's end effector has a pose, in rad, shape (n,).
+    """Returns joint angles for a desired pose of the end effector, in rad, shape (n,).
 
-    Gauss-Newton steps from the start pose find the nearest such angles.
+    This is inverse kinematics: Gauss-Newton steps from the start pose find the nearest such
+    angles.
 
     Args:
         site: Setup of a site that follows in task space.
@@ -646,10 +647,10 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
-    """Returns the equilibrium nearest to the end of a run.
+    """Finds the pose of rest nearest to the end of a simulated run.
 
     The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If it
-    diverges, the equilibrium is predicted from the start poses.
+    diverges, the pose is predicted from the start poses.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
     affordable_extension = _MAX_RUN_TICKS / ticks

@@ -314,10 +314,10 @@ _SAME_ROOT = 1e-6
 
 
 class SamplesInUse(NamedTuple):
-    """Which samples of the other sites each site uses, in every tick of a span of time.
+    """Which message of each other arm every arm uses, in every tick of a span of time.
 
-    A tick is one period of a site's control loop. A sample is the state that a site sends in
-    one tick. At the beginning of the span, all sites have a tick.
+    A tick is one period of a control loop. A sample is the message with an arm's state in one
+    tick. At the beginning of the span, all arms have a tick.
 
     Attributes:
         span_s: Length of the span, in s.
@@ -548,9 +548,10 @@ class _SpanMap:
         self.neutral = self._find_constant_motions(loop)
 
     def _find_sent_values(self, loop: CoupledTicks, j: int) -> Array:
-        """Returns the combinations of a site's states that act on other sites.
+        """Returns the combinations of an arm's states that act on the other arms.
 
-        They are an orthonormal basis of the row space of all effects of the site.
+        Only these must be stored for past ticks. They are an orthonormal basis of the row space
+        of all effects of the arm.
 
         Args:
             loop: The loop.
@@ -587,10 +588,10 @@ class _SpanMap:
         return np.linalg.qr(columns)[0]
 
     def build_constant_columns(self, X: Array) -> Array:
-        """Returns columns for motions in which all states have been constant.
+        """Returns columns of states for motions in which nothing has changed in the past.
 
-        Each column contains what all sites sent at their last ticks, as far back as it is used,
-        and their states. Here every past tick of a site has the same states.
+        Each column contains what all arms sent at their last ticks, as far back as it is used,
+        and their states.
 
         Args:
             X: The constant states, shape (n, columns), with the n states of all sites.
@@ -670,9 +671,9 @@ class _SpanMap:
         divided: bool = True,
         sizes: list[Array] | None = None,
     ) -> tuple[Array, list[Array]]:
-        """Computes how small motions develop over the analysed span of time.
+        """Computes how small motions of the arms develop over the analysed span of time.
 
-        For computation the span is split into parts.
+        If they grow over one span, they grow without limit, because the spans repeat.
 
         Args:
             V: Motions at the start of the span, shape (size, columns).

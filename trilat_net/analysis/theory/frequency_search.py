@@ -201,10 +201,10 @@ def _refine(
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns the same function of frequency, with its values at some frequencies stored.
+    """Returns a frequency response with its values at given frequencies stored.
 
-    The values are computed once, and returned whenever the function is called with this very
-    array.
+    Several analyses evaluate the response at the same frequencies, and the values are then
+    computed only once. They are used whenever the function is called with this very array.
 
     Args:
         response: The function of frequency.

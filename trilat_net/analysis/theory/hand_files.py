@@ -19,10 +19,10 @@ _KEYS = ("mass_kg", "damping_n_s_m", "stiffness_n_m")
 
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
-    """Reads the mass, damping and stiffness of hands that were measured before.
+    """Reads the mass, damping and stiffness of human hands that were measured before.
 
-    The analysis of ports uses them to check stability against these hands instead of all
-    passive operators.
+    Stability can then be checked against these hands instead of every passive operator, which
+    is less strict.
 
     Args:
         files: Paths of JSON files that `trilat identify hand --json` wrote.

@@ -100,10 +100,10 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """The pose of each end effector at the equilibrium, if end effectors follow each other.
+        """Pose of each arm's end effector (tip) at rest, if end effectors follow each other.
 
-        There is an array for each site (process that runs one arm), with the pose that the site
-        sends to the other sites. The arrays are empty if joints follow each other instead.
+        There is an array for each arm. The arrays are empty if joints follow each other
+        instead.
         """
         sites = self.conditions.sites
         if not sites[0].layout.task:
@@ -121,7 +121,7 @@ class LinearAnalysis(Result):
 
     @property
     def verdict(self) -> str:
-        """Whether small motions die away: "stable", "unstable" or "at the edge".
+        """Whether small motions of the arms die away: "stable", "unstable" or "at the edge".
 
         The roots in `decisive` determine the verdict.
         """
@@ -129,7 +129,7 @@ class LinearAnalysis(Result):
 
     @property
     def is_far_from_rest(self) -> bool:
-        """True if the run ends too far from the analysed equilibrium to be judged by it.
+        """True if the run ends too far from the analysed pose of rest to be judged by it.
 
         The limit is `NEAR_REST_RAD`. False for a scenario without a run, which has no final
         pose.
@@ -169,9 +169,9 @@ class LinearAnalysis(Result):
         return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
 
     def headline(self) -> str:
-        """Returns the scenario, the verdict and the delay margin in one line.
+        """The scenario, the verdict and the delay margin in one line, for the user.
 
-        The delay margin is the delay of all links up to which the loop stays stable.
+        The delay margin is the delay of all network links up to which the arms stay stable.
         """
         return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 

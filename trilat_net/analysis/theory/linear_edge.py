@@ -71,9 +71,9 @@ def find_rightmost_root(
     *,
     sampled: bool,
 ) -> CharacteristicRoot | None:
-    """Returns the rightmost characteristic root of the loop about an equilibrium.
+    """Returns the fastest growing (rightmost) root of the control loop about a pose of rest.
 
-    Its real part is the growth rate of small motions: the loop is stable if it is negative.
+    Its real part is the growth rate of small motions. If it is negative, they die away.
 
     Args:
         conditions: The numbers of the loop.
@@ -93,8 +93,8 @@ def find_rightmost_root(
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     """Finds the state of a run in which an end effector has penetrated a wall most deeply.
 
-    Only sampled walls are considered, which compute their force once per tick (period of the
-    control loop).
+    The linear analysis then includes the stiffness of the wall. Only sampled walls count, which
+    compute their force once per tick (period of the control loop).
 
     Args:
         scenario: Description of the experiment.
@@ -172,9 +172,9 @@ class LinearEdge(NamedTuple):
 
 
 class EdgeScan(NamedTuple):
-    """The values of a key, within a range, at which a loop becomes stable or unstable.
+    """Values of one setting, within a range, at which coupled arms become stable or unstable.
 
-    A loop with no edge in the range is stable in the whole range, or unstable.
+    Without such a value, the arms are stable in the whole range, or unstable.
 
     Attributes:
         key: Key of the scenario, such as "control.d".
@@ -217,9 +217,10 @@ def iterate_linear_edges(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> Iterator[LinearEdge]:
-    """Yields the values of a scenario's key at which the loop becomes stable or unstable.
+    """Yields the values of one setting at which coupled arms become stable or unstable.
 
-    The range is scanned, and each change of stability is then located. The values rise.
+    The range of values is scanned, and each change of stability is then located. The values
+    rise.
 
     Args:
         scenario: The description of the experiment.
@@ -271,17 +272,19 @@ class _GrowthPoint(NamedTuple):
 
     @property
     def is_unstable(self) -> bool:
-        """True if small motions grow at this value of the setting.
+        """True if small motions of the arms grow at this value of the setting.
 
-        An edge lies between two neighbouring values of which only one is unstable.
+        The limit of stability lies between two neighbouring values of which only one is
+        unstable.
         """
         return self.growth_per_s > 0.0
 
 
 class _GrowthRate:
-    """Growth rate of a loop as a function of a key's value.
+    """Function that computes the growth rate of small motions for a value of one setting.
 
-    Each evaluation follows the equilibrium from the one of the previous evaluation.
+    Each evaluation starts from the pose of rest of the previous one, because the pose may
+    depend on the setting.
 
     Args:
         scenario: The experiment.

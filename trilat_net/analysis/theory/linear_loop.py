@@ -63,10 +63,10 @@ class SiteJacobian(NamedTuple):
 
     @property
     def output(self) -> Array:
-        """Matrix that computes what the site sends to the other sites from its own states.
+        """Matrix from the states of an arm to the numbers that the arm sends to the others.
 
-        The site sends the pose that it shares, the velocity of this pose, and the external
-        torque that it reflects, with m numbers each. The matrix has the shape (3 m, states).
+        The numbers are its pose, the velocity of this pose, and the external torque, m of each.
+        The matrix has the shape (3 m, states).
         """
         rates = self.rates
         samples = np.vstack([rates.x, rates.xd, rates.reflected])
@@ -95,7 +95,8 @@ class DelayedTerm(NamedTuple):
 class LinearLoop(NamedTuple):
     """Linear model of the coupled arms near a pose of rest, with network delays.
 
-    The module's docstring has the equation and the notation.
+    It shows whether small motions about this pose grow. The module's docstring has the equation
+    and the notation.
 
     Attributes:
         names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".
@@ -134,7 +135,7 @@ class LinearLoop(NamedTuple):
 
 
 def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
-    """Returns a matrix with given blocks on its diagonal, and zeros elsewhere.
+    """Returns a matrix with given matrices (blocks) on its diagonal, and zeros elsewhere.
 
     `scipy.linalg.block_diag` does the same, but takes twenty times as long for small blocks.
 

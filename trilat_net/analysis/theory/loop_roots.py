@@ -136,7 +136,9 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
 
 
 def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
-    """Finds the control loop at the end of a recorded run, and the pose of rest near its end.
+    """Finds the control loop at the end of a recorded run, and the nearest pose of rest.
+
+    The linear analysis of this loop shows whether the run is stable.
 
     Args:
         log: The log of the run.
@@ -191,9 +193,10 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
 
 
 def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
-    """Finds the control loop at the end of a simulated run, and the rest next to its end.
+    """Finds the control loop at the end of a simulated run, and the nearest pose of rest.
 
-    The loop is that of a log of the same run. The code of imported control laws is executed.
+    The linear analysis of this loop shows whether the run is stable. The code of imported
+    control laws is executed.
 
     Args:
         scenario: The experiment.
@@ -677,7 +680,7 @@ def _has_sampled_wall(scenario: Scenario) -> bool:
 
 
 def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _EndState | None:
-    """Finds the deepest state of arms that chatter at a sampled wall, in the last quarter.
+    """Finds the deepest state of arms that chatter at a wall in the last quarter of a run.
 
     The mean of such a motion may be beside the wall, where the loop is another one. The deepest
     state is inside the wall, so the wall's stiffness is part of the linearised loop.

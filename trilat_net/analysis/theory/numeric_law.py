@@ -141,7 +141,7 @@ class NumericLaw:
         return slice(start, start + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:
-        """Returns the law. It stands for the function that builds the law of a site."""
+        """Returns the law itself, where other code expects a function that builds the law."""
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:

@@ -424,7 +424,7 @@ def compute_effective_delay(
     site: str,
     link: LinkBase,
 ) -> _EffectiveDelay:
-    """Computes the age of a peer's samples at the ticks of a site that use them.
+    """Computes how old the other arm's state is when a control loop uses it.
 
     The ages are those of the run. If the delay repeats after a longer time, they are those of a
     whole period, because the loop goes on after the run.

@@ -82,9 +82,9 @@ def freeze_external_torques(
 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Builds the linear model of the arms and their coupling, without operators.
+    """Builds the linear model of the arms and their coupling, without operators and walls.
 
-    Operators and environments act at its ports, the joints, and are not part of it.
+    Operators and walls act at its ports, the joints, and are not part of the model.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -164,10 +164,10 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
 
 
 class TwoPort(NamedTuple):
-    """Llewellyn's criterion of absolute stability for one joint of two sites.
+    """Result of Llewellyn's stability criterion for one joint of two arms.
 
-    The criterion says whether the loop is stable with every passive operator or environment at
-    each of the two joints. No operator acts at the other joints.
+    The criterion says whether the arms are stable with every passive operator or wall at both
+    joints. Nobody pushes the other joints.
 
     Attributes:
         sites: The two sites.
@@ -236,12 +236,15 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Word for a port in tables and texts: "joint", or "axis" for arms in task space."""
+        """Word for the place where an operator pushes an arm: "joint", or "axis" in task space.
+
+        In task space, arms follow each other with their end effectors (tips).
+        """
         return "axis" if self.axes else "joint"
 
     @property
     def speed(self) -> str:
-        """Symbol of the velocity of a port, for tables and figures.
+        """Symbol of the velocity at a port, the place where an operator pushes, for figures.
 
         It is "qd" for joints, and "xd" if end effectors follow each other.
         """
@@ -523,10 +526,9 @@ def _check_llewellyn(
     clamped: list[int],
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Evaluates Llewellyn's parameter of two ports over frequency.
+    """Evaluates Llewellyn's stability parameter of two joints over frequency.
 
-    The loop is stable with any passive operators at the two ports if the parameter is never
-    below 1.
+    The arms are stable with any passive operators at the two joints if it is never below 1.
 
     Args:
         Y: Admittance at all ports.
@@ -543,7 +545,7 @@ def _check_llewellyn(
 
 
 def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
-    """Returns a port analysis as plain values, ready for JSON.
+    """Converts an analysis of what operators feel to plain values for JSON.
 
     Infinite numbers become None, as JSON does not know them.
 

@@ -80,11 +80,10 @@ class Passivity(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if the loop is passive at all analysed frequencies.
+        """True if the arms are passive at all analysed frequencies: they never supply energy.
 
         This means that Y + Y^H has no negative eigenvalue, where Y is the admittance of the
-        ports and Y^H its conjugate transpose. The loop then never returns more energy than it
-        received.
+        ports and Y^H its conjugate transpose.
         """
         return not self.minima.below
 
@@ -217,7 +216,8 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
 def find_least_eigenvalue(Y: Complex) -> Array:
     """Returns the least eigenvalue of Y + Y^H at each frequency.
 
-    A response Y is passive if it is never negative. Y^H is the conjugate transpose.
+    Here Y is the admittance, from torques to velocities, and Y^H its conjugate transpose. The
+    arms are passive if the value is never negative: they never supply energy to operators.
 
     Args:
         Y: Response, shape (F, p, p).

@@ -72,9 +72,9 @@ class LoopOutput(NamedTuple):
     delayed: tuple[tuple[float, Array], ...] = ()
 
     def evaluate(self, s: Complex) -> Complex:
-        """Returns the matrix from the state to the output at complex frequencies.
+        """Returns the matrix from the state of the arms to an output at complex frequencies s.
 
-        It is C + sum_k C_k e^{-s T_k}.
+        It is C + sum_k C_k e^{-s T_k}, with the network delays T_k.
 
         Args:
             s: Complex frequencies, shape (F,), in 1/s.
@@ -551,7 +551,7 @@ class Transparency(NamedTuple):
         return self._average_magnitude(difference)
 
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
-        """Returns the magnitudes of the impedances that the operator feels at one frequency.
+        """Returns the magnitudes of the impedances that an operator feels at one frequency.
 
         They are interpolated between the computed frequencies on logarithmic axes.
 
@@ -596,11 +596,11 @@ class Transparency(NamedTuple):
 
 
 def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
-    """Computes what an operator at one site feels of another site, free and clamped.
+    """Computes what an operator feels of another arm that is free, and that is clamped.
 
-    With ideal transparency the operator would feel no impedance while the other site is free,
-    and a rigid one while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j
-    w) with the admittance Y of the loop. All other ports are free.
+    With ideal transparency the operator would feel nothing while the other arm is free, and a
+    rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j w)
+    with the admittance Y of the loop. All other ports are free.
 
     Args:
         loop: The loop.

@@ -138,10 +138,10 @@ def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
 
 
 class SiteRates(NamedTuple):
-    """Rates of a site's states, and its torques and outputs, for given arguments.
+    """Rates of change of an arm's states, with its torques and the values that it sends.
 
-    The trailing axes "..." stand for several arguments. In derivatives they have one column for
-    each entry of the argument vector.
+    The trailing axes "..." stand for several evaluations at once. In derivatives they have one
+    column for each entry of the argument vector.
 
     Attributes:
         qdd: Joint accelerations, shape (n, ...), in rad/s^2.
@@ -441,7 +441,7 @@ def _evaluate_adaptive_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """Returns True where an estimate is at its limit and its rate points beyond the limit.
+    """Returns True where a parameter estimate is at its limit and would leave its range.
 
     The adaptive law then holds the estimate (projection).
     """
@@ -584,10 +584,10 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 
 
 def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
-    """Finds estimates that rest exactly at a limit, and of which the law holds none.
+    """Finds parameter estimates at which the control law has no two-sided derivative.
 
-    The derivative of the law is one-sided there. The result is True for each such estimate,
-    shape (P,).
+    They rest exactly at a limit, and the law does not hold them. The result is True for each
+    such estimate, shape (P,).
     """
     layout = lay_out_arguments(site)
     gains = site.gains

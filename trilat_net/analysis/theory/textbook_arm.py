@@ -65,7 +65,7 @@ _INERTIA_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 
 
 def _build_cross_matrix(a: Numbers) -> Numbers:
-    """Returns the matrix A with A b = a x b for every vector b, shape (3, 3, ...).
+    """Returns the matrix A that computes a cross product, A b = a x b, shape (3, 3, ...).
 
     Args:
         a: The left factor of the cross product, shape (3, ...).
@@ -164,10 +164,11 @@ class _PlacedLink(NamedTuple):
 
 
 class PlacedChain:
-    """Dynamics of a serial arm with n joints, evaluated in given poses.
+    """Dynamics of a serial arm with n joints in given poses, such as its inertia matrix.
 
-    It is written from textbook formulas, independently of the simulation. The trailing axes
-    "..." stand for the poses. It has the same methods as the planar arm, `PlacedArm`.
+    It is written from textbook formulas, independently of the simulation, to check the
+    simulation. The trailing axes "..." stand for the poses. It has the same methods as the
+    planar arm, `PlacedArm`.
 
     Args:
         chain: Description of the links and joints.
@@ -382,7 +383,7 @@ class PlacedChain:
         return total
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector in the frame of the base, in m.
+        """Returns the position of the end effector (tip) in the frame of the base, in m.
 
         The shape is (3, ...), with one column for each set of joint angles.
         """
@@ -682,10 +683,10 @@ def _find_quaternion(R: Numbers) -> Numbers:
 
 
 def _relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
-    """Returns the rotation that turns one orientation into another, as a rotation vector.
+    """Returns the rotation vector that turns one orientation into another, in rad.
 
-    The rotation vector has the direction of the axis and the length of the angle. Its
-    components are those in the axes of the base.
+    It has the direction of the axis and the length of the angle. Its components are those along
+    the axes of the base.
 
     Args:
         other: Rotation matrix of the orientation before the rotation, shape (3, 3, ...).
@@ -743,8 +744,8 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
 class Following(NamedTuple):
     """Errors and reference motion with which an arm follows other arms.
 
-    Either its n joints follow, or its end effector along m coordinates. In the first case m is
-    n.
+    Either its n joints follow, or its end effector (tip) along m coordinates. In the first case
+    m is n.
 
     Attributes:
         x: Pose that other arms can follow, shape (m, ...).
@@ -841,7 +842,7 @@ def follow_joints(
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
-    """Returns the pose of the end effector that a site sends to its peers.
+    """Returns the pose of the end effector (tip) that an arm sends to the other arms.
 
     It is the position in m, and the rotation vector in rad if the task includes orientation.
 
@@ -866,7 +867,7 @@ def follow_in_task(
     x_des: Numbers,
     xd_des: Numbers,
 ) -> Following:
-    """Computes the errors and the reference motion with which an end effector follows a pose.
+    """Computes the errors and the reference motion of an end effector that follows a pose.
 
     The pose has m coordinates, and the arm has n joints.
 

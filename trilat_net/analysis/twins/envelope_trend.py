@@ -69,7 +69,7 @@ class EnvelopeTrend(StrEnum):
 
 
 class EnvelopeFit(NamedTuple):
-    """Trend of the magnitude of an oscillation, computed by `fit_envelopes`.
+    """Trend of an oscillation's amplitude: growing, decaying or constant. See `fit_envelopes`.
 
     The envelope is the largest magnitude of a signal in each short interval of time.
 
@@ -118,7 +118,7 @@ def fit_envelopes(
 ) -> list[EnvelopeFit]:
     """Determines whether oscillations grow, decay or stay, over the second half of a run.
 
-    The module's docstring defines the classes of the trend.
+    The module's docstring defines these classes of the trend.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
