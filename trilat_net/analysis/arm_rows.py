@@ -127,9 +127,9 @@ class PlacedArm:
     q: Numbers
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), which maps accelerations to torques, in kg m^2.
+        """Returns the inertia matrix M(q), from joint accelerations to torques, in kg m^2.
 
-        The shape is (2, 2, ...), with one matrix per record.
+        The shape is (2, 2, ...), with one matrix per pose.
 
         Args:
             theta: The five dynamic parameters of the arm, which combine masses, lengths and

@@ -152,10 +152,10 @@ class SessionProcess:
 
 
 def create_file(path: Path) -> BinaryIO:
-    """Creates a file for writing without a buffer. An earlier file of that name is deleted.
+    """Creates the file to which a process of a session writes its output.
 
-    The output of each process of a session goes to such a file, where the user finds its
-    errors.
+    The user finds the errors of the process there. The file is not buffered, so that nothing is
+    lost in a crash. An earlier file of that name is deleted.
 
     Args:
         path: Path of the file.
@@ -575,9 +575,9 @@ def _end_group(
     ends_now: Callable[[], bool],
     announce: Callable[[], None],
 ) -> None:
-    """Sends processes a signal to end, and waits until all have ended.
+    """Sends the processes of a session a signal to end, and waits until all have ended.
 
-    A process that does not end within `END_TIMEOUT_NS` is killed.
+    A process that does not end within `END_TIMEOUT_NS` is killed, so that none is left running.
 
     Args:
         starter: Starter of the processes.
@@ -740,7 +740,7 @@ class _StarterProcess:
 
 
 def _become_process(arguments: list[str], output: Path) -> None:
-    """Turns a copy of the starter into a process like one that a shell has started.
+    """Turns a forked copy of this process into a process like one that a shell has started.
 
     The copy receives its own process session, output file, signal handling and process title.
 

@@ -240,7 +240,7 @@ def _describe_untried(endpoint: str) -> DoctorFinding:
 
 
 def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
-    """Checks if this machine can listen at an endpoint, by listening there for a moment.
+    """Checks if this machine can listen at a network endpoint, by listening for a moment.
 
     The port may be in use already. An endpoint without encryption causes a warning.
 
@@ -274,9 +274,9 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 def _examine_reaching(
     endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
-    """Checks if another member of a session answers at an endpoint of TCP or TLS.
+    """Checks if another process of a session answers at a TCP or TLS endpoint.
 
-    The user learns before a session whether its members can reach each other, and whether the
+    The user learns before a session whether its processes can reach each other, and whether the
     connection is encrypted.
 
     Args:
@@ -417,10 +417,9 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
 def _examine_offsets(
     connection: Connection, clock: Clock, session: str
 ) -> Iterator[DoctorFinding]:
-    """Compares the clock of this machine with those of a session's members.
+    """Compares the clock of this machine with the clocks of a session's other processes.
 
-    The delays of messages are computed from these clocks. They are only as accurate as the
-    known offset between the clocks.
+    Measured delays of messages are only as accurate as the offset between the clocks is known.
 
     Args:
         connection: Endpoints of the session, and keys.
@@ -535,9 +534,9 @@ def examine_system() -> DoctorFinding:
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Measures how punctual the control loop is on this machine, at decreasing tick rates.
+    """Measures how punctual the control loop is on this machine, at decreasing rates.
 
-    The measurement ends at the first rate that the machine achieves.
+    The measurement ends at the first rate that the machine achieves, for example 1 kHz.
 
     Args:
         clock: Clock of this process.
@@ -679,7 +678,7 @@ class DoctorReport(Result):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all findings as plain values, with the keys of `trilat doctor --json`.
+        """Converts all findings to plain values, with the keys of `trilat doctor --json`.
 
         The only key is "findings". Its value has the rows of `to_rows`.
         """

@@ -164,9 +164,10 @@ def describe_angles(q: Sequence[float]) -> str:
 
 
 def describe_row(row: SiteRow) -> str:
-    """Returns the state of a site as one line of text, for outputs without a table.
+    """Returns the state of one arm in a session as a line of text.
 
-    The line contains only the most important columns.
+    Outputs that cannot show a table, such as a file, use it. The line contains only the most
+    important columns.
 
     Args:
         row: The texts of the row, by the headings of the columns.
@@ -209,7 +210,7 @@ def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
 
 
 class SessionDisplay:
-    """Terminal output of a session: a table of the sites, and lines above it.
+    """Terminal output of a running session: a table of the arms, and lines above it.
 
     The object is a context manager that restores the terminal.
 
@@ -256,7 +257,7 @@ class SessionDisplay:
     def show(
         self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
     ) -> None:
-        """Shows the present state of the session: a table of the sites, and alarms above it.
+        """Refreshes the table of the arms in the terminal, and the alarms above the table.
 
         An alarm remains visible as long as it is present.
 

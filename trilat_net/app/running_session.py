@@ -97,7 +97,7 @@ class ShareHistory:
         self._shares_before = self._ramp.alpha
 
     def add_change(self, change: str) -> None:
-        """Adds a change of the weights to the history, as an event of the site reports it.
+        """Adds a change of dominance factors, which an arm's process has reported as an event.
 
         Changes of other settings are ignored, and so are texts that do not describe a change.
 
@@ -111,10 +111,9 @@ class ShareHistory:
                 self._later_ramps.append(ramp)
 
     def advance_to(self, t_ns: int) -> tuple[float, ...]:
-        """Computes the dominance factors of the site at a time.
+        """Computes the dominance factors of an arm at a given time of the session.
 
-        A dominance factor is the weight with which a site follows one of its peers, the other
-        sites.
+        A dominance factor is the weight, from 0 to 1, with which the arm follows another one.
 
         Args:
             t_ns: The time, in ns after the start of the session. It must not be earlier than in
@@ -185,7 +184,7 @@ class RunningSession:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Closes the connection of the `with` block. The session itself goes on."""
+        """Closes the network connection of the `with` block. The session itself goes on."""
         opened, self._bus = self._blocks.pop()
         opened.close()
 
@@ -318,9 +317,9 @@ class RunningSession:
             say(f"{site}: {device_hand.describe()}")
 
     def stop(self, *sites: str) -> list[str]:
-        """Stops some arms at once, while the session continues.
+        """Stops some arms at once, while the other arms of the session continue.
 
-        The command `trilat stop` does the same. The other arms are not stopped.
+        The command `trilat stop` does the same.
 
         Args:
             *sites: Names of the sites whose arms are stopped. All sites if no name is given.
@@ -412,9 +411,10 @@ class RunningSession:
         )
 
     def end(self) -> list[str]:
-        """Ends the session in an orderly way, as `trilat stop --end` does.
+        """Ends the session for all arms at the same time, as `trilat stop --end` does.
 
-        All sites end at the same time of the session, about half a second from now.
+        This time is about half a second from now, so that all processes receive the request
+        before.
 
         Returns:
             One sentence per site: its reply, in the order of the sites.
@@ -488,9 +488,9 @@ class RunningSession:
         return scenario, infos
 
     def _find_members(self, bus: Bus) -> Iterator[Info]:
-        """Asks all members of the session who they are, and yields their replies.
+        """Asks all processes of the session who they are, and yields their replies.
 
-        A member may reply several times. The replies end after `REPLY_TIMEOUT_S`.
+        A process may reply several times. The replies end after `REPLY_TIMEOUT_S`.
         """
         return find_members(
             bus, self._clock, self.name, stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S
@@ -551,10 +551,10 @@ class RunningSession:
         return self._change(link.partition("->")[2], link=link, to=to)
 
     def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
-        """Changes the weights with which a site follows its peers, as `trilat set dominance`.
+        """Changes the weights with which an arm follows the other arms.
 
-        A site is the process that runs one arm. The arm follows a weighted mean of the other
-        arms. With other weights, another operator leads it.
+        With other weights, another operator leads the arm. For example, a trainer hands over to
+        a trainee. The command `trilat set dominance` does the same.
 
         Args:
             site: Name of the site.
@@ -757,7 +757,7 @@ class RunningSession:
 
     @contextmanager
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
-        """Subscribes to the weights with which a site follows the others, as a context manager.
+        """Subscribes to the weights with which an arm follows the others, as a context manager.
 
         These weights, the dominance factors, may change during the session.
 

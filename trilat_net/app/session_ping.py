@@ -139,7 +139,7 @@ class SessionPing:
 
     @property
     def _boots(self) -> set[int]:
-        """Random numbers (boots) of the processes that have replied as members of the session.
+        """Random numbers that identify the processes that have replied as session members.
 
         Only pings of these processes are evaluated.
         """
@@ -247,7 +247,7 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures the network of a running session once, and returns round trip times and delays.
+    """Measures round trip times and delays in the network of a running session once.
 
     Args:
         connection: Endpoints of the session, and keys.

@@ -252,7 +252,7 @@ def _explain_judgement(certificate: Certificate) -> str:
 
 
 def describe_settling(certificate: Certificate) -> str:
-    """Returns what was observed of a run that settled, and that no proof exists, as a clause.
+    """Returns a clause on what was observed of a run that settled, without a stability proof.
 
     A settled run has become slow, or its motion decays. Its arms need not be at rest.
 
@@ -589,9 +589,10 @@ def _compute_rest(balance: EnergyBalance) -> Array:
 
 
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
-    """Returns an entry for V at a tick: its name, and its value in J.
+    """Returns the name and the value in J of the energy function V at one tick.
 
-    A V that is smaller than rounding errors counts as 0.
+    The name is for example "V at 2.5 s". A tick is a control period. A V that is smaller than
+    rounding errors counts as 0.
     """
     energy_j = float(balance.V[index])
     shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0

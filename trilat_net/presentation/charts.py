@@ -94,7 +94,7 @@ class _PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Computes the charts of the page that reports a run, from the run's log.
+    """Computes from a log the charts of the web page that reports the run.
 
     The numbers become tables, from which the scripts of the page draw the charts in the
     browser.
@@ -326,7 +326,7 @@ class ChartBuilder:
         yield from self._chart_joints("control", "control torque", "N m", torques)
 
     def _build_timing_charts(self) -> Iterator[Chart]:
-        """Yields the charts of sample ages, delays, lateness of ticks and computing time.
+        """Yields charts of the network delays and of the timing of the control loops.
 
         Charts of delays need a delay that varies, and charts of the loop need a run in real
         time.

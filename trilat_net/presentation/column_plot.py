@@ -249,7 +249,7 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
-    """Returns the error message for an unknown column, with the most similar name.
+    """Returns the error message for an unknown column, which suggests a similar name.
 
     The user has probably misspelled the name.
     """

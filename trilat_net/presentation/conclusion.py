@@ -39,7 +39,7 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """The text and the files with which a finished run is presented to its user.
+    """Text and files with which a finished run is presented to its user.
 
     `conclude` creates this object after a run was recorded.
 
@@ -79,7 +79,7 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """The file that the user should open first: the HTML report of the run.
+        """File that the user should open first: the HTML report of the run.
 
         If no report was written, it is the path of the first log file.
         """
@@ -97,7 +97,7 @@ class Conclusion(CheckReport):
         return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
-        """Returns the table of the sites, one dictionary per site.
+        """Returns the table of the arms, one dictionary per arm.
 
         The keys are the headers of the columns. The values are texts, as in the terminal.
         """
@@ -220,7 +220,7 @@ def conclude(
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Simulates the run of a log without the people or programs that moved the arms.
+    """Simulates the run of a log again without the people or programs that moved the arms.
 
     The difference between the two runs shows how far the operators displaced the arms.
 

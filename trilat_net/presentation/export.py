@@ -302,9 +302,9 @@ def name_inside(table: Table, name: str, separator: str) -> str:
 
 
 def read_texts(column: Column) -> NDArray[Any]:
-    """Reads the texts of a column as an array of NumPy strings, shape (K,).
+    """Reads the texts of a table column as an array of NumPy strings, shape (K,).
 
-    Formats for numbers store texts in this way.
+    Formats for numbers, such as .npz, store texts in this way.
 
     Args:
         column: Column of a table with K rows.

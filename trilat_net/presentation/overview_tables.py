@@ -68,7 +68,7 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
 
 
 def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
-    """Yields the lines about the recorded session: its name, scenario, duration and records.
+    """Yields lines about a recorded session: its name, scenario, duration and records.
 
     A scenario is the text that defines the run. Its hash shows whether the log contains the
     text that was executed.
@@ -275,7 +275,7 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    """Yields the versions of the software and the machine that recorded the log.
+    """Yields the versions of the software and the machine that recorded a log.
 
     A run can be repeated bit for bit only with the same versions and the same arithmetic.
     """

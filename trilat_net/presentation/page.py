@@ -52,7 +52,7 @@ def write_report(
     twin: Log | None = None,
     verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
-    """Writes report.html and summary.json into a folder.
+    """Writes the report of a run, report.html and summary.json, into a folder.
 
     The page shows the results of a run to people, and the JSON file has the same numbers for
     programs.

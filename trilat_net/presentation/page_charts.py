@@ -45,7 +45,7 @@ _ARM_NOTE = (
 
 
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
-    """Renders the first view of the report: the moving arms, who leads, errors and delays.
+    """Renders the top of a report: the moving arms, who leads, errors and delays.
 
     Somebody who opens the page should understand the run without reading further.
 

@@ -63,7 +63,7 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HistogramSeries(msgspec.Struct, frozen=True):
-    """A line of a histogram, which shows how often the times of a site lie in each bin.
+    """One line of a histogram, which shows how often the times of an arm lie in each bin.
 
     The bins belong to the chart, and are the same for all of its lines.
 

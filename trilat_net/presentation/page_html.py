@@ -65,7 +65,7 @@ def render_note(text: str) -> Markup:
 
 
 def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
-    """Renders a table with two columns: the name and the text of each fact.
+    """Renders a table with two columns: the name and the text of each fact about a run.
 
     If the table is wider than the screen, it scrolls inside its own frame.
     """
@@ -106,7 +106,7 @@ def render_legend(columns: Mapping[str, str]) -> Markup:
 
 
 def render_scrolling(content: Markup, label: str) -> Markup:
-    """Renders HTML in a region that scrolls sideways, also by the keyboard.
+    """Renders wide content in a region that scrolls sideways, also by the keyboard.
 
     The page itself then never becomes wider than the screen.
 
@@ -173,5 +173,5 @@ def format_numbers(values: Iterable[float] | None) -> str:
 
 
 def to_percent(share: float | None) -> float | None:
-    """Converts a share from 0 to 1 to percent. None, an unknown share, stays None."""
+    """Converts a share from 0 to 1 to percent: 0.05 gives 5. None (unknown) stays None."""
     return None if share is None else 100.0 * share

@@ -55,7 +55,7 @@ class _Lead(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """True if no dominance factor of the slave changes during the run.
+        """True if no weight with which the slave arm follows the others changes during the run.
 
         A sentence then says all, and a bar over time would show nothing.
         """
@@ -125,7 +125,7 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that are needed to draw the shares as a line.
+    """Returns the indices of the points that are needed to draw weights over time as a line.
 
     Points on a straight line between others are left out. The first and the last are kept.
     """

@@ -78,7 +78,7 @@ The clause about a run that converged has numbers, see `_explain_end`.
 
 
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
-    """Renders the judgement whether the run was stable, with what the judgement rests on.
+    """Renders the judgement whether a run was stable, with the evidence for it.
 
     The page of a run begins with this judgement.
 
@@ -258,7 +258,7 @@ class _KeyNumber(NamedTuple):
 
 
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
-    """Renders the numbers that describe the run best: its errors and the delay in use.
+    """Renders the most important numbers of a run: its errors and the delay in use.
 
     They stand below the judgement, for readers who read nothing else.
 
@@ -340,10 +340,10 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
 
 
 def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumber]:
-    """Returns the largest distance of the slaves from where the others were at the same time.
+    """Returns a text on how far the slave arms were from the others at the same time.
 
-    The error compares a slave with what its peers sent some time ago. A reader who sees the
-    arms apart on the screen looks for the distance at the same time.
+    The tracking error compares a slave with what the other arms sent some time ago. A reader
+    who sees the arms apart on the screen looks for the distance at the same time.
 
     Args:
         log: Log of the run.
@@ -380,9 +380,9 @@ def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
 
 
 def _describe_delay(facts: JsonObject) -> _KeyNumber:
-    """Returns the mean age of the samples that the controllers used, and its range.
+    """Returns a text on the mean age and the range of ages of the states that were used.
 
-    The age of a sample is the delay that a controller experiences.
+    The age of another arm's state is the delay that a controller experiences.
     """
     ages_ms = [link["age_ms"] for link in facts["links"].values()]
     means_ms = [age["mean"] for age in ages_ms if age["mean"] is not None]

@@ -210,7 +210,8 @@ def _list_pushes(log: Log) -> Iterator[_RunMoment]:
 def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
     """Returns the intervals of time in which a condition holds, as start and end in s.
 
-    Interruptions that are shorter than `_PAUSE_S` do not divide an interval.
+    For example, an operator pushes. Interruptions that are shorter than `_PAUSE_S` do not
+    divide an interval.
 
     Args:
         t_s: Times of K records, shape (K,).

@@ -67,9 +67,9 @@ def explain_no_functional(scenario: Scenario) -> str:
 def describe_missing_functionals(
     missing: Sequence[premise_quantities.MissingFunctional],
 ) -> str:
-    """Returns for which arms the energy function of the stability proof is missing, and why.
+    """Returns a text on the arms for which the stability proof has no energy function.
 
-    A run with such an arm is judged without the energy function.
+    The text says why. A run with such an arm is judged without the energy function.
 
     Args:
         missing: Sites of these arms, grouped by the reason.

@@ -121,7 +121,7 @@ def open_rerun(
 
 
 def _require_display(options: ViewerOptions) -> None:
-    """Checks that there is a display if the viewer would open a window.
+    """Checks that the machine has a display if the viewer Rerun would open a window.
 
     Without a display, the viewer itself fails with an obscure message.
 
@@ -138,7 +138,7 @@ def _require_display(options: ViewerOptions) -> None:
 
 
 def make_application_id(path: Path) -> str:
-    """Returns the name under which Rerun stores the settings of a log's views.
+    """Returns the name under which the viewer Rerun stores the layout of a log.
 
     It is the name of the log, with only the letters that Rerun allows.
 
@@ -204,7 +204,7 @@ _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 
 
 class _PlotCurves(NamedTuple):
-    """The curves that show the numbers of one channel in a plot.
+    """Curves of a plot in the viewer Rerun, which show the numbers of one channel.
 
     A channel is a series of messages with a topic.
 
@@ -349,7 +349,7 @@ def _get_channel_name(topic: str) -> str:
 
 
 def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
-    """Returns a row for each quantity that control laws send to other sites.
+    """Returns a row of plots for each quantity that control laws send to other arms.
 
     The rows are in the order in which the laws declare the quantities. The metadata of a
     channel has the name and the unit of its quantity.

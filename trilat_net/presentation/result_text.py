@@ -69,7 +69,7 @@ class TextTable(NamedTuple):
 
     @property
     def to_the_right(self) -> list[bool]:
-        """For each column, True if its cells are aligned to the right, as numbers are.
+        """For each table column, True if its cells are aligned to the right, as numbers are.
 
         If `align` has fewer letters than there are columns, its last letter holds for the
         others.

@@ -317,9 +317,9 @@ def name_joints(log: Log) -> list[str]:
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns titles for the coordinates with which the arms follow each other.
+    """Returns titles for the joints or axes with which the arms follow each other.
 
-    They are joints, or axes of the task space if the arms follow each other's end effectors.
+    Axes are those of the task space, if the arms follow each other's end effectors.
 
     Args:
         log: Log with the arms.
@@ -554,7 +554,7 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that contains only the reason why there is nothing to draw.
+    """Returns a figure that contains only a text: the reason why there is nothing to draw.
 
     A command that writes a figure thus always writes a file.
 
@@ -696,7 +696,7 @@ def time_figure(
     height_in: float,
     interval_s: tuple[float, float] | None = None,
 ) -> Iterator["TimeFigure"]:
-    """Provides an empty figure over the time of a run, for use in a `with` statement.
+    """Provides an empty figure whose panels show a run over time, for use in a `with` block.
 
     Args:
         log: Log of the run.
@@ -766,10 +766,10 @@ class TimeFigure:
         plot_decimated(axes, records.tick, records.t_s, values, **line_options)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal over time, with a panel per joint and a line per site (arm).
+        """Draws a signal over time into a row of panels, a panel per joint and a line per arm.
 
-        Times in which a site does not follow other sites are shaded, and changes of settings
-        are marked.
+        Times in which an arm does not follow other arms are shaded, and changes of settings are
+        marked.
 
         Args:
             row: The panels, as Matplotlib axes.
@@ -857,7 +857,7 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Completes the figure with time axes, a legend, and a text about marked changes.
+        """Completes a drawn figure with time axes, a legend, and a text about marked changes.
 
         A function that draws a figure calls this last.
 

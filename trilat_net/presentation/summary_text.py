@@ -81,7 +81,7 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns lines about the notable facts of a run.
+    """Returns lines about notable facts of a run, such as alarms and changed delays.
 
     They concern alarms, user code, links, changes, modes and clocks. Long lists are cut, see
     `_limit_lines`.
@@ -157,10 +157,10 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def _format_change_lines(log: Log) -> list[str]:
-    """Returns a line for each change of a setting during the run.
+    """Returns a line of text for each change of a setting during the run.
 
-    A change is a command to an arm, another delay of a link, or other weights with which an arm
-    follows the others (dominance factors).
+    A change is a command to an arm, another delay of a network link, or other weights with
+    which an arm follows the others (dominance factors).
 
     Args:
         log: Log of the run.
@@ -233,7 +233,7 @@ def _format_stated_models(states: Sequence[StatedModel]) -> str:
 
 
 def _format_clock(use: link_summary.ClockSummary) -> str:
-    """Returns a description of how far the clocks of two machines differ.
+    """Returns a text on how far the clocks of two machines differ.
 
     Measured one-way delays are only as accurate as this difference is known.
 
@@ -279,9 +279,9 @@ def _format_number(value: float) -> str:
 
 
 def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
-    """Returns the number and percentage of a link's samples that were not used, by reason.
+    """Returns number and percentage of a network link's messages that were not used, by reason.
 
-    A sample is the state that one site sends to another in each control period.
+    Such a message has the state that one arm sends to another in each control period.
 
     Args:
         use: Summary of the link.
@@ -314,7 +314,7 @@ def _limit_lines(lines: list[str]) -> list[str]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields the result of the checks of a log: a line per check.
+    """Yields the results of the checks of a log for the user, one line per check.
 
     If all checks passed, the notable facts of the run follow.
 
@@ -538,7 +538,7 @@ def _format_difference(before: object, after: object) -> tuple[str, str]:
 
 
 def compose_doctor(report: Result) -> Iterator[Block]:
-    """Yields the result of examining whether this machine is fit for a session.
+    """Yields the results of checking whether this machine is ready for a session.
 
     Each finding has a line, with a mark for good, doubtful or bad.
 
@@ -642,7 +642,7 @@ def compose_topic_delays(report: Result) -> Iterator[Block]:
 
 
 def _draw_histogram(counts: Sequence[int]) -> str:
-    """Returns a histogram as text, with a bar of up to eight eighths per bin.
+    """Draws a histogram as one line of text, with a block character for each bin.
 
     Args:
         counts: Number of messages in each bin. At least one bin must have a message.
@@ -779,7 +779,7 @@ def _explain_missing(subject: str, reason: str) -> MarkedText:
 def _compose_group(
     group: str, members: Sequence[Quantity], metrics: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a table with a row per quantity and a column per subject.
+    """Yields a table of metrics with a row per quantity and a column per arm, link or wall.
 
     Rows and columns without any number that applies to the run are left out.
 
@@ -935,7 +935,7 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
-    """Returns the cells of one frequency: frequency, gain, phase, coherence and error.
+    """Returns the table cells of one frequency: frequency, gain, phase, coherence and error.
 
     If the ratio could not be estimated, the last cell has the reason, and the others are empty.
     """

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 class TextConsole(Console):
-    """Console of the package Rich that makes control characters of all texts visible.
+    """Console of the library Rich in which control characters of texts are made visible.
 
     A text from another program thus cannot control the terminal, not even in a table.
     """
@@ -70,9 +70,9 @@ _PIPE_WIDTH = 160
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
-    """Prints a text from an unknown source as a line.
+    """Prints a text of unknown origin as a line, without harmful characters.
 
-    The text is sanitized, and Rich's markup in it is not interpreted.
+    Control characters are made visible, and Rich's markup in the text is not interpreted.
 
     Args:
         text: The line.
@@ -157,7 +157,7 @@ def print_line(text: str) -> None:
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table, as wide as the terminal permits.
+    """Prints a table that is as wide as the terminal permits.
 
     If the output is not a terminal, it is at least `_PIPE_WIDTH` wide.
 
@@ -371,7 +371,7 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Tells the user if a log file has no proper end, and which command recovers it.
+    """Tells the user if a log file was cut off, and which command recovers its contents.
 
     Nothing is printed for a complete file.
 

@@ -166,7 +166,8 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
 def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
     """Returns a sentence on a growth of the energy V that no operator or wall explains.
 
-    Such a growth is doubtful, even if the run looks stable.
+    V is the energy of the stability proof. Such a growth is doubtful, even if the run looks
+    stable.
 
     Args:
         growth: The growth at the end of the run.

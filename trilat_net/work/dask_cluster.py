@@ -148,10 +148,9 @@ def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
 
 
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns the laws whose file this process does not have, or has with other contents.
+    """Finds the users' control laws whose file this process lacks, or has in another version.
 
-    A worker without the file of a user's law could not run the study, or would compute other
-    results.
+    A worker without the right file could not run the study, or would compute other results.
 
     Args:
         laws: Name of each law, with the SHA-256 of its file.
@@ -252,7 +251,7 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`.
+        """Runs functions on the workers of a Dask cluster, as a `concurrent.futures.Executor`.
 
         A function is executed again for each call, even if the arguments are the same.
         """
@@ -269,10 +268,10 @@ class DaskCluster:
         return sum(worker["nthreads"] for worker in workers.values())
 
     def require(self, laws: Sequence[NamedCode]) -> WorkerRequirements:
-        """Determines what workers need for a study, and checks the workers that are present.
+        """Determines what workers of the cluster need for a study, and checks all present ones.
 
         A worker must have the same program, arithmetic and versions of packages as this
-        process, and the files of all imported control laws.
+        process, and the files of all imported control laws. Otherwise, results would differ.
 
         Args:
             laws: Imported control laws that the items of the study need.

@@ -131,9 +131,9 @@ def run_batch(
 
 
 class _Batch(NamedTuple):
-    """A group of items that a worker process is working on.
+    """A group of items that one worker process is working on.
 
-    If the worker dies, the items are known from here and return to the queue.
+    If the worker dies, its items are known from here and return to the queue.
 
     Attributes:
         numbers: Numbers of the items in the study, counted from 0.
@@ -481,10 +481,10 @@ class WorkerPool:
             yield number, lost(item)
 
     def _replace_executor(self, broken: Executor) -> None:
-        """Starts a new executor in place of a broken one.
+        """Starts a new pool of worker processes in place of a broken one.
 
-        Several batches of the broken executor fail one after another. Only the first failure
-        starts a new executor.
+        Several batches of the broken pool fail one after another. Only the first failure starts
+        a new pool.
 
         Args:
             broken: The broken executor.

@@ -245,7 +245,7 @@ class RunJournal(Generic[E]):
         self.done.close()
 
     def add(self, entry: E) -> None:
-        """Appends the result of a run to the file at once.
+        """Appends the result of a finished run to the journal file at once.
 
         Thus an interruption of the study cannot lose the run. A run that the journal contains
         already is ignored.

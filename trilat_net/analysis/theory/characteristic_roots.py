@@ -757,7 +757,8 @@ def chebyshev_interpolation(order: int, x: Array) -> Array:
 def chebyshev_differentiation(order: int) -> Array:
     """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes.
 
-    It turns the values at the nodes into the derivatives at the nodes.
+    Multiplied by the values at the nodes, it gives the derivatives there. Delayed motion is
+    approximated by such a polynomial.
 
     Args:
         order: Degree of the polynomial.

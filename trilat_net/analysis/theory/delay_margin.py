@@ -439,7 +439,7 @@ class _FrequencySweep:
         return self._list_delays(omega, pairs)
 
     def _list_delays(self, omega: float, pairs: int) -> list[_AxisCrossing]:
-        """Lists the delays at which roots are on the imaginary axis at a frequency.
+        """Lists the delays at which roots of the loop lie on the imaginary axis at s = j w.
 
         For each eigenvalue of modulus 1 these are the delays T with w T = phase + 2 pi k.
 

@@ -179,9 +179,10 @@ def _find_nearest_equilibrium(
 
 
 def _limit_step(step: Array) -> float:
-    """Returns the factor with which no state changes by more than `_MAX_STEP` in a step.
+    """Returns the factor by which an iteration step is reduced to change no state too much.
 
-    Long steps would leave the region in which the linearisation is useful.
+    The limit is `_MAX_STEP`. Longer steps would leave the region in which the linearisation is
+    useful.
     """
     largest = float(np.abs(step).max())
     return _MAX_STEP / max(largest, _MAX_STEP)

@@ -240,10 +240,9 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Builds the linear model of all coupled sites over one tick of their control loops.
+    """Builds the linear model of all coupled arms over one tick, a period of control loops.
 
-    The model contains each site by itself, and the effects of the sites on each other. States
-    that are constant, and states without an effect, are left out.
+    States that are constant, and states without an effect, are left out.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.

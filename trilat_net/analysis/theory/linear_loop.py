@@ -408,7 +408,7 @@ def _select_states(
     *,
     all_estimates: bool,
 ) -> SiteJacobian:
-    """Returns a site's derivatives with respect to the states that the loop keeps.
+    """Returns derivatives of an arm's motion with respect to the states that the model has.
 
     Of the parameter estimates of a chain, only independent combinations that change the torque
     at rest are kept, see the module's docstring.

@@ -167,9 +167,10 @@ class NumericLaw:
         return full_memory
 
     def iterate_memory(self, x: Array, ticks: int) -> Array:
-        """Executes the law for some ticks with constant inputs, and returns its memory.
+        """Executes a user's control law with constant inputs until its memory is steady.
 
-        The iteration ends early once the memory no longer changes.
+        The memory are the values that the law stores from one tick (control period) to the
+        next, such as an integral. The iteration ends early once they no longer change.
 
         Args:
             x: Arguments in the order of `ArgumentLayout`, shape (arguments,).

@@ -573,7 +573,7 @@ class Transparency(NamedTuple):
         return free, clamped
 
     def _average_magnitude(self, Z: Complex) -> float:
-        """Returns the mean magnitude of an impedance over the band, on logarithmic axes.
+        """Returns the mean magnitude of an impedance over a frequency band, on log axes.
 
         On these axes each decade of frequency and each decade of magnitude has the same weight.
 

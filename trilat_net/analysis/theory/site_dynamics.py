@@ -89,10 +89,10 @@ class ArgumentLayout:
         self.inputs = slice(self.states, self.external_torque.start)
 
     def peer_sample(self, index: int) -> slice:
-        """Returns where the values received from one other site are stored in the vector.
+        """Returns where the argument vector has the values received from one other arm.
 
-        The values are the pose of that site's arm, the velocity of the pose, and the external
-        torque, in this order.
+        The values are the pose of that arm, the velocity of the pose, and the external torque,
+        in this order.
 
         Args:
             index: Index of the other site, where the site itself is not counted.

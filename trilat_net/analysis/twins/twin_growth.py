@@ -232,7 +232,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def _miss_text(self) -> str:
-        """A clause on how likely random pushes of all joints miss a growth, for the user.
+        """A clause for the user on how likely random pushes fail to reveal an unstable run.
 
         Empty if each joint was pushed by itself.
         """
@@ -868,10 +868,10 @@ class PushedTwins(Result):
         return self.describe(worst) if worst else self.growth.text
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each push: what was pushed, and how its effect develops.
+        """Returns a table row for each small push: what was pushed, and how its effect evolves.
 
-        A push is a small disturbance in a repetition of the run. The keys are those of an entry
-        of `pushes` in `trilat twin --json`.
+        Each push was made in a repetition of the run. The keys are those of an entry of
+        `pushes` in `trilat twin --json`.
         """
         rows = self.growth.to_json()["pushes"]
         return [

@@ -261,7 +261,7 @@ def log_view_command(
 
 
 def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
-    """Writes the files with which other viewers show a log, and prints how to use them.
+    """Writes layout files for the viewers Foxglove and RViz, and prints how to use them.
 
     A viewer then opens with the plots of all arms, which need not be arranged by hand.
 

@@ -156,7 +156,7 @@ def list_laws() -> list[str]:
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Returns the scenarios with which a shell may complete the word that a user types.
+    """Lists the scenarios that the shell offers when the user presses the tab key.
 
     They are the shipped scenarios, and the TOML files of a folder.
 
@@ -446,9 +446,9 @@ AllOption = Annotated[
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Refuses the path of a figure that cannot be written.
+    """Refuses the path of a figure that cannot be written, before the figure is computed.
 
-    The check is made before the result is computed, which may take long.
+    The computation may take long, and would be lost.
 
     Args:
         path: Path of the figure. None if no figure was requested.
@@ -522,7 +522,7 @@ def load_chosen_scenario(
 def _refuse_double_setting(
     overrides: list[str] | None, key: str, option: str, given: float | None
 ) -> None:
-    """Refuses a setting of the scenario that the user has given in two ways.
+    """Raises an error if the user has given a setting in two ways that may contradict.
 
     For example, --duration 5 and --set duration_s=10 contradict each other.
 
@@ -569,7 +569,7 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Splits the names that an option lists: "adaptive, p_d" gives ["adaptive", "p_d"].
+    """Splits the names that a user gave in one option: "adaptive, p_d" gives two names.
 
     None, which stands for an absent option, gives an empty list.
     """
@@ -638,9 +638,9 @@ class MemberOptions(NamedTuple):
         *,
         stops: bool = False,
     ) -> "Connection":
-        """Returns the connection that the options describe, secured by the keys of the process.
+        """Returns the network connection that the options of a command describe, with its keys.
 
-        Prints a note if the keys expire soon.
+        A note for the user is printed if the keys expire soon.
 
         Args:
             listen_else: Endpoints at which to listen if the options name none.
@@ -675,7 +675,7 @@ class Reach(NamedTuple):
     keys: KeysOption = None
 
     def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
-        """Returns the connection to the session that the command line options describe.
+        """Returns the connection to a running session that the command-line options describe.
 
         If the session is encrypted, the option --keys names the keys of the command.
 
@@ -722,7 +722,7 @@ class LawFiles(NamedTuple):
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Opens a log, and warns the user if code from another person will be executed.
+        """Opens a log, and warns the user if code of another person will be executed.
 
         A log may name files with control laws, which are executed if the run is repeated.
 

@@ -28,7 +28,9 @@ _PROGRESS_LINES = 10
 def show_progress(
     label: str, print_line: Callable[[str], None], items: str = "runs"
 ) -> Iterator[Callable[[int, int], None]]:
-    """Shows progress as a bar in a terminal, and elsewhere as a few printed lines.
+    """Shows the progress of a long computation as a bar in a terminal.
+
+    Elsewhere, for example in a log file, a few lines are printed instead.
 
     Args:
         label: Label of the bar.

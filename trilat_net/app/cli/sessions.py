@@ -266,10 +266,9 @@ _OPTIONS_WITH_MODE = {
 
 
 def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
-    """Refuses options that do not belong to the selected mode of `trilat ping`.
+    """Raises an error for options that have no effect in the selected mode of `trilat ping`.
 
-    The command has modes for sessions, for ROS 2 topics and for benchmarks. An option of
-    another mode would have no effect.
+    The command has modes for sessions, for ROS 2 topics and for benchmarks.
 
     Args:
         context: The command line.
@@ -338,7 +337,7 @@ def _benchmark(
 def _ping_topic(
     topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool
 ) -> None:
-    """Measures the delay of the messages of a ROS 2 topic, and prints the result.
+    """Measures the network delay of the messages of a ROS 2 topic, and prints the result.
 
     Args:
         topic: Name of the topic.
@@ -380,7 +379,7 @@ def _ping_topic(
 def _run_far_end(
     endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
 ) -> None:
-    """Replies to benchmarks from other machines, for a time or until Ctrl-C.
+    """Replies to network benchmarks from other machines, for a time or until Ctrl-C.
 
     This is the counterpart of `trilat ping --benchmark`: it sends every message back at once.
 

@@ -94,9 +94,10 @@ def _limit_by_later(values: Ints) -> Ints:
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """Stores K messages compactly, as a table of numbers and one buffer with all payloads.
+    """K messages of a log in compact form: a table of numbers, and one buffer with contents.
 
-    Several batches may share the same buffer.
+    A Python object per message would need much more memory. Several batches may share the same
+    buffer.
 
     Attributes:
         rows: Table with a row per message, shape (K, 5). The columns are the deadline after the
@@ -121,7 +122,7 @@ class MessageBatch:
 
     @property
     def end_ns(self) -> int:
-        """Time at which the last message is due, in ns after the start of the session.
+        """Time of the last message of the batch, in ns after the start of the session.
 
         An empty batch has no such time, and raises IndexError.
         """
@@ -263,7 +264,7 @@ class BatchBuilder:
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Returns the added messages in the order in which they are played.
+        """Returns the added messages in the order in which they are replayed.
 
         Two files of a session may contain the same message, which is included only once.
 
@@ -286,7 +287,7 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Returns the indices of messages that repeat an earlier one, and need not be played.
+        """Finds messages that repeat an earlier one, and need not be replayed.
 
         Two files of a session may contain the same message.
 
@@ -305,7 +306,7 @@ class BatchBuilder:
 
 
 def _find_equal_numbers(rows: Ints) -> Ints:
-    """Finds the messages that have the same channel and number as another message.
+    """Finds the messages that have the same channel (topic) and number as another message.
 
     Such messages may be copies of each other. The messages are sorted by channel and number, so
     that equal ones are neighbours, and each one is compared with the next.

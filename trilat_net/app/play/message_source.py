@@ -173,7 +173,8 @@ class MessageSource:
     def fill(self) -> bool:
         """Fetches messages in advance from the process that reads the log, without waiting.
 
-        The bytes are read from the pipe and decoded. `poll` then returns the messages.
+        The player calls it while there is time before the next message. The bytes are read from
+        the pipe and decoded. `poll` then returns the messages.
 
         Returns:
             True if bytes were read. False if none are available now, or if enough messages have

@@ -69,7 +69,7 @@ class Pace:
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
     def later(self, length_ns: int) -> "Pace":
-        """Computes the deadlines for the next round, when a log is played in a loop.
+        """Returns the deadlines for the next round, when a log is replayed in a loop.
 
         Args:
             length_ns: Time in the log after which the next round begins, counted from the
@@ -414,7 +414,7 @@ class Player:
                 next_numbers[channel] = number + 1
 
     def _use_slack(self, due_ns: int, now_ns: int) -> bool:
-        """Does other work until shortly before a deadline.
+        """Does other work until shortly before the deadline of the next message.
 
         Such work includes replies to other programs and reading in advance. Shortly before the
         deadline, nothing may delay the player.

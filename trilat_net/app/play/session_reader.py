@@ -101,7 +101,7 @@ def parse_selection(
     duration_s: float | None,
     time: str,
 ) -> PlaySelection:
-    """Parses the options of a command that select which messages of a log are played.
+    """Parses the options of a command that select which messages of a log are replayed.
 
     The user limits the part of the session by `--start`, and by either `--stop` or
     `--duration`.

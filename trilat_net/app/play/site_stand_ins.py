@@ -345,7 +345,7 @@ class SiteStandIns:
         return True
 
     def _find_channel(self, site: str, channel: str) -> int:
-        """Returns the number of a site's channel among the played channels.
+        """Returns the number of an arm's channel (topic), such as its records, in the replay.
 
         It is -1 if the log has no such channel.
         """

@@ -371,9 +371,10 @@ def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 
 
 def _choose_plugin_site(log: Log, settings: _Settings) -> str:
-    """Returns the user whose arm the LeRobot plugin will hold.
+    """Chooses the user's arm that the LeRobot plugin, a learnt policy, will move later.
 
-    It is the user that the settings name, or else the program, or else the last user.
+    It is the arm that the settings name, or else that of the program, or else that of the last
+    user.
 
     Args:
         log: Log of a run with at least one user.
@@ -718,9 +719,9 @@ def _read_ages(log: Log, receiver: str, sender: str) -> Array:
 
 
 def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:
-    """Returns the reference q_des that the slave follows, and the names of its n numbers.
+    """Returns the pose that the slave arm follows in each frame, and the names of its numbers.
 
-    A learning program takes it as the action of the demonstrator.
+    A learning program takes this reference q_des as the action of the demonstrator.
 
     Args:
         log: Log of the run that is exported.
@@ -858,7 +859,7 @@ def _write_tables(
 def _describe_dataset(
     fps: int, names: Names, columns: Columns, episodes: int, tasks: int
 ) -> dict[str, Any]:
-    """Returns the contents of the file meta/info.json, which describes a data set in LeRobot.
+    """Returns the contents of meta/info.json, the file that describes a LeRobot data set.
 
     LeRobot is a library for learning from demonstrations of robots. It reads there how many
     episodes there are, where they are stored, and which numbers (features) each frame contains.

@@ -289,7 +289,7 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 
 def is_unsteady(ages_ms: Array) -> bool:
-    """Tells whether ages fluctuate so often that a line would look like a filled area.
+    """Returns True if ages fluctuate so often that a line would look like a filled area.
 
     The figure then draws the spread of the ages as a band.
 
@@ -364,7 +364,7 @@ def choose_bin_edges_us(log: Log) -> Array:
 
 
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
-    """Counts how many times lie in each bin of a histogram.
+    """Counts how many times lie in each bin of a histogram of control loop timing.
 
     Times below 1 us count in the first bin.
 

@@ -77,9 +77,9 @@ def _compute_largest_torque(log: Log, site: str) -> Array:
 
 
 def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
-    """Returns the age of the oldest sample in use in each record, shape (K,), in ms.
+    """Returns the age of the oldest state of another arm that a control loop used, in ms.
 
-    A record without any sample in use has the value NaN.
+    The result has a value per record, shape (K,). It is NaN while no state was in use.
     """
     ages_ms = plot_signals.sample_ages_ms(log, site)
     # NumPy prints a warning for a row of NaN only. Therefore -inf stands for unknown ages.
@@ -98,7 +98,7 @@ _PANELS = (
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the most important quantities of one run in four panels, with a line per site.
+    """Draws the most important quantities of one run in four panels, with a line per arm.
 
     The title has the judgement whether the run was stable, and the settling time.
 
@@ -197,7 +197,7 @@ def _list_lowest(panels: list[Axes], form: FigureSize) -> list[Axes]:
 
 
 def _style_run(number: int) -> dict[str, Any]:
-    """Returns the options of the line of a run.
+    """Returns colour and dashes of the line that shows one of several runs.
 
     Lines are solid until every colour is used. Further runs have the same colours with dashes.
     """
