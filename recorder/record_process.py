@@ -150,9 +150,9 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits until the session begins. If it is running already, the recorder joins it.
+        """Waits until the session begins, or joins a session that is running already.
 
-        The members of a session, the recorder included, first agree on a common start time.
+        All processes of a session, the recorder included, first agree on a common start time.
 
         Args:
             timeout_s: Longest time to wait, in s. None means no limit.

@@ -208,9 +208,10 @@ class Recording:
 
     @property
     def repaired_ns(self) -> int:
-        """Latest arrival of a missing message from any site, on the monotonic clock, in ns.
+        """Time at which the latest missing message of any site arrived, in ns.
 
-        A recorder that ends stops waiting if this lies too long ago.
+        It is a time of the monotonic clock. A recorder that ends stops waiting for missing
+        messages if it lies too long ago.
         """
         return max(repair.progress_ns for repair in self._repairs.values())
 
@@ -836,7 +837,7 @@ class RecorderReport:
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
-        """Returns the present statistics of the recording, for people who watch the session.
+        """Returns the present statistics of the recording for people who watch the session.
 
         They have, for each channel, the numbers of expected, received and missing messages, and
         the ranges of the missing ones.

@@ -269,9 +269,10 @@ class SiteReception:
         self._largest_counts[topics.EVENT] = self._event_bytes_left // _LEAST_EVENT_BYTES
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
-        """Decodes a message of the site and checks its sender and number, without counting it.
+        """Decodes a message of a site and checks its sender and number, without counting it.
 
-        The message is written to the log only if this method accepts it.
+        A site is the process that controls one arm. The message is written to the log only if
+        this method accepts it.
 
         Args:
             channel: Name of the channel in which the message arrived.
@@ -445,10 +446,10 @@ class SiteReception:
         self._event_bytes_left -= size
 
     def accept(self, channel: str, message: SiteMessage, received_ns: int) -> bool:
-        """Counts a message that the site published in the normal way, without a request.
+        """Counts a published message, and finds messages that are missing before it.
 
         A gap between its number and that of the previous message shows that messages are
-        missing.
+        missing. The method is for messages that were sent without a request.
 
         Args:
             channel: Name of the channel.
@@ -482,13 +483,13 @@ class SiteReception:
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Checks that a reply with missing messages comes from the right process of this site.
+        """Checks that a reply with missing messages comes from the right start of a process.
 
-        The reply of an earlier start of the process would contain messages with the same
-        numbers but other contents.
+        A site is the process that controls one arm. The reply of an earlier start of this
+        process would contain messages with the same numbers but other contents.
 
         Args:
-            reply: The reply.
+            reply: The reply to the recorder's request.
 
         Raises:
             WireError: The reply comes from another site, or from an earlier or later start of
@@ -501,7 +502,7 @@ class SiteReception:
             )
 
     def add_expected(self, channel: str, count: int) -> None:
-        """Takes into account that the site has published at least a given number of messages.
+        """Notes that a site has published at least a given number of messages in a channel.
 
         Expected messages that have not been received count as missing. Since a faulty site
         could state any number, the number is limited to what is possible in the scenario by
@@ -550,9 +551,9 @@ class SiteReception:
                 self.add_expected(channel, count)
 
     def _exclude_skipped_ticks(self, record: State) -> None:
-        """States that no messages exist for the ticks that the site skipped before a record.
+        """Notes that no messages exist for control periods (ticks) that the site has skipped.
 
-        A site with an external arm skips ticks that it missed. They must not count as lost
+        A site with an external arm skips ticks that came too late. They must not count as lost
         messages.
 
         Args:

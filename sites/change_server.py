@@ -196,10 +196,10 @@ class ChangeServer:
         return text, first, change
 
     def _poll(self) -> Query | None:
-        """Returns the next request. None if no request waits.
+        """Returns the next waiting request of a user. None if no request waits.
 
-        Orders to stop from other members come first, then the request that had to wait for a
-        tick without orders, and then the requests of the operator.
+        Orders to stop from other processes come first, for safety. The request that had to wait
+        for a tick without orders comes next, and then the requests of the operator.
         """
         query = self._poll_stop()
         if query is None:
@@ -247,9 +247,9 @@ class ChangeServer:
         return f"{self._site} marks tick {next_tick}"
 
     def _make_order_change(self, tick: int, order: SiteOrder) -> CoreChange:
-        """Returns the change with which the order of a user takes effect in a tick.
+        """Converts an order of a user into the change that the control loop carries out.
 
-        A user stops an arm, lets it move again, or clears a fault by such an order.
+        By such an order, a user stops an arm, lets it move again, or clears a fault.
 
         Args:
             tick: Number of the tick, a period of the control loop.

@@ -257,7 +257,7 @@ class CodeWatchdog:
             self._handler_before = None
 
     def _check(self, _number: int, _frame: FrameType | None) -> None:
-        """Raises an error in a user's code that hangs. It is the handler of the signal SIGALRM.
+        """Handles the timer signal SIGALRM: raises an error in a user's code that hangs.
 
         The signal arrives every `_CHECK_S`, also while the code is in an endless loop.
         """

@@ -194,10 +194,10 @@ class ExternalArm:
         )
 
     def poll(self) -> None:
-        """Receives the waiting measurements, and checks how long the arm has been silent.
+        """Receives measurements of an arm outside of this program, and detects its silence.
 
-        The silence is the time since the last accepted measurement. The loop calls this method
-        in every tick, a period of the control loop.
+        The silence is the time since the last accepted measurement. The control loop calls this
+        method in every tick (period).
         """
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted
@@ -215,10 +215,10 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order to the site if measurements are missing, or arrive again.
+        """Returns the order with which the control loop reacts to missing measurements.
 
-        Each order is returned once, except that "arm_lost" is repeated until the site is in the
-        mode "fault".
+        Another order follows when measurements arrive again. Each order is returned once,
+        except that "arm_lost" is repeated until the site is in the mode "fault".
 
         Args:
             mode: Present mode of the site.
@@ -394,10 +394,10 @@ class DeadManSwitch:
         return bool(holders) and not any(map(self._is_silent, holders))
 
     def poll(self) -> None:
-        """Receives the waiting reports, and updates whether the switch counts as held.
+        """Receives reports about the dead-man switch, and updates whether it is held.
 
         If a program that holds the switch has been silent for too long, the switch counts as
-        released.
+        released, because the program may have crashed.
         """
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message

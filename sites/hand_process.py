@@ -52,10 +52,10 @@ _VIEWS_KEPT = 64
 
 
 class HandProcess(SiteClient):
-    """Connects an operator that a user wrote with the site (process) whose arm it moves.
+    """Runs an operator class that a user wrote, and connects it with the arm that it moves.
 
-    The caller calls `serve` repeatedly. Each call replies to one view, a state that the site
-    has sent.
+    The arm is controlled by another process, its site. The caller calls `serve` repeatedly.
+    Each call replies to one view, a state that the site has sent.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.

@@ -277,7 +277,7 @@ class RemoteHand(HandPlayer):
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits until the operator's process announces itself.
+        """Waits until the process of the user's operator class announces itself.
 
         A session must not start before, because nobody could move the arm.
 

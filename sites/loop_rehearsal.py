@@ -16,10 +16,10 @@ from .site_loop import PeerInbox, StateBlock, run_loop
 
 
 def rehearse_loop(scenario: Scenario, name: str, clock: Clock) -> list[int]:
-    """Executes all ticks of a site in real time, without other sites.
+    """Executes the control loop of one arm in real time, to measure how punctual it is.
 
-    `trilat doctor` learns from the result whether this machine can run the site punctually. A
-    tick is one period of the control loop.
+    `trilat doctor` learns from the result whether this machine is fast enough. The loop runs
+    without other arms and without a network.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.

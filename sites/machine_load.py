@@ -41,9 +41,10 @@ class _ProcessorTimes(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "_ProcessorTimes":
-        """Parses the times from the content of /proc/stat, as proc_stat(5) describes it.
+        """Reads the idle and total processor times from the content of /proc/stat of Linux.
 
-        The first line of the file is used, which is the sum of all processors.
+        The first line of the file is used, which is the sum of all processors, see
+        proc_stat(5).
 
         Args:
             text: Content of the file.
@@ -55,7 +56,8 @@ class _ProcessorTimes(NamedTuple):
 def measure_busy_share(clock: Clock) -> float | None:
     """Measures the fraction of time in which the processors of this machine are busy.
 
-    On a busy machine, the control loops of the sites may be late.
+    It is for example 0.25 if one of four processors is always busy. On a busy machine, control
+    loops may begin their periods too late.
 
     Args:
         clock: Clock of this process.

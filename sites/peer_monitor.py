@@ -102,7 +102,8 @@ class PeerMonitor:
     def all_stored(self) -> bool:
         """True if every recorder that is present has stored all messages of this site.
 
-        It is False if no recorder is present. The site may then not end without losing data.
+        It is False if no recorder is present. The site, the process that controls the arm, may
+        then not end without losing data.
         """
         return bool(self.stored) and self.recorders <= self.stored
 
@@ -330,10 +331,9 @@ class PeerMonitor:
 
 
 def _set_membership(members: set[T], member: T, is_present: bool) -> None:
-    """Puts a member into a set if it is present on the network, and takes it out if it is not.
+    """Adds a member to a set if it is present on the network, and removes it otherwise.
 
-    A member that is already there, or already gone, changes nothing: tokens may be reported
-    twice.
+    The network may report the same presence twice. The second report changes nothing.
     """
     if is_present:
         members.add(member)

@@ -69,7 +69,7 @@ class RunOutcome(NamedTuple):
 
 
 def _summarise_loop(ticks: int, parts: SiteParts) -> str:
-    """Returns the sentence about the ticks and the dropped messages of a site at its end.
+    """Returns a sentence about the executed ticks and the dropped messages of an arm's process.
 
     The user sees there whether the control loop was punctual and whether the network lost
     messages. A tick is one period of the control loop.

@@ -421,9 +421,10 @@ class StateBlock:
             self._send_waiting_samples(send)
 
     def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends all waiting samples to the peers, and moves their records to the next block.
+        """Sends the waiting states of this arm (samples) to the other arms.
 
-        A record states when its sample was sent, so it is complete only now.
+        The records of the same control periods become complete by this, because a record states
+        when its sample was sent. They move to the next block for the recorders.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -504,9 +505,9 @@ class _LoopSite(Protocol):
         """
 
     def use_slack(self) -> bool:
-        """Does one piece of work that can wait, in the time that is left before the next tick.
+        """Does one piece of work that can wait, in the time left before the next period.
 
-        A site answers a query of a recorder for lost messages.
+        An example is to answer a recorder's request for lost messages.
 
         Returns:
             True if more work may wait.

@@ -67,10 +67,9 @@ from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """Options of the user about how a site joins a session and waits for others.
+    """Options of the user about how an arm's process joins a session and waits for others.
 
-    A site is a process that runs one arm and its control loop. The options come from the
-    command line of `trilat site`.
+    Such a process is called a site. The options come from the command line of `trilat site`.
 
     Attributes:
         session: Name of the session.
@@ -291,7 +290,7 @@ class SiteParts:
         )
 
     def _connect_outside_arm(self) -> None:
-        """Makes the site receive measurements and switch reports, if its arm is external.
+        """Connects the site to the driver of an external arm, and to its dead-man switch.
 
         `arm` and `switch` stay None for an arm that the site simulates, or that has no such
         switch.

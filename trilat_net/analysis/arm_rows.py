@@ -235,9 +235,10 @@ class PlacedArm:
         return 0.0 * v
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns the joint accelerations under a torque, shape (2, ...), in rad/s^2.
+        """Returns the joint accelerations of the arm under a torque, in rad/s^2.
 
         The accelerations qdd solve the equation of motion M qdd + C qd + G = torque, Eq. (8).
+        The shape is (2, ...).
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -264,9 +265,10 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian J of the end effector's position: its velocity is J qd.
+        """Returns the matrix J from joint velocities to the velocity of the end effector (tip).
 
-        The shape is (2, 2, ...), in m/rad. Rows are x and y, columns are the two joints.
+        J is called the Jacobian. The shape is (2, 2, ...), in m/rad. Rows are x and y, columns
+        are the two joints.
         """
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
@@ -360,7 +362,7 @@ class PlanarArmRows(NamedTuple):
         return PlacedArm(self.g, self.lengths_m, q.T)
 
     def weightless(self) -> "PlanarArmRows":
-        """Returns the same arm without gravity.
+        """Returns a model of the same arm without gravity.
 
         The torque of such an arm is linear in the reference velocity v and acceleration a, so
         that the effects of parts of a motion can be computed separately and added.
@@ -368,7 +370,7 @@ class PlanarArmRows(NamedTuple):
         return self._replace(g=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Returns the product M(q) x of the inertia matrix and a vector, in each of K poses.
+        """Multiplies the inertia matrix M(q) by a vector x, in each of K poses.
 
         With velocities, the products are momenta, and with accelerations they are torques.
 
@@ -518,7 +520,7 @@ class PlanarArmRows(NamedTuple):
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle between a link and the direction straight down, in rad.
 
-        A small angle means that the arm hangs down, as it does after a fall.
+        A small angle means that the arm hangs down, as an arm does that was not held up.
 
         Args:
             q: Joint angles of one pose, shape (2,), in rad.
@@ -699,9 +701,9 @@ class ChainArmRows(NamedTuple):
         return self._replace(chain=chain)
 
     def weightless(self) -> "ChainArmRows":
-        """Returns the same chain without gravity and Coulomb friction.
+        """Returns a model of the same arm without gravity and dry (Coulomb) friction.
 
-        The torque of this chain is linear in the reference velocity v and acceleration a, so
+        The torque of this model is linear in the reference velocity v and acceleration a, so
         that the effects of parts of a motion can be computed separately and added.
         """
         bare = self._replace_in_joints(coulomb=0.0)
@@ -1024,10 +1026,10 @@ ArmRows = PlanarArmRows | ChainArmRows
 
 
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
-    """Returns the model of a site's arm, for computations over many poses at once.
+    """Returns the model of an arm for computations over many poses at once.
 
-    Certificate and metrics evaluate inertia and energy at every record, for which one call per
-    record would be too slow.
+    Certificate and metrics evaluate inertia and energy at every record of a log, for which one
+    call per record would be too slow.
 
     Args:
         scenario: The description of the experiment, which defines the arm.
@@ -1068,7 +1070,7 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
 
 
 def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
-    """Returns the positions of base, joints and end effector of a chain, for drawing, in m.
+    """Returns the positions of base, joints and end effector of an arm, for drawing, in m.
 
     Their shape is (K, n + 2, 3) for K poses of n joints.
     """
@@ -1121,7 +1123,7 @@ DEPENDENT_SHARE = 1e-9
 
 
 class _BaseParameters(NamedTuple):
-    """Base parameters of an arm: the combinations of its parameters that torques determine.
+    """Base parameters of an arm: combinations of masses and inertias that torques determine.
 
     No measurement of torque and motion can determine every dynamic parameter theta of a chain
     by itself. It determines only the B linear combinations in the rows of `combination`, so
@@ -1272,10 +1274,10 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Finds for each link whether a rigid body with its parameters can exist.
+    """Finds the links whose learnt masses and inertias are those of a possible rigid body.
 
-    The condition is that the link's pseudo-inertia (see `find_pseudo_inertias`) is positive
-    definite (Wensing et al. 2018).
+    A negative mass, for example, is impossible. The condition is that the link's pseudo-inertia
+    (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).
 
     Args:
         theta: Parameters of the links, shape (10 n,).

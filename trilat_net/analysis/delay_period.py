@@ -93,10 +93,10 @@ def _find_near_period_s(
     cycles: Iterable[Fraction],
     rates_hz: Sequence[int],
 ) -> float | None:
-    """Returns a time after which delays repeat to within half a tick, in s.
+    """Returns a time after which network delays repeat to within half a tick, in s.
 
-    The shortest time with a deviation of at most `_SLIP` is preferred, then the time with the
-    least deviation.
+    A tick is a control period. The shortest time with a deviation of at most `_SLIP` is
+    preferred, then the time with the least deviation.
 
     Args:
         cycles: Periods of the delays of the links, in s.

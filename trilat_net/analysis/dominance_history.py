@@ -259,9 +259,9 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Finds the times at which a site continued without a peer that it had lost.
+    """Finds the times at which an arm continued without another arm that it had lost.
 
-    A peer is lost if nothing was heard of it for some time, see `core.lost_peers`.
+    An arm is lost if nothing was heard of it for some time, see `core.lost_peers`.
 
     Args:
         log: The log of the run.
@@ -474,10 +474,10 @@ KD_SHAPE_TOLERANCE = 1e-9
 
 
 class _LyapunovWeights(NamedTuple):
-    """Weights beta of the N sites in the energy function V of the stability proof.
+    """Weights beta of the N arms in the energy function V of the stability proof.
 
-    With these weights the energies that sites transfer to each other cancel in V. They follow
-    from the matrix alpha of the dominance factors and from the gains Kd of the sites.
+    With these weights the energies that arms transfer to each other cancel in V. They follow
+    from the matrix alpha of the dominance factors and from the damping gains Kd.
 
     Attributes:
         beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each

@@ -156,10 +156,9 @@ class FileInventory:
         rates_hz: Mapping[str, int],
         absences: Absences,
     ) -> dict[str, JsonObject]:
-        """Describes the messages in each channel of the files, for `trilat log info`.
+        """Describes the messages in each channel (topic) of the files, for `trilat log info`.
 
-        A channel contains the messages of one topic. Missing messages are counted only for a
-        session whose tick rates are known.
+        Missing messages are counted only for a session whose rates are known.
 
         Args:
             session: Name of the session. Empty to count no missing messages.
@@ -268,9 +267,9 @@ def _count_gaps(
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """Overview of one or several recorded files, returned by `info`.
+    """Overview of one or several recorded MCAP files, returned by `info`.
 
-    The files are MCAP files. A log that was recorded in several files is described as a whole.
+    A log that was recorded in several files is described as a whole.
 
     Attributes:
         facts: The overview as plain values. The keys are those of `trilat log info --json`.
@@ -578,9 +577,9 @@ def _parse_number(text: str) -> int | None:
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Collects the key numbers of a recorded run, for the file `summary.json`.
+    """Collects the most important numbers of a run, for the file `summary.json`.
 
-    The log may be torn, short or empty. Numbers that it does not determine are None.
+    The log may be torn, short or empty. Numbers that the log does not determine are None.
 
     Args:
         log: The log of the run.

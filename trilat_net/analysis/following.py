@@ -89,7 +89,7 @@ class JointFollowing(NamedTuple):
     ) -> tuple[Array, Array]:
         """Returns the joint velocity that should reduce the errors, and its derivative.
 
-        The velocity is -Lambda e, with the error e of the joints and the gain Lambda.
+        The velocity is -Lambda e, with the error e of the joints and the gain Lambda, in 1/s.
 
         Args:
             rows: Rows of the records. They have no effect, because the result depends on no
@@ -105,9 +105,9 @@ class JointFollowing(NamedTuple):
         return -self.Lambda * e, -self.Lambda * ed
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
-        """Returns the jump of the filtered error r when the error e jumps, shape (K, n).
+        """Returns the jump of the filtered error r when a new message of another arm is used.
 
-        As r = qd + Lambda e, the jump is Lambda de.
+        The error e jumps by de. As r = qd + Lambda e, the jump is Lambda de, shape (K, n).
 
         Args:
             rows: Rows of the records. Not needed here, as the result depends on no pose.
@@ -270,10 +270,10 @@ class TaskFollowing:
         return self._solve(slice(None), along_axes)
 
     def without_posture(self) -> "TaskFollowing":
-        """Returns a copy of this object in which free joints keep their positions.
+        """Returns a copy in which the arm does not move its free joints to a preferred posture.
 
-        They do not move to a preferred posture. The reference velocity is then linear in the
-        error of the end effector.
+        An arm may have more joints than the task needs. The reference velocity is then linear
+        in the error of the end effector.
         """
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)

@@ -95,10 +95,9 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> _PredictedDelivery:
-    """Computes when a site may use each of the first samples that another site sent.
+    """Computes when each message of another arm comes into use, as the scenario defines.
 
-    A site is the process that runs one arm, and a sample is the state that it sends in every
-    tick. The scenario delays samples in a repeatable way to emulate a network.
+    The scenario delays the messages (samples) in a repeatable way to emulate a network.
 
     Args:
         log: The log of the run, which contains the scenario and the changes of the delays.
@@ -361,9 +360,9 @@ class ClockSummary(NamedTuple):
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns the estimates of a peer's clock that a site made during a session.
+    """Returns how far the clocks of two arms differ, as one of them estimated in a session.
 
-    The age of a sample is known only as well as the offset between both clocks.
+    The age of a message is known only as well as this difference.
 
     Args:
         log: The log of the run.
@@ -586,7 +585,7 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
 
 
 def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
-    """Returns a histogram of ages in at most `MOST_AGE_BINS` bins.
+    """Counts ages in a histogram of at most `MOST_AGE_BINS` bins.
 
     The width of a bin is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
 

@@ -540,10 +540,10 @@ def _find_worst_joint(
     columns: Sequence[Array],
     sites: Sequence[Array],
 ) -> RunEnd:
-    """Returns the end of the joint with the worst behaviour.
+    """Returns how the motion of the joint with the worst behaviour ends.
 
-    Of several joints with the worst behaviour the fastest one is returned. The largest |e| and
-    |qd| of the last second are those of all joints.
+    Growing is worse than oscillating, for example. Of several such joints the fastest one is
+    returned. The largest |e| and |qd| of the last second are those of all joints.
 
     Args:
         scenario: Scenario of the run.
@@ -966,7 +966,7 @@ def _find_held_sites(
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
-    """Yields a sentence if arms end in a pose that a controller should not have brought about.
+    """Yields a sentence if arms end in a pose that no good controller should cause.
 
     Such arms hang down, or are far from every start pose although nobody pushed.
 

@@ -72,9 +72,10 @@ def _describe_programs(log: Log) -> str:
 
 
 def _describe_torque_limits(log: Log) -> str:
-    """Returns a clause on how long each site was at its torque limit. Empty if none was.
+    """Returns a clause on how long each arm's motors were at their torque limit.
 
-    At its limit a drive does not apply the torque that the control law demands.
+    At its limit a motor does not apply the torque that the control law demands. The clause is
+    empty if no motor was at its limit.
 
     Args:
         log: The log of the run.

@@ -121,9 +121,9 @@ class RunView:
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, TorqueSource]]:
-        """All virtual walls by name, each with the site whose arm can touch it.
+        """All virtual walls by name, each with the arm that can touch it.
 
-        The name "s/1" denotes the first wall of site s. Walls of a site are counted from 1.
+        The name "s/1" denotes the first wall of arm s. Walls of an arm are counted from 1.
         """
         walls = {}
         for site in self.log.sites:

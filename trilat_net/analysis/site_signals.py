@@ -106,9 +106,9 @@ class JointError(NamedTuple):
 
     @classmethod
     def find_in_last_second(cls, site_log: SiteLog) -> "JointError | None":
-        """Finds the largest error |e| of a site in the last second of its records.
+        """Finds the largest tracking error of an arm in the last second of its records.
 
-        The last second, rather than the last record, does not miss an oscillation.
+        The last record alone could miss an oscillation.
 
         Args:
             site_log: Log of the site.

@@ -57,10 +57,11 @@ _UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 
 
 class LoopRoots(NamedTuple):
-    """Characteristic roots of the control loop, linearised at the pose at which a run ended.
+    """Growth rates (roots) of small motions about the pose at which a run ended.
 
-    The roots show whether small motions about this pose die away. `theory.loop_roots` computes
-    them for every command.
+    They are characteristic roots of the linearised control loop. If the real parts of all of
+    them are negative, small motions die away. `theory.loop_roots` computes them for every
+    command.
 
     Attributes:
         verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
@@ -345,9 +346,10 @@ def _find_refutation(run: RunFindings) -> str:
 
 
 def _agrees_with_proof(run: RunFindings) -> bool:
-    """Returns True if neither the end of a run nor its twins contradict a proof.
+    """Returns True if neither the end of a run nor its repetitions contradict a proof.
 
-    A run that is shorter than the period of its delays contradicts nothing: it may show a beat.
+    A repetition, a twin, has a small push. A run that is shorter than the period of its delays
+    contradicts nothing: it may show a beat.
     """
     end = run.end
     twins = run.twins

@@ -130,9 +130,9 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
 
 
 def _describe_hold(hand: HandInForce | None) -> str:
-    """Returns the text of the column "held": whether a person or a program moves the arm.
+    """Returns the table text that says whether a person or a program moves the arm.
 
-    An operator holds an arm while the person or program moves it.
+    It stands in the column "held".
 
     Args:
         hand: State of the operator in the record. None if nobody may move the arm during the

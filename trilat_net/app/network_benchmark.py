@@ -87,7 +87,7 @@ def _parse_header(payload: bytes) -> tuple[int, ...] | None:
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
-    """Sends each message of a benchmark back to its sender, until the connection is closed.
+    """Sends each test message of a network benchmark back, until the connection is closed.
 
     This is the work of the far end. The near end measures the round trip times.
 
@@ -525,7 +525,7 @@ class NetworkBenchmark(Result):
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result with the keys of `trilat ping --benchmark --json`.
+        """Converts the result to plain values, as `trilat ping --benchmark --json` prints them.
 
         "needs" states what the scenario requires of the network, "transports" judges each
         transport, and "rows" has the measurements.

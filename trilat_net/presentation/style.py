@@ -168,10 +168,9 @@ _THINNER_PT = 1.2
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
-    """Returns the colour, dashes and width of the lines that belong to a site.
+    """Returns the colour, dashes and width of the lines of an arm, for all figures.
 
-    A site is a process that runs one arm. If there are more sites than colours, colours are
-    repeated with dashes.
+    If there are more arms than colours, colours are repeated with dashes.
 
     Args:
         log: Log with the site.

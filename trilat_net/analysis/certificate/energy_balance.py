@@ -56,10 +56,11 @@ _EnergyKey = tuple[str, str]
 
 @dataclass(frozen=True)
 class SiteEnergy:
-    """Everything that changes the energy function V_i of a site, over K records.
+    """Energy V_i of one arm in the stability proof, and everything that changes it.
 
-    V_i is the part of a site i in the energy function of the stability proof. Its change over a
-    tick period must equal the energies listed here. There are K - 1 periods between K records.
+    There are K records. V_i is the part of arm i in the energy function V of the proof. Its
+    change over each of the K - 1 control periods (ticks) must equal the energies listed here.
+    Otherwise, the records contradict the model.
 
     Attributes:
         motion: Motion of the site, from which its energies are computed.
@@ -124,10 +125,10 @@ class SiteEnergy:
 
     @property
     def followed(self) -> dict[str, DelayedPeer]:
-        """The peers that the site follows at some time, with their motion as it is received.
+        """The other arms that this arm follows at some time, with their motion as received.
 
-        A peer is another site. It is followed if its dominance factor, the weight with which
-        the arm follows it, is ever different from zero.
+        An arm is followed if its dominance factor, the weight with which this arm follows it,
+        is ever different from zero.
         """
         alpha = self.motion.dominance.alpha
         peers = self.motion.peers
@@ -241,9 +242,9 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Computes the energy of each site in the stability proof, from a log.
+    """Computes from a log the energy of each arm that the stability proof uses.
 
-    A site is the process that runs one arm. Every site must have an energy function.
+    An energy function must exist for the control law of every arm.
 
     Args:
         log: The log of the run.
@@ -273,9 +274,9 @@ def derive_site_energies(
     pasts: Mapping[str, PeerTrajectory],
     dominance: Callable[[str, Array], DominanceHistory],
 ) -> dict[str, SiteEnergy]:
-    """Computes the energy of each site in the stability proof, and all that changes it.
+    """Computes the energy of each arm in the stability proof, and everything that changes it.
 
-    A site is the process that runs one arm. Every site must have an energy function.
+    An energy function must exist for the control law of every arm.
 
     Args:
         scenario: The description of the experiment.
@@ -328,9 +329,9 @@ def derive_site_energies(
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the times at which the energy functions V_i of all sites are known, in s.
+    """Returns the times at which the energies V_i of all arms are known, in s.
 
-    They are ticks of the site with the highest tick rate, shape (T,).
+    They are ticks (control periods) of the arm with the highest rate, shape (T,).
 
     Args:
         energies: Energies of the sites, by name.
@@ -426,9 +427,9 @@ class EnergyBalance:
 
     @property
     def _work_from_outside(self) -> dict[str, Array]:
-        """Work of operators, environments and stops, by source, shape (T,) each, in J.
+        """Work of operators, environments and end stops on the arms, by source, in J.
 
-        Other work, such as that of gravity, is internal to the arms.
+        Each has the shape (T,). Other work, such as that of gravity, is internal to the arms.
         """
         sources = {}
         for name in EXTERNAL_SOURCES:
@@ -438,10 +439,10 @@ class EnergyBalance:
 
     @property
     def external_work(self) -> Array:
-        """Work of operators, environments and stops on all arms since the first tick, in J.
+        """Work of operators, walls and end stops on all arms since the first tick, in J.
 
-        The stability proof permits V to rise by this amount. The shape is (T,), with one entry
-        per tick.
+        The stability proof permits the energy V to rise by this amount. The shape is (T,), with
+        one entry per tick (control period).
         """
         return _sum(self._work_from_outside)
 

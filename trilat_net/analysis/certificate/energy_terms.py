@@ -170,9 +170,9 @@ class SiteConstants(NamedTuple):
 
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Collects the gains, limits and arm parameters of a site from the scenario.
+    """Collects the gains, limits and arm parameters of one arm from the scenario.
 
-    The site must use the adaptive control law, and the parameters of its arm must be known.
+    The arm must have the adaptive control law, and its parameters must be known.
 
     Args:
         scenario: The description of the experiment, which defines the gains.
@@ -516,7 +516,7 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """The energy of a site in the stability proof, split into its four parts, in J.
+    """Energy of one arm in the stability proof, split into its four parts, in J.
 
     Each part has the shape (K,) for K records. Their sum is V_i in the module's docstring.
 
@@ -1060,7 +1060,9 @@ def _singular_pose_power(
 ) -> Array:
     """Returns the power of the damping near singular poses, at one end of every period, in W.
 
-    `_singular_pose_work` has the equation and integrates this power, whose shape is (K - 1,).
+    In a singular pose, such as a stretched arm, the end effector cannot move in every
+    direction. `_singular_pose_work` has the equation and integrates this power, whose shape is
+    (K - 1,).
 
     Args:
         site: Motion of the site.

@@ -391,9 +391,10 @@ def _read_peer_records(
     sent: Mapping[str, Array],
     count: int,
 ) -> PeerRecords:
-    """Returns the values that a law received from a peer, and those sent to this peer alone.
+    """Returns the recorded values that a control law exchanged with one other arm.
 
-    A key such as `wave[s]` is a value for site s alone.
+    They are the values that the law received from this arm, and those that it sent to this arm
+    alone. A key such as `wave[s]` is a value for arm s alone.
 
     Args:
         log: The log of the run.
@@ -423,7 +424,7 @@ def _read_peer_records(
 
 
 def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
-    """Yields the energies over time that a passive law never lets fall below zero.
+    """Yields the energies over time that a passive control law never lets fall below zero.
 
     They are the energy on the way between two arms (line), the part of it that the receiver
     knows, stored energy, and the energy that a law dissipated.

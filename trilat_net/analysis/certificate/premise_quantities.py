@@ -109,10 +109,10 @@ class GainQuantities(NamedTuple):
 
 
 class WallQuantities(NamedTuple):
-    """Evidence for the premise that simulated walls generate no energy.
+    """Evidence on whether simulated walls generate no energy, as the theorem requires.
 
-    A wall whose force is computed once per tick generates energy. The damping of the arm may
-    remove more than that.
+    A wall whose force is computed once per tick (control period) generates energy. The damping
+    of the arm may remove more than that.
 
     Attributes:
         walls: The walls that were touched, with their energies and dampings.
@@ -133,9 +133,10 @@ class WallQuantities(NamedTuple):
 
 
 class DominanceQuantities(NamedTuple):
-    """Evidence for the premise that the dominance factors are constant and give weights for V.
+    """Evidence on whether the dominance factors are constant and determine weights for V.
 
-    A dominance factor is the weight with which a site follows a peer.
+    A dominance factor is the weight with which an arm follows another one. The stability
+    theorem requires both. V is its energy function.
 
     Attributes:
         changing: Sites whose dominance factors change.
@@ -378,10 +379,7 @@ class AbsentSpan(NamedTuple):
 
 
 class PresentStretch(NamedTuple):
-    """Interval of time between two absences, in which all sites were present.
-
-    The stability theorem can apply only from the time in the interval at which all sites follow
-    again.
+    """Interval of time between two absences, in which the processes of all arms were present.
 
     Attributes:
         from_s: Start, in s.
@@ -398,9 +396,10 @@ class PresentStretch(NamedTuple):
 
 
 class PresenceQuantities(NamedTuple):
-    """Evidence for the premise that all sites are present during the whole run.
+    """Evidence on whether the processes of all arms are present during the whole run.
 
-    A site may leave a session and return. The theorem then applies to each stretch between.
+    A process may leave a session and return. The stability theorem then applies to each
+    interval between.
 
     Attributes:
         absent: Spans of time during which sites were absent.

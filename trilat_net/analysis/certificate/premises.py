@@ -726,7 +726,7 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
 
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
-    """Collects how complete the records of a run are, and whether its log is unchanged.
+    """Collects how complete the records of a run are, and whether its log was changed.
 
     A run of which too little is known is not called stable, see `Evidence.reasons`.
 

@@ -307,8 +307,8 @@ class RunningEnergy:
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Computes the energy V of all arms since the last call, if all records have arrived.
 
-        A site is the process that runs one arm. V is the energy function of the stability
-        proof.
+        V is the energy function of the stability proof. The result shows during a session
+        whether V rises.
 
         Args:
             complete: For every site, the number of the last tick for which nothing is missing

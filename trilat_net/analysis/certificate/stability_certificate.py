@@ -204,7 +204,7 @@ class Certificate(Result):
 
     @cached_property
     def decision(self) -> StabilityDecision:
-        """The decision whether the run is stable, what it rests on, and the reasons against it.
+        """The decision whether the run is stable, with its evidence and the reasons against it.
 
         It combines the motion at the end, the repetitions with small pushes, the characteristic
         roots, the proofs and the doubts, by the rules of `stability_decision`. It is computed
@@ -222,10 +222,10 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on everything that prevents a stable judgement or refutes it.
+        """Sentences on everything that speaks against calling the run stable.
 
-        They concern the end of the run, V, the roots at the end pose, the energies that control
-        laws declare, and the completeness of the log. Empty for a stable run.
+        They concern the end of the run, the energy V, the roots at the end pose, the energies
+        that control laws declare, and the completeness of the log. Empty for a stable run.
         """
         return self.decision.reasons
 
@@ -255,10 +255,10 @@ class Certificate(Result):
         return str(find_hook("head a certificate")(self))
 
     def to_dict(self) -> JsonObject:
-        """Returns the certificate as plain values, with the keys of `trilat certify --json`.
+        """Converts the certificate to plain values, as `trilat certify --json` prints them.
 
         docs/reference/json.md explains the most important keys. The entry "functional" is None
-        if V cannot be computed.
+        if the energy function V cannot be computed.
         """
         verdict = self.verdict
         end = self.end
@@ -294,7 +294,7 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the premises of the stability theorem as a table, with a row for each.
+        """Returns the conditions (premises) of the stability theorem as rows of a table.
 
         A row has the keys "name", "holds" and "text", from which `to_frame` makes a data frame.
         """
@@ -467,10 +467,10 @@ def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> Stability
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns the verdict of a run whose V can be judged.
+    """Judges a run by its energy function V: whether V rose, and whether the theorem applies.
 
-    The verdict depends on whether V rose beyond the supplied energy, and on whether the
-    premises of the theorem hold.
+    V must not rise beyond the supplied energy. The stability theorem applies if its premises
+    (conditions) hold.
     """
     balance = run.balance
     # Energies that are rounding errors are written as zero.

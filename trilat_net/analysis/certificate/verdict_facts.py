@@ -232,8 +232,7 @@ class StabilityVerdict(NamedTuple):
 class Evidence(NamedTuple):
     """The records on which a stability certificate is based, and whether they suffice.
 
-    A site is the process that runs one arm, and stores a record in every tick of its control
-    loop.
+    A site, the process that runs one arm, stores a record in every tick (control period).
 
     Attributes:
         coverage: Recorded ticks and expected ticks of every site.

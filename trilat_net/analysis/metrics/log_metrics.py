@@ -224,9 +224,9 @@ class LogMetrics(Result):
                 yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns the metrics of one quantity for every subject that has it, by name.
+        """Returns the values of one metric for every subject that has it, by the subject.
 
-        A subject is a site, a link or a wall, or the whole run, whose name is empty.
+        A subject is an arm, a network link or a wall, or the whole run, whose name is empty.
 
         Args:
             quantity: The quantity.

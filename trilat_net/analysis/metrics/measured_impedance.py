@@ -60,9 +60,10 @@ NO_SCRIPT_TEXT = "the scenario does not contain the hand's intention: the drive 
 
 
 class FrequencyResponse(NamedTuple):
-    """Ratio of an output to an input at one frequency, estimated from a recorded run.
+    """Ratio of two recorded signals at one frequency, such as torque over velocity.
 
-    Both signals are caused by a known drive. Values that the log does not determine are None.
+    Both signals are caused by a known drive, the motion of an operator. Values that the log
+    does not determine are None.
 
     Attributes:
         frequency_hz: Frequency of the spectral line, in Hz.
@@ -299,10 +300,10 @@ class ImpedanceEstimate(NamedTuple):
 
 
 def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Estimates what each operator feels, as frequency responses of a recorded run.
+    """Estimates what each operator feels over frequency, from a recorded run.
 
     For each operator the impedance is estimated, the operator's torque over the velocity of the
-    joint. For each environment at another site the reflection is estimated, the torque that the
+    joint. For each environment at another arm the reflection is estimated, the torque that the
     operator feels over the torque of the environment.
 
     Args:

@@ -133,9 +133,9 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square over time of the column for which it is largest.
+    """Returns the root mean square over time of the worst column, such as the worst joint.
 
-    With a column per joint, this is the RMS value of the worst joint.
+    Each column has the values of one joint. The largest of the columns' values is returned.
 
     Args:
         values: Values of n quantities over time, shape (K, n).

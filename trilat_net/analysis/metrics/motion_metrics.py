@@ -88,10 +88,9 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     *list_shared_quantities(_ERRORS),
 )
 def _measure_tracking(view: RunView, site: str) -> MetricValues:
-    """Measures how well a site tracks its reference: settling time, RMS and peak of the error.
+    """Measures how well an arm tracks its reference: settling time, RMS and peak of the error.
 
-    The error e is the difference between the coordinates of the site and their reference, the
-    weighted mean of what its peers sent.
+    The reference is the weighted mean of the positions that the other arms sent.
 
     Args:
         view: The run.
@@ -201,9 +200,9 @@ def _compute_undelayed_error(
 
 
 def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
-    """Returns the peers that a site follows at some time, with their dominance factors.
+    """Returns the other arms that an arm follows at some time, with their dominance factors.
 
-    The factors, which are the weights of the peers, have the shape (K,) for K ticks.
+    The factors, which are the weights of these arms, have the shape (K,) for K ticks.
     """
     if site not in view.sites:
         return {}

@@ -38,7 +38,7 @@ _NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that is constant within each tick period, in J.
+    """Returns the work of a torque that is constant within each control period, in J.
 
     The work in period k is exactly tau_k' (q_{k+1} - q_k), whatever the motion within the
     period.
@@ -290,9 +290,10 @@ def _compute_delay_torque(
     alpha: Array,
     alpha_rate: Array,
 ) -> Array:
-    """Returns the torque by which a law's torque differs from its torque without delay.
+    """Returns the change of a control law's torque that is due to the network delay.
 
-    The effect of the delay on the Coulomb friction that a law compensates is left out.
+    It is the torque less the torque without delay. The effect of the delay on the Coulomb
+    friction that a law compensates is left out.
 
     Args:
         gains: Gains of the law.

@@ -81,10 +81,10 @@ class _StaticWindow(NamedTuple):
 
 
 def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
-    """Finds the static windows of a run, in order.
+    """Finds the windows of time in which all arms rest, in order.
 
-    A window is the last `WINDOW_S` of an interval in which all sites rest. Each interval has
-    one window at most.
+    A window is the last `WINDOW_S` of an interval in which all arms rest. Each interval has one
+    window at most.
 
     Args:
         run_view: The run.
@@ -350,10 +350,10 @@ class JointLoad(NamedTuple):
 
 
 def find_joint_loads(view: RunView) -> list[JointLoad]:
-    """Finds the joints that carry a torque while all arms rest, with these torques.
+    """Finds the joints that carry an external torque while all arms rest, with these torques.
 
-    A time of rest is called a static window. At a joint, an arm counts as loaded if the
-    external torque on it is neither small nor much smaller than the torque on another arm.
+    At a joint, an arm counts as loaded if the external torque on it is neither small nor much
+    smaller than the torque on another arm.
 
     Args:
         view: The recorded run.
@@ -435,9 +435,9 @@ def _weigh_load(
     torque: dict[str, float],
     weights: Array | str,
 ) -> JointLoad:
-    """Computes how well the torques on the arms at a joint balance, weighted with pi_i / K_i.
+    """Computes how well the torques on all arms balance at one joint while the arms rest.
 
-    The module's docstring has the equation that the torques satisfy at rest.
+    The torques are weighted with pi_i / K_i, see the equation in the module's docstring.
 
     Args:
         window: The static window.

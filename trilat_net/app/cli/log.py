@@ -289,9 +289,9 @@ def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) 
 
 
 def _open_page(files: list[Path]) -> None:
-    """Opens the page of a log in a browser, in place of the viewer Rerun.
+    """Opens the report (web page) of a log in a browser.
 
-    If the page is missing, it is written first, as by `trilat report`.
+    If the report is missing, it is written first, as by `trilat report`.
 
     Args:
         files: The log, or its parts.

@@ -541,10 +541,9 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
 
 
 def _show_playback(outcome: "PlaybackSummary") -> None:
-    """Prints the outcome of a replay.
+    """Prints the outcome of a replay: numbers of messages, duration and lateness.
 
-    It has the number of messages of each channel, the duration, the delay of the messages
-    behind their schedule, and whether a recorder received all of them.
+    The user also sees whether a recorder received all of the messages.
     """
     if terminal.err.is_interactive:
         terminal.err.file.write("\r" + " " * 72 + "\r")  # erases the line of the progress

@@ -107,7 +107,7 @@ def sim_command(
 
 
 def _describe_length(scenario: "Scenario", path: Path) -> str:
-    """Returns how long a simulated run is and which arms (sites) it has, as a phrase.
+    """Returns a phrase on how long a simulated run is and which arms it has.
 
     A run that diverged is shorter than planned, and the phrase says so.
 
