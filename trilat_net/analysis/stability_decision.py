@@ -262,7 +262,7 @@ def is_decided_by_roots(run: RunFindings) -> bool:
 
 
 def _list_reasons(run: RunFindings) -> tuple[str, ...]:
-    """Lists the sentences that prevent the judgement stable or settled, in order.
+    """Lists the sentences that prevent the judgements "stable" and "settled", in order.
 
     They come from the end of the run, from missing records, from the runs with small pushes,
     from doubts about the analyses, and from roots that show growth.
@@ -366,7 +366,9 @@ def _agrees_with_proof(run: RunFindings) -> bool:
 def _confirms_slowest_root(run: RunFindings) -> bool:
     """Returns True if the slowest push decays at the rate that the slowest root predicts.
 
-    A push that shows no clear trend then agrees with a proof by roots: it merely decays slowly.
+    A push is a small disturbance in a repetition of the run, and a root the growth rate of
+    small motions. A push that shows no clear trend then agrees with the roots: it merely decays
+    slowly.
     """
     roots = run.roots
     worst = None if run.twins is None else run.twins.worst

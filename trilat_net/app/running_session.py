@@ -82,10 +82,10 @@ def _never_stopped() -> bool:
 
 
 class ShareHistory:
-    """Keeps the weights with which a site follows the others, over time and with all changes.
+    """Weights with which an arm follows the others, over the time of a session.
 
     Such a weight is called a dominance factor. The scenario states the factors at the start,
-    and scripted changes. Users request further changes during the session. Each change is a
+    and planned changes. Users request further changes during the session. Each change is a
     linear ramp from the present factors to other ones.
     """
 
@@ -993,7 +993,7 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
 
 
 def _list_present(scenario: Scenario, infos: dict[str, Info]) -> list[str]:
-    """Lists the sites that a request to all sites addresses.
+    """Lists the arms' processes that a request to all arms addresses.
 
     These are all sites of the scenario. If the scenario allows sites to leave, they are only
     the running sites, as long as at least one site runs.

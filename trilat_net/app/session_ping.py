@@ -321,7 +321,7 @@ class TopicDelays(Result):
     publishers: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per program that publishes on the topic, for a table or a data frame.
+        """Returns a table row for each program that publishes on the ROS 2 topic.
 
         A row contains the number of messages of the program, and their delays.
         """

@@ -65,10 +65,9 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
-    """Yields the text of a stability certificate.
+    """Yields the text of a stability certificate: judgement, reasons, and tables.
 
-    The judgement and its reasons come first. Tables of the premises (the conditions of the
-    stability theorem) and of the energies follow.
+    The tables have the premises (conditions of the stability theorem) and the energies.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -576,10 +575,10 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of V that no listed energy explains, shape (T,), in J.
+    """Returns the change of the energy V that no known cause explains, shape (T,), in J.
 
-    The table of energies lists it as "unexplained". It should be close to 0, except in gaps of
-    the records.
+    V belongs to the stability proof. The table of energies lists this change as "unexplained".
+    It should be close to 0, except in gaps of the records.
     """
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())

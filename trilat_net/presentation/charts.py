@@ -253,7 +253,7 @@ class ChartBuilder:
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
-        """Adds a line per site with the largest value of a signal in each short interval.
+        """Adds a line per arm with the largest value of a signal in each short interval.
 
         Within an interval, the line is constant. A line of the values themselves would be a
         broad band wherever they oscillate.
@@ -347,9 +347,9 @@ class ChartBuilder:
             yield from self._chart_histograms()
 
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
-        """Adds a table of values to the data of the page, from which its scripts draw curves.
+        """Adds a table of numbers to the report, from which its scripts draw curves.
 
-        A table contains encoded binary numbers, which are shorter than their texts.
+        The numbers are encoded in binary form, which is shorter than text.
 
         Args:
             site: Name of the site, whose tick rate converts ticks (control periods) to times.
@@ -423,7 +423,7 @@ class ChartBuilder:
     def _add_columns(
         self, site: str, tick: Ints, t_s: Array, values: Values
     ) -> list[TableSeries]:
-        """Decimates the values of one site, and adds them to the page.
+        """Reduces the values of one arm to what a screen can show, and adds them to the page.
 
         All columns share one table if there are few of them. Otherwise each column has its own
         table, which is smaller in total, see `__init__`.
@@ -513,10 +513,9 @@ class ChartBuilder:
             yield self._make_chart(section, f"{title}, {name}", unit, series)
 
     def _chart_positions(self) -> Iterator[TimeChart]:
-        """Yields a chart per site and joint, with the actual and the desired angle.
+        """Yields a chart per arm and joint, with the actual and the desired angle over time.
 
-        The desired angle is the one that the controller makes the joint follow, computed from
-        the received states of the other arms.
+        The desired angle follows from the received states of the other arms.
         """
         for site in self._log.sites:
             records = self._log[site]
@@ -728,7 +727,7 @@ class ChartBuilder:
             )
 
     def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
-        """Adds the motion of a site's arm and of the bodies that it touches.
+        """Adds the motion of an arm, and of bodies that it touches, for the moving picture.
 
         The script of the page draws planar arms from their joint angles and link lengths. Other
         arms, called chains, are handled by `_build_chain`.

@@ -326,7 +326,7 @@ def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
 
 
 def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Panels:
-    """Removes the columns of joints that are not selected.
+    """Removes the table columns of joints that the user did not select for the figure.
 
     Columns that belong to no joint, such as the age of a sample, are kept.
 

@@ -128,7 +128,7 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Checks the log of a finished run, and writes its page and summary into a folder.
+    """Checks the log of a finished run, judges the run, and writes its report into a folder.
 
     The checks execute the log again in a second process, while this process judges the run and
     draws the figures.
@@ -244,7 +244,7 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
-    """Returns a table with a row per site: number of records, timing, and largest final error.
+    """Returns a table with a row per arm: number of records, timing, and largest final error.
 
     The error is the largest one of any joint in the last second, or of the whole run if the run
     was shorter. The table names the joint.
@@ -295,7 +295,7 @@ def conclude_files(
 ) -> tuple[Log, Conclusion]:
     """Checks a log that was just recorded, writes its report, and prints the result.
 
-    If the user interrupts the work, a note gives the command that draws the report later.
+    If the user interrupts the work, a note gives the command that writes the report later.
 
     Args:
         paths: Files of the log.

@@ -53,9 +53,9 @@ Tree = str | JsonObject
 
 
 def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
-    """Arranges the channels of a log or of a session in panels.
+    """Returns a layout of plots for Foxglove, a program that shows data of robots.
 
-    Foxglove is a program that shows recorded or live data of robots. It opens the layout from a
+    It shows the channels of a log or of a running session. Foxglove opens the layout from a
     file.
 
     Args:
@@ -78,7 +78,7 @@ def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
 
 
 class _Panels:
-    """Collects the settings of panels, and gives each panel an identifier.
+    """Collects the panels of a layout for Foxglove, and gives each one an identifier.
 
     Foxglove is a viewer for data of robots. Its layout file refers to panels by their
     identifiers.

@@ -73,10 +73,9 @@ def _make_environment() -> Environment:
 
 
 def _mark_hashes(text: str) -> Markup:
-    """Converts plain text to HTML, and keeps each hash on a single line.
+    """Converts plain text to HTML, and keeps each hash on a single line for copying.
 
-    A hash is a long hexadecimal number that identifies a file. Without a line break, a user can
-    copy it.
+    A hash is a long hexadecimal number that identifies a file.
 
     Args:
         text: Plain text.

@@ -26,9 +26,10 @@ The lines of references, true values and limits have the colour "limit".
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
-    """Numbers of a site over time, as the browser page gets them.
+    """Numbers of one arm over time, as the report's web page contains them.
 
-    A table has one row per shown tick. The lines of charts refer to its columns.
+    A table has one row per shown tick (control period). The lines of charts refer to its
+    columns.
 
     Attributes:
         rate_hz: Tick rate of the site, which converts ticks to times.
@@ -238,10 +239,10 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
 
 
 class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
-    """Who leads a slave over time, for a slave whose dominance factors change.
+    """Data of a bar that shows over time which arms lead a slave arm.
 
-    A slave follows its peers with weights, the dominance factors. Between two points in time
-    the factors change linearly.
+    A slave follows its peers, the other arms, with weights, the dominance factors. Between two
+    points in time the factors change linearly.
 
     Attributes:
         site: Name of the slave.

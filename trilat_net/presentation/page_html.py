@@ -91,7 +91,7 @@ def render_table(
 
 
 def render_legend(columns: Mapping[str, str]) -> Markup:
-    """Renders the meanings of a table's columns as a line, for screens without a pointer.
+    """Renders the meanings of a table's columns as a line of text, for touch screens.
 
     With a pointer, a reader sees the meaning of a column at its header.
 

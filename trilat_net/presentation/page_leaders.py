@@ -75,7 +75,7 @@ def _name_role(scenario: Scenario, site: str) -> str:
 
 
 def caption_site(scenario: Scenario, site: str) -> str:
-    """Returns the caption of a site's arm in the drawing, for example "m1, master 1"."""
+    """Returns the caption of an arm in the drawing, for example "m1, master 1"."""
     return f"{site}, {_name_role(scenario, site)}"
 
 

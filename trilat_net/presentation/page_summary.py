@@ -310,7 +310,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 
 
 def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
-    """Returns the largest error of some sites, with their largest error in the last second.
+    """Returns a text with the largest error of some arms, and that of the last second.
 
     The error e is the difference between the angles of an arm and the angles that it should
     have.

@@ -504,9 +504,9 @@ _TIMELINE = "message_publish_time"
 
 
 def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
-    """Writes a layout as a blueprint, the file from which Rerun reads it.
+    """Writes the layout of a log for the viewer Rerun to a file, called a blueprint.
 
-    A blueprint tells the viewer which plots and views it arranges on the screen.
+    It tells the viewer which plots and views it arranges on the screen.
 
     Args:
         layout: The plots on each page, and what else is shown.
@@ -545,10 +545,9 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
 
 
 def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns Rerun's view of a plot, in which each channel has its own colors.
+    """Returns a plot for the viewer Rerun, in which each channel has its own colors.
 
-    Rerun is a viewer for data of robots. A legend with too many names would cover the curves,
-    and is hidden.
+    A legend with too many names would cover the curves, and is hidden.
     """
     styles_by_channel = {}
     for index, curves in enumerate(plot.curves):

@@ -279,10 +279,10 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
 def _import_composer(
     result: Result, composers: Mapping[str, str]
 ) -> Callable[[Result], Iterable[Block]]:
-    """Imports the function that composes the text of a result.
+    """Imports the function that composes the text of a result, only when it is needed.
 
-    A subclass of a listed class has the function of the listed class. Importing the module only
-    when it is needed keeps other commands fast.
+    Importing all such modules at the start would make every command slow. A subclass of a
+    listed class has the function of the listed class.
 
     Args:
         result: The result.

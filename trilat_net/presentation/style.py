@@ -115,8 +115,8 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
 class _NotebookFigure(Figure):
     """A Matplotlib figure that a Jupyter notebook displays as a picture.
 
-    A plain Matplotlib figure that was made without pyplot would be displayed as its size in
-    words.
+    Without this class, a notebook would display only the size of the figure in words, because
+    figures are made without pyplot.
     """
 
     def _repr_png_(self) -> bytes:
@@ -342,7 +342,7 @@ def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> N
 
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Writes a label beside a row of low panels, in several lines.
+    """Writes a label beside a row of low panels of a figure, in several lines.
 
     A low panel has no room beside it for a long label in one line.
 

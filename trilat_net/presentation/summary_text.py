@@ -352,7 +352,7 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
-    """Yields the result of the recovery of an unfinished log.
+    """Yields the outcome of recovering a log that was cut off.
 
     The first line names the new file. A table lists which records were recovered, and which
     were lost or are missing.
@@ -604,10 +604,10 @@ _DELAY_KEYS = ("min", "p50", "p99", "max")
 
 
 def compose_topic_delays(report: Result) -> Iterator[Block]:
-    """Yields a table of the delays with which the messages of a ROS topic arrive.
+    """Yields a table of the delays with which the messages of a ROS 2 topic arrive.
 
-    There is a row per publisher. The last column is a histogram of the delays, from the
-    smallest to the largest one.
+    There is a row per publishing program. The last column is a histogram of the delays, from
+    the smallest to the largest one.
 
     Args:
         report: Result of the measurement.

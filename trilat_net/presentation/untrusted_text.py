@@ -24,7 +24,7 @@ MAX_LETTERS = 4000
 def escape_controls(text: str) -> str:
     """Replaces control characters of a text by their names, as in <U+001B>.
 
-    Otherwise a text from another program could control the terminal.
+    Otherwise a text from another program could control the terminal, for example clear it.
 
     Args:
         text: The text.

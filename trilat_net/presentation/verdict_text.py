@@ -109,7 +109,7 @@ def _describe_coarse_energies(energies: facts.CoarseEnergies) -> str:
 
 
 def _describe_course(course: facts.FunctionalCourse) -> str:
-    """Returns whether V, the energy function of the stability proof, rose during a run.
+    """Returns a sentence on whether the energy V of the stability proof rose during a run.
 
     The sentence also says whether the premises (conditions) of the theorem hold, under which V
     must not rise.

@@ -167,7 +167,7 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks in a worker of a cluster that it would compute the same results as this study.
+    """Checks in a worker of a cluster that it would compute the same results as the study.
 
     A worker that joins during the study has not been checked before. Results from different
     program versions must not be mixed.
@@ -260,7 +260,7 @@ class DaskCluster:
 
     @property
     def workers(self) -> int:
-        """Number of items that all workers together run at the same time, one per thread.
+        """Number of items of a study that the cluster runs at the same time, one per thread.
 
         The number may change, because workers may join and leave.
         """

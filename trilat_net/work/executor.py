@@ -401,7 +401,7 @@ class WorkerPool:
         pending: dict[Future[_BatchResult], _Batch],
         together: Together[T, R] | None,
     ) -> None:
-        """Submits batches until every worker has one batch that runs and one that waits.
+        """Sends groups of items (batches) to the workers, so that each has one waiting.
 
         A batch that waits keeps the worker busy until the results of the previous batch have
         been processed.

@@ -82,9 +82,10 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
 
 
 class _JournalEntry(Protocol):
-    """Interface of an entry of a `RunJournal`: the result of a finished run.
+    """Result of a finished run, as a `RunJournal` stores it in a file.
 
-    An entry is a structure of plain values. The cell and the seed together identify its run.
+    An entry is a structure of plain values. The cell (combination of settings) and the random
+    seed together identify its run.
     """
 
     @property

@@ -246,10 +246,10 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio of the mode, -re(s) / abs(s), from -1 to 1.
+        """Damping ratio of the motion exp(s t) that belongs to the root, from -1 to 1.
 
-        It is 1 for a decay without oscillation, 0 for a lasting oscillation, and negative if
-        the mode grows.
+        It is -re(s) / abs(s): 1 for a decay without oscillation, 0 for a lasting oscillation,
+        and negative if the motion grows.
         """
         return -self.s.real / abs(self.s)
 
@@ -322,9 +322,9 @@ class Spectrum(NamedTuple):
     def rightmost(self) -> CharacteristicRoot | None:
         """The characteristic root with the largest real part, which determines stability.
 
-        Roots that are zero because of the structure of the loop are not considered: they exist,
-        for example, because all arms can rest in other poses too. None if there are no other
-        roots.
+        The real part is the growth rate of a small motion. Roots that are zero because of the
+        structure of the loop are not considered: they exist, for example, because all arms can
+        rest in other poses too. None if there are no other roots.
         """
         return self.roots[0] if self.roots else None
 
@@ -555,8 +555,8 @@ def refine_roots(
 def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Reduces a linear loop to the states that can influence its stability.
 
-    States that are constant, and states that act on no other state, are left out. Each of them
-    only adds a characteristic root at zero.
+    Constant states, and states that act on no other state, are left out. Each of them only adds
+    a characteristic root at zero.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -641,7 +641,7 @@ def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
-    """Eliminates the states that algebraic equations determine from a matrix.
+    """Eliminates the states that algebraic equations determine from a matrix of the loop.
 
     From 0 = M_aa x_a + M_ar x_r follows the Schur complement M_rr - M_ra M_aa^-1 M_ar, where a
     stands for the algebraic states and r for those with a rate.

@@ -222,7 +222,7 @@ def _shift_equilibrium(
     rest: Equilibrium,
     step: Array,
 ) -> Equilibrium:
-    """Returns the pose and estimates of an equilibrium after a step of the loop's states.
+    """Returns the pose and estimates of a pose of rest after an iteration step of its search.
 
     Velocities in the step are ignored, because all arms rest.
     """
@@ -630,9 +630,9 @@ def _reach_pose(site: SiteSetup, pose: Array) -> Array:
 
 
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
-    """Returns the mean of the start poses that the sites share, shape (m,).
+    """Returns the mean of the start poses of all arms, shape (m,).
 
-    A shared pose consists of the joint angles, or in task space of the end effector's pose.
+    A pose consists of the joint angles, or in task space of the pose of the end effector (tip).
 
     Args:
         scenario: The description of the experiment.

@@ -93,10 +93,10 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
 
 
 class _SiteTickMap(NamedTuple):
-    """Linear model of one site over one tick (period of its control loop): X' = P X + Q w.
+    """Linear model of one arm over one tick (control period): X' = P X + Q w.
 
-    X contains the n states of the site at a tick, and X' the states at the next tick. w
-    contains what the site receives from the other sites.
+    X contains the n states of the arm at a tick, and X' the states at the next tick. w contains
+    what the arm receives from the other arms.
 
     Attributes:
         P: Effect of the states, shape (n, n). The states are the joint angles and velocities,
@@ -389,10 +389,10 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
 
 
 class _TickRun(NamedTuple):
-    """Consecutive ticks of one site whose used samples have all been computed before the first.
+    """Consecutive ticks (control periods) of one arm that can be computed together.
 
-    The received effects of such ticks are computed in one array operation, instead of tick by
-    tick.
+    All messages that the arm uses in these ticks have been sent before the first of them. Their
+    effects are computed in one array operation, instead of tick by tick.
 
     Attributes:
         site: Index of the site.
@@ -852,7 +852,7 @@ def compute_sampled_spectrum(
 
 
 class SampledLoop:
-    """Coupled arms with controllers in ticks, whose roots can be computed about several poses.
+    """Linear model of coupled arms whose controllers act in ticks, for several poses of rest.
 
     The modes about a first pose are a good start for the search of those about a second pose
     nearby, which then takes half of the time.

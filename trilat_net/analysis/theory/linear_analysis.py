@@ -176,7 +176,7 @@ class LinearAnalysis(Result):
         return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the analysis as plain values, with the keys of `trilat linear --json`.
+        """Converts the analysis to plain values, as `trilat linear --json` prints them.
 
         Parts that were not requested, or that do not exist for this loop, are None or empty.
         """
@@ -297,9 +297,10 @@ class _AnalysedLoop(NamedTuple):
 
 
 def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
-    """Finds the loop at the end of a run, whose roots a stability certificate states as well.
+    """Finds the control loop at the end of a run, which the linear analysis examines.
 
-    If the arms have no equilibrium near the end, that of a longer run or a prediction is used.
+    A stability certificate states the roots of the same loop. If the arms have no equilibrium
+    near the end, that of a longer run or a prediction is used.
 
     Args:
         scenario: The scenario of the run.

@@ -153,7 +153,7 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
 
 class LinearEdge(NamedTuple):
-    """A value of a scenario's key at which a loop becomes stable or unstable.
+    """A value of one setting at which coupled arms become stable or unstable.
 
     At this value a characteristic root crosses the imaginary axis, and small motions oscillate
     with the frequency of the root.

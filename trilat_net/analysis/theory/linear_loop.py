@@ -200,9 +200,9 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
 
 
 def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that each site sends to its peers at an equilibrium.
+    """Computes the pose that each arm sends to the other arms while all of them rest.
 
-    It consists of the joint angles, or in task space of the end effector's pose.
+    It consists of the joint angles, or in task space of the pose of the end effector (tip).
 
     Args:
         conditions: The sites, gains and delays of the loop.

@@ -491,10 +491,10 @@ def _fix_delays(
     last_ticks: Sequence[int],
     find_used: Callable[[int, int, Ints], Ints],
 ) -> _FixedDelays:
-    """Returns a scenario with the delays that occurred in its run.
+    """Returns a scenario in which random and measured delays are those of its run.
 
-    Random and measured delays cannot be predicted. For them the samples in use in the last
-    quarter of the run stand for all later ones.
+    These delays cannot be predicted. The messages in use in the last quarter of the run stand
+    for all later ones.
 
     Args:
         scenario: The scenario up to the end of the run.
@@ -549,9 +549,9 @@ def _fix_delays(
 def _choose_end_state(
     scenario: Scenario, trace: RunTrace, theta_hat: Sequence[Array]
 ) -> _EndState:
-    """Chooses the angles and the estimates of all sites at the end of a run.
+    """Chooses the joint angles and parameter estimates of all arms at the end of a run.
 
-    The angles of a site at rest are the last ones. Those of a site that still moves are the
+    The angles of an arm at rest are the last ones. Those of an arm that still moves are the
     mean over the last quarter of the run, in intervals of 50 ms.
 
     Args:

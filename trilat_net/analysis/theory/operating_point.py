@@ -97,10 +97,10 @@ class _EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The gains, delays, weights and operators from which the linear model of a loop is built.
+    """Gains, delays, weights and operators from which the linear model of the arms is built.
 
     They are those at the end of a run of the scenario, see `OperatingConditions.derive`. N is
-    the number of sites.
+    the number of arms (sites).
 
     Attributes:
         sites: Setups of the sites in scenario order, with the operators and environments in
@@ -217,7 +217,7 @@ class OperatingConditions(NamedTuple):
 
     @classmethod
     def derive(cls, scenario: Scenario, *, own_laws: bool = True) -> "OperatingConditions":
-        """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
+        """Collects the numbers of a scenario's linear model, as they are at the end of a run.
 
         They are delays, dominance factors, gains and operators, after all planned changes.
 

@@ -59,7 +59,7 @@ _NEGLIGIBLE = 1e-3
 
 
 class LoopOutput(NamedTuple):
-    """An output of a loop that depends on its present and on its past state x.
+    """Output of a linear loop that depends on its present and its delayed states x.
 
     It is y(t) = C x(t) + sum_k C_k x(t - T_k).
 
@@ -371,12 +371,12 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
 
 
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
-    """Returns the loop with the arm of a site held still by a clamp.
+    """Returns the linear model of the arms with one arm held still by a clamp.
 
-    The torque u_c of the clamp makes the site's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
+    The torque u_c of the clamp makes the arm's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
     u + delayed terms). Here x is the state, u the other torques, A_c and B_c are the rows of
     the loop's matrices for these accelerations, and B_cc is the part of B_c that belongs to the
-    site's own torques. The torque acts wherever the law uses the site's torque.
+    arm's own torques. The torque acts wherever the law uses the torque of this arm.
 
     Args:
         loop: The loop.

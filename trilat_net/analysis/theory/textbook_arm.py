@@ -75,7 +75,7 @@ def _build_cross_matrix(a: Numbers) -> Numbers:
 
 
 def _build_inertia_units() -> Numbers:
-    """Returns the spatial inertia of each unit parameter of a link, shape (10, 6, 6).
+    """Returns the spatial inertia of a link for each unit parameter, shape (10, 6, 6).
 
     A link's inertia is linear in its parameters: mass, first moments, second moments.
     """
@@ -358,9 +358,9 @@ class PlacedChain:
         return solve_columns(M, net_torque)
 
     def _compute_stop_torque(self, qd: Numbers) -> Numbers:
-        """Returns the torque of the joints' mechanical stops, shape (n, ...), in N m.
+        """Returns the torque of the mechanical end stops of the joints, shape (n, ...), in N m.
 
-        A stop at the end of a joint's range is a spring with a damper.
+        An end stop is a spring with a damper at the end of a joint's range.
         """
         q = self._q
         stiffness = self._get_per_joint("stop_stiffness")
@@ -462,7 +462,7 @@ class PlacedChain:
         return rate + frame_rate
 
     def _move_to_tip(self, columns: Numbers) -> Numbers:
-        """Converts spatial velocities of the last link to the point of the end effector.
+        """Converts spatial velocities from the last link to the end effector (tip of the arm).
 
         The arguments are along the axes of the link, and the results along those of the base.
         Both have the shape (6, n, ...).
@@ -934,9 +934,10 @@ def follow_in_task(
 
 
 def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
-    """Returns the difference x - x_des of two poses, shape (m, ...).
+    """Returns the difference x - x_des of two poses of an end effector, shape (m, ...).
 
-    Orientations R and R_des differ by the rotation vector Log(R R_des').
+    Positions are subtracted. Orientations R and R_des differ by the rotation vector Log(R
+    R_des').
     """
     e = x - x_des
     if len(x) == POSITION:

@@ -130,10 +130,10 @@ def estimate_miss_probability(directions: int) -> float:
 
 
 class RestDeparture(NamedTuple):
-    """A time in which a run and its twins moved away from rest by themselves.
+    """Interval of time in which a run moved away from rest by itself, so that rest is unstable.
 
-    Twins are repeated runs with a small push. Nobody acts on the arms during this time, which
-    shows that the rest position is unstable.
+    Its twins, repeated runs with a small push, did the same. Nobody acted on the arms during
+    this time.
 
     Attributes:
         from_s: Start, in s.
@@ -880,7 +880,7 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the pushes and how they develop, with the keys of `trilat twin --json`.
+        """Converts pushes and their effects to plain values, as `trilat twin --json` prints.
 
         The entry "linear" is None if the growth was not compared with characteristic roots.
         """

@@ -114,9 +114,9 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Time at which each message is due, in ns after the start of the session, shape (K,).
+        """Time of each message, in ns after the start of the session, shape (K,).
 
-        The player publishes each message at this time, scaled by the speed of playing.
+        The player publishes each message at this time, scaled by the speed of the replay.
         """
         return self.rows[:, _TIME]
 
@@ -220,9 +220,9 @@ class MessageBatch:
 
 
 class BatchBuilder:
-    """Collects messages in the order of a log file, and sorts them into the order of playing.
+    """Collects messages in the order of a log file, and sorts them for replaying.
 
-    To play a log means to publish its messages again, each at its original time.
+    To replay a log means to publish its messages again, each at its original time.
 
     Args:
         kept: Messages that were sorted in an earlier step but have not been played yet. They

@@ -216,7 +216,7 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Supplies the messages again from the first one, when a log is played in a loop.
+        """Supplies the messages of the log again from the first one, for replaying in a loop.
 
         A log in memory is queued once more. For a long log, the reader process begins again on
         its own.

@@ -39,9 +39,9 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Converts times in a log to the times on the clock at which messages are published.
+    """Schedule of a replay: converts times in a log to times on the player's clock.
 
-    The conversion is a linear function of the start time and the speed of playing.
+    The conversion is a linear function of the start time and the speed of the replay.
 
     Attributes:
         origin_ns: Deadline of the time `start_ns` on the clock, in ns.
@@ -138,10 +138,10 @@ LATENESS_LIMIT_US = 100_000
 
 
 class LatenessSummary(NamedTuple):
-    """States how late messages were published: median, 99th percentile and maximum, in us.
+    """How late messages were published in a replay: median, 99th percentile and maximum.
 
-    If a percentile is above `LATENESS_LIMIT_US`, the histogram does not resolve it. Then it is
-    replaced by the maximum.
+    The times are in us. If a percentile is above `LATENESS_LIMIT_US`, the histogram does not
+    resolve it. Then it is replaced by the maximum.
     """
 
     p50_us: int

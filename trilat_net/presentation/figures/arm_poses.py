@@ -150,7 +150,7 @@ def trace_bodies_m(
 
 
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
-    """Projects points of an arm to the plane of a picture.
+    """Projects points of an arm to the plane of a picture, in m.
 
     A planar arm lies in the plane already. An arm in space is seen from one fixed direction,
     with "up" opposite to gravity.

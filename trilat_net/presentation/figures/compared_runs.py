@@ -65,7 +65,7 @@ def draw_compared_runs(
 ) -> Figure:
     """Draws a signal, such as the joint angles, of several runs over one another.
 
-    There is a panel per site (arm) and joint. The dashes of a line distinguish the runs.
+    There is a panel per arm and joint. The dashes of a line distinguish the runs.
 
     Args:
         logs: Logs of the runs, by their names in the legend.

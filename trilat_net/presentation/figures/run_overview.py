@@ -210,9 +210,10 @@ def _style_run(number: int) -> dict[str, Any]:
 
 
 def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
-    """Returns the largest value of all sites of a run over time, as one curve to compare runs.
+    """Returns the largest value of all arms of a run over time, as one curve per run.
 
-    Time is divided into equal spans, and the curve has a point per span.
+    Time is divided into equal spans, and the curve has a point per span. Several runs can be
+    compared in one panel in this way.
 
     Returns:
         Middles of the spans in s, and largest values, each of shape (S,). The value of a span
