@@ -92,7 +92,7 @@ CollectProvenance = Callable[[], Mapping[str, str]]
 
 
 class Recorder:
-    """Runs one recording: joins the session, writes its messages, and completes the file.
+    """Process that records one session: joins it, writes its messages, and completes the log.
 
     The recorder is a process of its own, so that a slow disk cannot delay the control loops of
     the arms.
@@ -201,7 +201,7 @@ class Recorder:
         scenario, make_views = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
-            """Creates the writer for one of the files into which a long log is divided.
+            """Creates the writer for one MCAP file. A long log is divided into several files.
 
             Args:
                 stream: The open file.

@@ -595,9 +595,9 @@ class SiteReception:
 
     @property
     def lacks_messages(self) -> bool:
-        """True if a message is missing that the site can still send again.
+        """True if a message is missing that its sender can still send again.
 
-        Messages that were given up, because the site has overwritten them, do not count.
+        Messages that the sender has overwritten in its buffer do not count.
         """
         return any(account.find_requestable_gap() for account in self.accounts.values())
 

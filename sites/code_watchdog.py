@@ -63,11 +63,10 @@ def _read_thread_usage() -> tuple[int, int]:
 
 
 class WatchedCode:
-    """Calls a user's own code, and measures its computing time.
+    """Calls a user's own code, such as a control law, and limits its computing time.
 
-    The code is for example a control law in Python, which the control loop of the arm calls in
-    every period. Code that is too slow would make the arm unsafe, and ends the run with an
-    error.
+    The control loop of the arm calls the code in every period, for example every millisecond.
+    Code that is too slow would make the arm unsafe, and ends the run with an error.
 
     Args:
         name: Name of the code, as in "the law mylaw:MyLaw".

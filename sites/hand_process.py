@@ -178,7 +178,7 @@ def _read_view(message: HandViewMessage) -> HandView:
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
-        """Reads fields of a message by their names, and converts lists of numbers to arrays.
+        """Reads the fields of a message that have given names, with lists converted to arrays.
 
         The field "peers" is left out, because it is converted separately.
 

@@ -329,7 +329,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages for retransmission, and publishes them in larger blocks.
+            """Stores messages for sending them again, and publishes them in larger blocks.
 
             Args:
                 payloads: The encoded messages.

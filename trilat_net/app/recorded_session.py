@@ -21,7 +21,7 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
     """
 
     def read_scenario(text: str, source: str) -> RecordedScenario:
-        """Reads the text of a scenario that a process of the session has sent.
+        """Reads the scenario (TOML text) that a process of the session has sent.
 
         Args:
             text: TOML text of the scenario.

@@ -631,9 +631,9 @@ class RunningSession:
                 inboxes.append(bus.inbox(key, STATES_KEPT))
 
             def receive() -> list[State]:
-                """Returns the records of the sites that have arrived since the last call.
+                """Returns the records of all arms that have arrived since the last call.
 
-                A record contains what a site measured and computed in one period of its control
+                A record contains what was measured and computed in one period of a control
                 loop. The list is empty if none has arrived.
                 """
                 return [record for inbox in inboxes for record in read_records(inbox)]
@@ -779,10 +779,10 @@ class RunningSession:
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:
-                """Returns the present weight with which the site follows each other site.
+                """Returns the present weights with which an arm follows each other arm.
 
-                The keys are the names of the other sites. The present time is the time of the
-                newest record that has arrived from the site.
+                The keys are the names of the other arms' sites. The present time is the time of
+                the newest record that has arrived from the arm's process.
                 """
                 nonlocal now_ns
                 for event in read_messages(events, Event):

@@ -673,7 +673,7 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
     """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
-        """Returns the numbers and times of a site's K ticks, and the values to draw.
+        """Returns the ticks and times of an arm's K records, and the values to draw.
 
         Args:
             site: Name of the site.

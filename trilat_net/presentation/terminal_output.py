@@ -228,12 +228,12 @@ def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
     percent = ""
 
     def show(done: int, total: int) -> None:
-        """Stores the progress for the next line."""
+        """Stores the progress of a command, which the next printed line states."""
         nonlocal percent
         percent = f"{100 * done // total} %, " if total > 0 else ""
 
     def print_lines() -> None:
-        """Prints the lines until the work ends."""
+        """Prints lines with the progress at intervals, until the work ends."""
         if has_ended.wait(LINES_AFTER_S):
             return
         err.print(f"{label} ...", markup=False, soft_wrap=True)

@@ -195,7 +195,7 @@ def _make_probe() -> Callable[
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
-        """Describes the worker process in which it is called, and checks its control laws.
+        """Describes the worker process in which it runs, and checks its files of control laws.
 
         Args:
             laws: Name of each imported control law, with the SHA-256 of its file.

@@ -528,7 +528,7 @@ def compute_energy_balance(
     all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
-        """Returns the energies of a kind over time, each accumulated over the judged periods.
+        """Returns the energies of one kind, such as dissipation, summed over judged periods.
 
         Args:
             kind: The kind, such as "dissipation" or "work".
@@ -652,7 +652,7 @@ def _trace_weights(
     beta_by_matrix: dict[bytes, Array] = {}
 
     def compute_beta(t_s: Array, ahead_s: float) -> Array:
-        """Computes the weights beta of the sites in V from the dominance factors.
+        """Computes the weights beta of the arms in the energy V from the dominance factors.
 
         Dominance factors seldom change. Therefore the weights of a matrix of factors are
         computed once and kept in `beta_by_matrix`.

@@ -1002,7 +1002,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
-        """Returns the power at given motions, shape (rows,), in W."""
+        """Returns the power of the friction that the law does not know, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 

@@ -278,7 +278,7 @@ def measures(
     """
 
     def declare(measure: _DeclaredMeasuring) -> _DeclaredMeasuring:
-        """Registers a function, unless one of its quantities is registered already."""
+        """Registers a function that computes metrics. A metric may be registered only once."""
         definitions = {
             quantity.key: declared for declared in _MEASURES for quantity in declared.quantities
         }

@@ -73,7 +73,10 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     end_s = scenario.duration_s
 
     def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
-        """Leaves out what never rests, and lets springs of the original end stay for ever."""
+        """Adapts operators and walls to a longer run, in which the arms shall come to rest.
+
+        Those that never rest are left out, and springs of the original end stay for ever.
+        """
         extended = []
         for actor in actors:
             starts_later = getattr(actor, "start_s", 0.0) > end_s

@@ -148,7 +148,10 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
-        """Marks the steps between neighbouring frequencies that must be divided."""
+        """Marks neighbouring frequencies between which the response changes too much.
+
+        These steps of the grid are then divided.
+        """
         size = np.linalg.norm(Y, axis=(1, 2))
         larger_size = np.maximum(size[1:], size[:-1])
         reference = np.maximum(larger_size, 1e-300)
@@ -244,7 +247,7 @@ def find_minima(
         return tolerance(w) if tolerance is not None else np.zeros(len(w))
 
     def evaluate(w: Array) -> Array:
-        """Returns the curve and its rounding error at frequencies, shape (F, 2)."""
+        """Returns the curve and its rounding error at given frequencies, shape (F, 2)."""
         values = curve(w)
         rounding = find_rounding(w)
         return np.stack([values, rounding], axis=1)

@@ -467,7 +467,7 @@ def _replace_estimate(
     estimate = layout.estimate
 
     def convert(derivative: Array) -> Array:
-        """Returns a derivative by the new states."""
+        """Converts a derivative with respect to the estimates to one by the new states z."""
         motion = derivative[:, : estimate.start]
         by_estimate = derivative[:, estimate]
         by_z = by_estimate @ estimate_by_z

@@ -159,10 +159,11 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
             raise ScenarioError(problem, source=log.source)
 
     def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns which samples of a peer a site had in use at given ticks, from its records.
+        """Returns which messages of another arm were in use at given ticks, from the records.
 
-        A sample is the state that a site sends once per tick, and samples are numbered from 0.
-        A tick without a record has the samples of the last record before.
+        Such a message, a sample, is the state that an arm sends once per tick (control period).
+        Samples are numbered from 0. A tick without a record has the samples of the last record
+        before.
 
         Args:
             i: Index of the receiving site.
@@ -217,7 +218,7 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         return find_log_loop(simulate_scenario(ended), own_laws=True)
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns which samples of a peer a site had in use at ticks, by the delay model.
+        """Returns which messages (samples) of another arm were in use, by the delay model.
 
         The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
         without a log has no records, but the random delays of the link can be drawn again from

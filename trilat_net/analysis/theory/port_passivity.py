@@ -187,7 +187,7 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of these eigenvalues."""
+        """Returns the rounding error of the least eigenvalue at each frequency w, in rad/s."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
@@ -288,7 +288,7 @@ def check_passivity(
     """
 
     def evaluate_weighted(w: Array) -> Complex:
-        """Returns the response, with the weights of the ports if there are any."""
+        """Returns the frequency response, with the weights of the ports if there are any."""
         Y = response(w)
         return Y if weights is None else weight_response(Y, weights)
 
@@ -297,7 +297,7 @@ def check_passivity(
         return find_least_eigenvalue(weighted)
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of the least eigenvalue."""
+        """Returns the rounding error of the least eigenvalue at each frequency w, in rad/s."""
         Y = response(w)
         norm = _find_frobenius_norm(Y)
         return EIGENVALUE_ROUNDING * norm

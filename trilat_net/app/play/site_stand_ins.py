@@ -409,7 +409,7 @@ class SiteStandIns:
         start_index, boot = self._find_start(site)
 
         def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
-            """Finds the messages that a recorder requests because it has missed them.
+            """Finds the replayed messages that a recorder requests again after missing them.
 
             Args:
                 request: The channel, and the numbers of the first and last requested message.

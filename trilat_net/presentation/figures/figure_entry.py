@@ -78,7 +78,7 @@ def draws(
     """
 
     def register(draw: Drawing) -> Drawing:
-        """Registers a function, and returns it unchanged."""
+        """Registers a function that draws a figure under its name, and returns it unchanged."""
         other = _ENTRIES.get(name)
         if other is not None:
             modules = f"{other.draw.__module__} and {draw.__module__}"
