@@ -90,7 +90,7 @@ class SessionResult:
 
 
 class SessionProcess:
-    """State of one process of a session: a site, a recorder or an operator program.
+    """State of one process of a session: of an arm, the recorder or an operator program.
 
     `ProcessStarter` creates this object, and updates it with the reports of the starter
     process.
@@ -524,10 +524,10 @@ def _end_all(
     interrupt: Interrupt,
     say: Callable[[str], None],
 ) -> None:
-    """Ends the processes of a session: first the sites, and then the recorder.
+    """Ends the processes of a session: first those of the arms, and then the recorder.
 
-    In this order, the recorder stores the last messages of the sites. If the user presses
-    Ctrl-C a second time, all processes receive another signal, which ends them at once.
+    In this order, the recorder stores the last messages of the arms. If the user presses Ctrl-C
+    a second time, all processes receive another signal, which ends them at once.
 
     Args:
         starter: Starter of the processes.

@@ -561,7 +561,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if a machine achieves a tick rate, judged by how late its ticks are.
+    """Returns True if a machine achieves a control rate, judged by how late its periods begin.
 
     The rate is achieved if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
 
@@ -582,10 +582,10 @@ _RATES_CODE = (
 
 
 def examine_rate() -> DoctorFinding:
-    """Returns the highest tick rate that a single control loop achieves on this machine.
+    """Measures the highest rate at which a control loop is punctual on this machine.
 
-    A tick is one period of the control loop. Each rate of `RATES_HZ` is tried for
-    `REHEARSAL_S`, until the loop is punctual.
+    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until the loop begins its periods on
+    time. An example is 1000 Hz.
     """
     if not is_core_cached():
         return DoctorFinding(

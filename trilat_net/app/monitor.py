@@ -95,10 +95,9 @@ def describe_site(
 
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
-    """Returns the texts of a site's row that follow from its newest record.
+    """Returns the texts of an arm's table row that follow from its newest record.
 
-    The display of `trilat demo` and `trilat watch` has one row per site, the process that runs
-    one arm.
+    The display of `trilat demo` and `trilat watch` has one row per arm.
 
     Args:
         scenario: Scenario of the session.
@@ -288,7 +287,7 @@ class SessionDisplay:
 
 
 class SessionMonitor:
-    """Receives the messages of all sites of a session, and shows them on a display.
+    """Receives the messages of all arms of a session, and shows them on a display.
 
     The program of a user who watches the session creates this object and calls `poll`
     repeatedly.
@@ -323,7 +322,7 @@ class SessionMonitor:
             self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and updates the display if that is due.
+        """Receives the messages that have arrived, and refreshes the display if that is due.
 
         Important events are printed as lines above the table. The method does not wait.
         """

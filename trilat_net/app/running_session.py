@@ -231,10 +231,10 @@ class RunningSession:
 
     @contextmanager
     def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
-        """Waits until a site runs, and connects to its session, as a context manager.
+        """Waits until the process of an arm runs, and connects to its session.
 
-        A site is the process that controls one robot arm. The connection is closed at the end
-        of the `with` block.
+        Such a process is called a site. This is a context manager, and the connection is closed
+        at the end of the `with` block.
 
         Args:
             site: Name of the site.
@@ -344,9 +344,10 @@ class RunningSession:
         return _read_replies(self.send_order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
-        """Clears the fault of arms, so that they can be enabled again.
+        """Clears the fault of arms, such as lost measurements, so that they can move again.
 
-        A fault whose reason persists is not cleared. The command `trilat reset` does the same.
+        The arms can then be enabled. A fault whose reason persists is not cleared. The command
+        `trilat reset` does the same.
 
         Args:
             *sites: Names of the sites. All sites if no name is given.
@@ -666,16 +667,16 @@ class RunningSession:
             picture_delay: PictureDelay | None = None  # created when the first record arrives
 
             def find() -> dict[str, State]:
-                """Returns one record of each site, by the name of the site.
+                """Returns the newest known state of every arm, by the name of its site.
 
-                A record is the stored result of one tick, a period of a site's control loop.
-                Without `as_site`, it is the newest record that has arrived. With `as_site`, it
-                is the record of the pose that the user of that site sees. The dictionary is
-                empty until the first record has arrived.
+                A site is the process that controls an arm. The state is a record, the stored
+                result of one tick (period of a control loop). The dictionary is empty until the
+                first record has arrived.
 
-                The records that arrive from `inbox` are kept in `latest_records`, because the
-                user may see an older pose than the newest. `picture_delay` computes which tick
-                of each peer the user sees, as the scenario may delay the user's picture.
+                With `as_site`, the states are those that the user of that site sees. This may
+                be an older pose, because the scenario may delay the user's picture.
+                `picture_delay` computes which tick of each arm the user sees, and
+                `latest_records` keeps the records that arrive from `inbox`.
                 """
                 nonlocal picture_delay
                 for record in read_records(inbox):
@@ -795,9 +796,10 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures round trip times and clock offsets of the session, as `trilat ping` does.
+        """Measures round trip times and clock offsets between the processes of the session.
 
-        A member is a process of the session: a site, which runs one arm, or a recorder.
+        The command `trilat ping` does the same. A member is a process of the session: a site,
+        which runs one arm, or a recorder.
 
         Args:
             count: Number of pings to each member.

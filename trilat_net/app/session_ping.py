@@ -69,9 +69,9 @@ class PingReport(Result):
     links: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per member of the session, for a table or a data frame.
+        """Returns one table row per process of the session, for example for pandas.
 
-        The links between sites are left out, because they have other columns.
+        The network links between the arms are left out, because they have other columns.
         """
         return self.members
 
@@ -400,10 +400,10 @@ def ping_topic(
 
 
 def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
-    """Returns the row of a publisher, with a histogram of its delays.
+    """Returns the table row of one publisher on a ROS 2 topic, with a histogram of its delays.
 
-    A publisher is a program that sends messages on the ROS 2 topic. The table lets the user
-    compare the publishers.
+    A publisher is a program that sends messages on the topic. The table lets the user compare
+    the publishers.
 
     Args:
         samples: Number and delay in ns of each message that arrived. The publisher numbers its

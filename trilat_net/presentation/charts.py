@@ -287,10 +287,9 @@ class ChartBuilder:
         return series
 
     def _build_motion_charts(self) -> Iterator[TimeChart]:
-        """Yields the charts of torques, positions, errors, estimates and displacements.
+        """Yields charts of the arms' torques, positions, errors, estimates and displacements.
 
-        Some of them are yielded only if the run has the quantity, such as the operator's
-        torque.
+        A chart is left out if the run lacks the quantity, such as the operator's torque.
         """
         log = self._log
         operated_sites = plot_signals.sites_with_operator(log)
@@ -385,10 +384,9 @@ class ChartBuilder:
         return self._add_table(site, trace.tick, trace.values)
 
     def _add_records(self, site: str, values: Values) -> int:
-        """Decimates values that belong to the records of a site, and adds them as a table.
+        """Reduces one arm's recorded values to what a page can show, and adds them as a table.
 
-        The records of a long run are more than the page can show. Decimation keeps their
-        extremes.
+        The records of a long run are more than the page can show. Their extremes are kept.
 
         Args:
             site: Name of the site.

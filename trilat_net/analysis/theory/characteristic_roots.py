@@ -129,9 +129,10 @@ class Pencil(NamedTuple):
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def sum_term_norms(self, s: complex) -> float:
-        """Returns the sum of the norms of the terms of the characteristic matrix Delta(s).
+        """Returns the size of the terms of the characteristic matrix Delta(s).
 
-        A residual of Delta(s) counts as zero if it is small compared with this sum.
+        It is the sum of their norms. A residual of Delta(s) counts as zero if it is small
+        compared with this sum.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -167,7 +168,7 @@ class Pencil(NamedTuple):
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
-        """Indices of the states whose delayed values act on the loop.
+        """Indices of the states whose delayed values act on the arms.
 
         An arm, for example, follows the angles that another arm had some time ago. Few states
         do so, and only these are discretised over the delay, which keeps the matrices small.

@@ -174,7 +174,7 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Finds the stable delays of a control loop whose links all have the same delay.
+    """Finds the network delays, equal on all links, for which a control loop is stable.
 
     The delays that the loop itself contains are replaced by this common delay. The unstable
     characteristic roots are counted for a small delay, below the first delay at which roots

@@ -94,9 +94,9 @@ class _EndLoop(NamedTuple):
 
 @limit_blas_threads()
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
-    """Computes whether small motions about the end pose of a recorded run die away.
+    """Decides by linear analysis whether small motions at the end of a recorded run die away.
 
-    The coupled arms are linearised at the pose at rest next to the last one. The result may
+    The coupled arms are linearised at the pose of rest next to the last pose. The result may
     prove the run stable, or refute it.
 
     Args:
@@ -116,7 +116,7 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
 
 @limit_blas_threads()
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
-    """Computes whether small motions about the end pose of a simulated run die away.
+    """Decides by linear analysis whether small motions at the end of a simulated run die away.
 
     The result is that of `find_log_roots` for a log of the same run, but no log is needed.
     Studies with many runs use this function.
@@ -262,10 +262,10 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
 
 
 def resolve_final_scenario(log: Log) -> Scenario:
-    """Returns the scenario of a log with the commands of the run as planned changes.
+    """Returns the scenario of a log, with the users' commands of the run as planned changes.
 
     Its duration is the recorded one, so that the settings in force at its end are those of the
-    final loop.
+    final control loop.
 
     Args:
         log: The log of the run.
@@ -668,10 +668,10 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
 
 
 def _has_sampled_wall(scenario: Scenario) -> bool:
-    """Returns True if the force of some environment is computed once per tick and held.
+    """Returns True if the force of some wall is computed once per control period and held.
 
-    An arm may then chatter at the wall, and its mean pose may be off the wall although it hits
-    it in every cycle.
+    An arm may then chatter at the wall, and its mean pose may be off the wall although the arm
+    hits the wall in every cycle.
 
     Args:
         scenario: Scenario of the run.

@@ -169,10 +169,10 @@ class OperatingConditions(NamedTuple):
 
     @property
     def has_forms(self) -> bool:
-        """True if gains alone do not describe the control law of some site.
+        """True if gains alone do not describe the control law of some arm.
 
-        Examples are laws that store numbers from tick to tick, or send waves. The coupled arms
-        are then linearised in continuous time only, and not tick by tick.
+        Examples are laws that store numbers from tick to tick (control period), or send waves.
+        The coupled arms are then linearised in continuous time only, and not tick by tick.
         """
         return any(form is not None for form in self.find_forms())
 

@@ -106,10 +106,10 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Returns the sites without which a session may begin, after checking them.
+    """Checks which arms may be absent at the start of a session, as an option names them.
 
-    Sites that join later are permitted only if the arms glide back to each other after a break.
-    Only the first site decides about the start of a session.
+    Arms that join later are permitted only if all arms glide back to each other after a break.
+    Only the first site (process of an arm) decides about the start of a session.
 
     Args:
         scenario: The scenario of the session.

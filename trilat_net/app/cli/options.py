@@ -331,9 +331,10 @@ MOST_LETTERS = 80
 
 
 def check_session_name(name: str) -> str:
-    """Checks that the name of a session can be part of a Zenoh key, and returns the name.
+    """Checks that the name of a session can be part of a network address, and returns it.
 
-    Zenoh is the network protocol, and its keys are the names of the channels.
+    Zenoh, the network library, calls such an address a key, in which some characters are not
+    allowed.
 
     Raises:
         UsageError: The name is too long or has other characters.
@@ -577,7 +578,7 @@ def split_names(text: str | None) -> list[str]:
 
 
 def list_used_options(context: typer.Context) -> list[str]:
-    """Lists the options and arguments that the user wrote on the command line.
+    """Lists the options that the user wrote on the command line, without those at defaults.
 
     Commands use the list to refuse combinations: an option with its default value is no
     conflict.
@@ -594,10 +595,10 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """The options with which a process takes part in a session as one of its members.
+    """Options with which a process connects to the other processes of a session.
 
-    The members of a session are its sites and recorders. The options say at which endpoints the
-    process listens, to which it connects, and with which keys.
+    The options say at which network endpoints the process listens, to which it connects, and
+    with which keys.
     """
 
     listen: ListenOption = None
@@ -691,7 +692,7 @@ class Reach(NamedTuple):
 
 
 class LawFiles(NamedTuple):
-    """The options that allow files to run as the user-written control laws that a log names.
+    """Options that permit a log's control laws, written by a user, to be executed.
 
     A log may come from somebody else. Code that it names runs only with the permission of the
     user.
@@ -739,7 +740,7 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """The options of a command that runs a session on this machine and reports on it.
+    """Options of a command that runs a session on this machine and reports on it.
 
     The options override parts of the scenario (`load`), name the folder of the results, and say
     what is written and printed.

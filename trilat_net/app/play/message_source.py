@@ -49,9 +49,9 @@ and above other processes.
 
 
 class _RoundEnd(NamedTuple):
-    """States that the messages of a round have ended, in the stream from the reader process.
+    """Message from the process that reads a log: all messages of a round were sent.
 
-    A round is one pass through the log. A log that is played in a loop has several rounds.
+    A round is one pass through the log. A log that is replayed in a loop has several rounds.
 
     Attributes:
         strays: Number of messages that could not be played in order, because their place in the
@@ -79,10 +79,10 @@ class _ReadPiece(NamedTuple):
 
 
 class MessageSource:
-    """Supplies the messages of a log in the order in which they are played.
+    """Supplies the messages of a log in the order in which they are replayed.
 
-    A log that is played in a loop has several rounds, passes through the log. Its messages are
-    supplied round after round.
+    A log that is replayed in a loop has several rounds, passes through the log. Its messages
+    are supplied round after round.
 
     Args:
         header: Description of the files. The topics and damages that are found during reading

@@ -150,7 +150,7 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Counts messages by their lateness: the time from the deadline to the publication.
+    """Counts the published messages of a replay by their lateness behind the deadline.
 
     Percentiles can be computed at any time from the counts, without storing every lateness. The
     width of an interval is 1 us.

@@ -65,10 +65,10 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
-        """Finds out whether the messages of a channel are played.
+        """Returns True if the messages of a channel (topic) of the log are replayed.
 
-        By default, these are the channels of the sites, the processes that each control one
-        arm. If the user includes channels explicitly, only the user's filter counts.
+        By default, these are the channels of the arms. If the user includes channels
+        explicitly, only the user's filter counts.
 
         Args:
             topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -332,10 +332,10 @@ class SessionReader:
                 yield from self._read_file(path, reader)
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
-        """Yields the messages of a file that are played, and completes the session's header.
+        """Yields the messages of a log file that are replayed, and completes the header.
 
-        Each message is yielded with its time, the number of its channel, and the number that
-        orders it within the channel.
+        The header describes the session. Each message is yielded with its time, the number of
+        its channel, and the number that orders it within the channel.
 
         Args:
             path: The file.

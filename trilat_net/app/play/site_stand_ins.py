@@ -128,7 +128,7 @@ class PlayedHistory:
         self._messages.clear()
 
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Finds consecutive messages for one reply to a recorder.
+        """Finds consecutive replayed messages for one reply to a recorder that missed them.
 
         A reply has no gaps. It contains at most `BACKFILL_MESSAGES` messages and, unless a
         single message is larger, at most `BACKFILL_BYTES` bytes.
@@ -192,9 +192,9 @@ so that its encoding takes long.
 
 
 class SiteStandIns:
-    """Acts for all sites of a recorded session while its log is played.
+    """Takes the place of all arms' processes of a recorded session while it is replayed.
 
-    To other programs, a log that is played thus looks like a running session: its sites
+    To other programs, a log that is replayed thus looks like a running session: its arms
     announce themselves, reply to queries, and send messages again that a recorder missed.
 
     Args:
