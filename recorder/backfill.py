@@ -55,11 +55,14 @@ RepairedMessage = tuple[str, SiteMessage, bytes]
 
 
 class _OpenRequest(NamedTuple):
-    """A request that waits for its reply.
+    """A request for missing messages that the recorder has sent and that is not yet answered.
+
+    Messages can get lost on the network. The recorder then requests them again from their
+    sender.
 
     Attributes:
-        request: The request.
-        replies: Inbox for the replies.
+        request: The request, which states the wanted message numbers.
+        replies: Inbox in which the network connection stores the replies to the request.
         sent_ns: Time at which the request was sent, on the monotonic clock, in ns.
     """
 
@@ -69,9 +72,10 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """Requests the messages of one site that were lost on the network, from the site itself.
+    """Requests messages that were lost on the network again from the site that sent them.
 
-    The site is the process that controls one arm, and keeps its recent messages in a buffer.
+    A site is the process that controls one arm. It keeps its recent messages in a buffer.
+    Without repair, the log would have gaps.
 
     Args:
         bus: Network connection of the recorder.
@@ -118,7 +122,7 @@ class GapRepair:
     def is_active(self) -> bool:
         """True if messages are missing that the site may still have, or if a reply is awaited.
 
-        The recorder then polls more often than it flushes the file.
+        The recorder then checks for replies more often than it writes to the disk.
         """
         return self._open is not None or self._due_ns is not None
 
@@ -126,7 +130,7 @@ class GapRepair:
     def progress_ns(self) -> int:
         """Time at which the last missing message arrived, on the monotonic clock, in ns.
 
-        If it lies long ago, the site probably has no more of them.
+        If it lies long ago, the site probably has no more missing messages.
         """
         return self._progress_ns
 
@@ -409,7 +413,7 @@ class GapRepair:
             self._count_vain_request(channel)
 
     def _count_vain_request(self, channel: str) -> None:
-        """Counts a reply that filled no gap, and gives up after `MAX_VAIN_REQUESTS` of them.
+        """Counts a request that filled no gap, and gives up after `MAX_VAIN_REQUESTS` of them.
 
         All messages that are missing in the channel then count as missing for good.
 

@@ -68,9 +68,10 @@ A longer period costs less computing time.
 
 
 class RecordedScenario(NamedTuple):
-    """Scenario of a session, as far as the recorder needs it.
+    """The parts of a session's scenario that the recorder needs.
 
-    The recorder does not import the scenario's own package, so the caller provides both parts.
+    A scenario is the TOML text that describes the arms, their control laws and the network. The
+    recorder does not import the code that interprets it, so its caller provides the parts.
 
     Attributes:
         scenario: Names, rates and sizes of the sites, from which the messages to expect follow.
@@ -91,7 +92,7 @@ CollectProvenance = Callable[[], Mapping[str, str]]
 
 
 class Recorder:
-    """Runs one recording: joins the session, writes its messages, and completes the file.
+    """Process that records one session: joins it, writes its messages, and completes the log.
 
     The recorder is a process of its own, so that a slow disk cannot delay the control loops of
     the arms.
@@ -149,9 +150,9 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits until the session begins. If it is running already, the recorder joins it.
+        """Waits until the session begins, or joins a session that is running already.
 
-        The members of a session, the recorder included, first agree on a common start time.
+        All processes of a session, the recorder included, first agree on a common start time.
 
         Args:
             timeout_s: Longest time to wait, in s. None means no limit.
@@ -182,7 +183,10 @@ class Recorder:
         return None
 
     def record(self, epoch: Epoch) -> Recording:
-        """Writes the messages of the session until it ends.
+        """Writes the messages of the session to the log file until the session ends.
+
+        A session is a group of processes that each control one arm. They publish their results
+        on the network, and the recorder stores them in a log, an MCAP file.
 
         Args:
             epoch: Common start time of the session.
@@ -197,7 +201,7 @@ class Recorder:
         scenario, make_views = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
-            """Creates the writer for one of the files into which a long log is divided.
+            """Creates the writer for one MCAP file. A long log is divided into several files.
 
             Args:
                 stream: The open file.
@@ -267,12 +271,15 @@ class Recorder:
         return self._read_scenario(sender.scenario, sender.member)
 
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Announces that the recorder runs. If it joins late, it requests the earlier messages.
+        """Announces on the network that the recorder runs.
 
-        The other members then know that their messages are recorded.
+        A late one requests earlier messages.
+
+        The other processes of the session wait for this announcement, from which they know that
+        their messages are recorded.
 
         Args:
-            recording: The recording.
+            recording: The recording, which has just been created.
             epoch: Common start time of the session.
             path: The file, for the user.
         """
@@ -293,20 +300,23 @@ class Recorder:
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
-        """Tells the recording which members have appeared on the network or disappeared.
+        """Tells the recording which processes have joined the session's network or left it.
 
-        The recording decides from that which sites it still has to wait for.
+        Zenoh, the network library, reports both. From these reports the recording decides which
+        sites (processes that control an arm) it still has to wait for before it closes the log.
         """
         while (change := self._presence.poll()) is not None:
             key, alive = change
             recording.note_presence(key, alive)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
-        """Writes the messages periodically until the session is over or the recorder must end.
+        """Writes received messages to the log at regular intervals until the session is over.
+
+        The loop also ends if the recorder itself is told to end, for example by Ctrl-C.
 
         Args:
-            recording: The recording.
-            report: Publishes the statistics.
+            recording: The recording, whose log is written.
+            report: Publishes statistics of the recorder, such as the number of stored messages.
         """
         ending_since_ns: int | None = None
         while not (self._stopped() or recording.is_over(self._clock.monotonic_ns())):
@@ -366,7 +376,10 @@ def record_session(
     afterwards: Callable[[], None] = lambda: None,
     warn: Callable[[], None] = lambda: None,
 ) -> int:
-    """Records one session in this process, from its search on the network to the finished log.
+    """Records a session in this process, from finding it on the network to the finished log.
+
+    A session is a group of processes (sites) that each control one arm. They publish the
+    results of every control period, which the recorder writes to an MCAP file.
 
     Args:
         session: Name of the session.

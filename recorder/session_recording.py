@@ -53,7 +53,7 @@ LAST_NS = 6_000_000_000
 
 
 class Recording:
-    """Writes one log while it is recorded, and counts its received and missing messages.
+    """Writes the log (MCAP file) of a session, and counts received and missing messages.
 
     `Recorder` creates this object when the session begins, and calls `write` periodically.
 
@@ -171,8 +171,9 @@ class Recording:
     def assume_gone(self) -> None:
         """Regards every site as gone until the network reports that it is present.
 
-        A recorder that joins a running session cannot know which sites have left before it
-        came.
+        A site is a process that controls one arm. A recorder that joins a running session
+        cannot know which sites have left before. If it expected messages of such a site, it
+        would wait forever.
         """
         self._gone_sites = set(self._sites)
 
@@ -198,14 +199,19 @@ class Recording:
 
     @property
     def is_repairing(self) -> bool:
-        """True if messages are missing that a site may still have, or if a reply is awaited."""
+        """True while messages are missing that may still be obtained from their sender.
+
+        This is so if a site that has the messages is still present, or if the recorder waits
+        for its reply to a request. The log is not closed in the meantime.
+        """
         return any(repair.is_active for repair in self._repairs.values())
 
     @property
     def repaired_ns(self) -> int:
-        """Latest arrival of a missing message from any site, on the monotonic clock, in ns.
+        """Time at which the latest missing message of any site arrived, in ns.
 
-        A recorder that ends stops waiting if this lies too long ago.
+        It is a time of the monotonic clock. A recorder that ends stops waiting for missing
+        messages if it lies too long ago.
         """
         return max(repair.progress_ns for repair in self._repairs.values())
 
@@ -237,10 +243,11 @@ class Recording:
             self._note_admission(message.content)
 
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
-        """Publishes the event "stored": the log has all messages of a site that it can get.
+        """Announces that the log has all messages of one site that can still be obtained.
 
-        The process of the site waits for this event before it ends. The text says what stays
-        missing.
+        A site is the process that controls one arm. Its process waits for this event before it
+        ends, because it keeps messages that the recorder may request again. The text says which
+        messages stay missing.
 
         Args:
             site: Reception of the site, which has ended.
@@ -376,10 +383,10 @@ class Recording:
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
-        """Decodes a message of a site.
+        """Decodes a message of a site, the process that controls one arm.
 
-        If the message is the first one of the site's next start, that start is recorded from
-        now on.
+        If the process has been restarted and this is its first message, the new start is
+        recorded from now on.
 
         Args:
             key: Key under which the message arrived.
@@ -644,14 +651,17 @@ class Recording:
         return True
 
     def flush(self) -> None:
-        """Passes all written messages to the operating system.
+        """Passes all messages in the memory of this process to the operating system.
 
-        They are then in the file even if this process crashes.
+        After this call they are in the file even if this process crashes. Without it, a crash
+        would lose the messages since the last call.
         """
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
-        """Finishes the log with the counts of messages and the end mark.
+        """Closes the log: writes the numbers of messages and the mark of a complete file.
+
+        A log without this mark was cut off, for example by a power failure.
 
         Args:
             queue: Queue of the received messages.
@@ -663,7 +673,7 @@ class Recording:
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Formats the numbers of received and missing messages, as they are stored in the log.
+        """Formats the numbers of received and missing messages as text to be stored in the log.
 
         A reader of the log can see from these numbers whether the log is complete.
 
@@ -689,9 +699,7 @@ class Recording:
         return texts
 
     def render_summary(self) -> list[str]:
-        """Summarises the recording for the user.
-
-        The user sees there whether the log is complete.
+        """Returns lines that tell the user at the end whether the log is complete.
 
         Returns:
             A line for each site with the numbers of its records, and a line for each reason why
@@ -734,7 +742,10 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Returns the first problem of the recording, for the error message at its end.
+        """Returns the first problem of the recording, which becomes the recorder's error text.
+
+        The recorder ends with an error if the log is not complete, so that nobody uses an
+        incomplete log unknowingly. A site is a process that controls one arm.
 
         Returns:
             A sentence about a site that disappeared or lacks messages. None if there is no
@@ -790,9 +801,9 @@ class RecorderReport:
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
     def note_flush(self, duration_ns: int) -> None:
-        """Notes how long it took to pass the written messages to the operating system.
+        """Notes how long the operating system took to accept the written messages.
 
-        The next statistics state the longest of these times.
+        A slow disk shows first in these times. The next statistics state the longest one.
 
         Args:
             duration_ns: The time, in ns.
@@ -826,7 +837,7 @@ class RecorderReport:
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
-        """Returns the present statistics of the recording, for people who watch the session.
+        """Returns the present statistics of the recording for people who watch the session.
 
         They have, for each channel, the numbers of expected, received and missing messages, and
         the ranges of the missing ones.

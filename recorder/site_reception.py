@@ -65,11 +65,11 @@ _OTHER_KEYS = "others"
 
 
 class InboundMessage(NamedTuple):
-    """A message that has arrived over the network and waits to be written.
+    """A network message in the recorder's queue, which is not yet decoded or written to a log.
 
     Attributes:
-        key: Key under which the message was published. It names the session, the member and the
-            channel.
+        key: Network address ("key") under which the message was published. It names the
+            session, the member and the channel.
         payload: Bytes of the message.
         mono_ns: Time of the arrival on the monotonic clock, in ns.
     """
@@ -80,10 +80,10 @@ class InboundMessage(NamedTuple):
 
 
 class InboundQueue:
-    """Bounded queue of messages from the network's threads to the thread that writes them.
+    """Bounded queue of messages between the threads of the network and the writing thread.
 
-    If the disk is slow, messages wait here. A message for which there is no room is dropped and
-    counted.
+    While the disk is slow, messages wait here. A message is dropped and counted if the queue is
+    full, because an unbounded queue could use up the memory.
 
     Args:
         clock: Clock that determines the times of arrival.
@@ -176,7 +176,10 @@ _LEAST_EVENT_BYTES = 128
 
 
 class SiteMessage(NamedTuple):
-    """A message of a site after it was decoded, with its number.
+    """A decoded message of a site, with the numbers under which the log stores it.
+
+    A site is a process that controls one arm. It publishes a record of each control period
+    (tick), statistics of its network links, and events.
 
     Attributes:
         number: Number of the message in its channel. It is -1 for an event without a number.
@@ -266,9 +269,10 @@ class SiteReception:
         self._largest_counts[topics.EVENT] = self._event_bytes_left // _LEAST_EVENT_BYTES
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
-        """Decodes a message of the site and checks its sender and number, without counting it.
+        """Decodes a message of a site and checks its sender and number, without counting it.
 
-        The message is written to the log only if this method accepts it.
+        A site is the process that controls one arm. The message is written to the log only if
+        this method accepts it.
 
         Args:
             channel: Name of the channel in which the message arrived.
@@ -420,9 +424,10 @@ class SiteReception:
         return int(min(self._ticks, latest_ns * 1e-9 * self._rate_hz + 1.0))
 
     def _reserve_event_bytes(self, event: Event, size: int) -> None:
-        """Subtracts the size of an event from the bytes of events that are permitted.
+        """Limits how many bytes of events one site may add to the log.
 
-        Without this limit, a faulty site could fill the log with events.
+        Without this limit, a faulty site could fill the disk. The size of each event is
+        subtracted from the bytes that remain.
 
         Args:
             event: The event.
@@ -441,10 +446,10 @@ class SiteReception:
         self._event_bytes_left -= size
 
     def accept(self, channel: str, message: SiteMessage, received_ns: int) -> bool:
-        """Counts a message that the site published in the normal way, without a request.
+        """Counts a published message, and finds messages that are missing before it.
 
         A gap between its number and that of the previous message shows that messages are
-        missing.
+        missing. The method is for messages that were sent without a request.
 
         Args:
             channel: Name of the channel.
@@ -478,13 +483,13 @@ class SiteReception:
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Checks that a reply with missing messages comes from the right process of this site.
+        """Checks that a reply with missing messages comes from the right start of a process.
 
-        The reply of an earlier start of the process would contain messages with the same
-        numbers but other contents.
+        A site is the process that controls one arm. The reply of an earlier start of this
+        process would contain messages with the same numbers but other contents.
 
         Args:
-            reply: The reply.
+            reply: The reply to the recorder's request.
 
         Raises:
             WireError: The reply comes from another site, or from an earlier or later start of
@@ -497,7 +502,7 @@ class SiteReception:
             )
 
     def add_expected(self, channel: str, count: int) -> None:
-        """Takes into account that the site has published at least a given number of messages.
+        """Notes that a site has published at least a given number of messages in a channel.
 
         Expected messages that have not been received count as missing. Since a faulty site
         could state any number, the number is limited to what is possible in the scenario by
@@ -514,10 +519,11 @@ class SiteReception:
         self.accounts[channel].add_expected(min(count, largest))
 
     def count_previous_start(self, ticks: int) -> None:
-        """Takes into account how many ticks the previous start of the site executed at least.
+        """Notes how many control periods (ticks) a site executed at least before its restart.
 
-        The previous start may have been killed. In that case it could not state this number
-        itself, but other sites have received its samples (sent states).
+        A site is the process that controls one arm. If it was killed, it could not state this
+        number, but other sites have received its samples (sent states). Without the number,
+        records lost at the end of the previous start would not be counted as missing.
 
         Args:
             ticks: Number of ticks that another site reports.
@@ -526,10 +532,11 @@ class SiteReception:
             gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _count_implied(self, content: State | LinkStats | Event) -> None:
-        """Evaluates what a message shows about the existence of other messages.
+        """Finds out from a message which other messages of the sender exist.
 
-        A record states which ticks were skipped. Statistics show that all records up to their
-        tick exist. The events "join" and "end" state the first tick and the number of ticks.
+        A message that exists and did not arrive is counted as missing. A record states which
+        ticks were skipped. Statistics show that all records up to their tick exist. The events
+        "join" and "end" state the first tick and the number of ticks.
         """
         if isinstance(content, State):
             self._exclude_skipped_ticks(content)
@@ -544,9 +551,9 @@ class SiteReception:
                 self.add_expected(channel, count)
 
     def _exclude_skipped_ticks(self, record: State) -> None:
-        """States that no messages exist for the ticks that the site skipped before a record.
+        """Notes that no messages exist for control periods (ticks) that the site has skipped.
 
-        A site with an external arm skips ticks that it missed. They must not count as lost
+        A site with an external arm skips ticks that came too late. They must not count as lost
         messages.
 
         Args:
@@ -588,29 +595,35 @@ class SiteReception:
 
     @property
     def lacks_messages(self) -> bool:
-        """True if a message is missing that the site can still send again.
+        """True if a message is missing that its sender can still send again.
 
-        Messages that were given up, because the site has overwritten them, do not count.
+        Messages that the sender has overwritten in its buffer do not count.
         """
         return any(account.find_requestable_gap() for account in self.accounts.values())
 
     @property
     def is_complete(self) -> bool:
-        """True if the site has ended and every message that it can still send has arrived."""
+        """True if the site has ended and the recorder has received all of its messages.
+
+        A site is a process that controls one arm. When it ends, it publishes how many control
+        periods it has executed, from which the recorder knows what to expect.
+        """
         return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:
-        """Gives up all messages that are missing, because the site cannot send them any more.
+        """Stops requesting missing messages of a site that can no longer send them.
 
-        They still count as missing, but are no longer requested.
+        A site is a process that controls one arm. If it has crashed, its buffer of sent
+        messages is lost. The messages remain counted as missing in the summary of the log.
         """
         for account in self.accounts.values():
             account.abandon_below(account.last + 1)
 
     def describe_missing(self) -> str:
-        """Describes for the user which messages of the site are missing.
+        """Returns a text for the user about the missing messages of one site.
 
-        Messages that were lost and could not be requested again leave gaps in the log.
+        A site is the process that controls one arm. Messages that were lost and could not be
+        requested again leave gaps in the log.
 
         Returns:
             The number of missing messages and their first ranges, for each channel. Empty if no

@@ -196,10 +196,10 @@ class ChangeServer:
         return text, first, change
 
     def _poll(self) -> Query | None:
-        """Returns the next request. None if no request waits.
+        """Returns the next waiting request of a user. None if no request waits.
 
-        Orders to stop from other members come first, then the request that had to wait for a
-        tick without orders, and then the requests of the operator.
+        Orders to stop from other processes come first, for safety. The request that had to wait
+        for a tick without orders comes next, and then the requests of the operator.
         """
         query = self._poll_stop()
         if query is None:
@@ -208,10 +208,11 @@ class ChangeServer:
         return query
 
     def _poll_stop(self) -> Query | None:
-        """Returns the next order to stop from a member that may send no other request.
+        """Returns the next order to stop from a process that may send no other request.
 
-        Any member of a session may stop an arm for safety, while only the operator may change
-        more. Other requests of such a member are refused here. The order may name its source.
+        Any process of a session may stop an arm for safety, while only the operator may change
+        settings. Other requests of such a process are refused here. The order may name its
+        source.
         """
         while self._stops is not None and (query := self._stops.poll()) is not None:
             with suppress(WireError):
@@ -246,9 +247,9 @@ class ChangeServer:
         return f"{self._site} marks tick {next_tick}"
 
     def _make_order_change(self, tick: int, order: SiteOrder) -> CoreChange:
-        """Returns the change with which the order of a user takes effect in a tick.
+        """Converts an order of a user into the change that the control loop carries out.
 
-        A user stops an arm, lets it move again, or clears a fault by such an order.
+        By such an order, a user stops an arm, lets it move again, or clears a fault.
 
         Args:
             tick: Number of the tick, a period of the control loop.
@@ -278,7 +279,9 @@ class ChangeServer:
         return to_core_change(self._scenario, change)
 
     def _schedule_stop(self, next_tick: int, stop_s: float) -> tuple[str, int]:
-        """Schedules the end of the run, unless an earlier end is scheduled already.
+        """Schedules the end of the run at a requested time, unless an earlier end is scheduled.
+
+        All arms of a session receive the same time, so that they stop together.
 
         Args:
             next_tick: Number of the next tick, a period of the control loop. It is executed in
@@ -298,17 +301,17 @@ class ChangeServer:
         return text, self._stop_tick
 
     def _update_stopped(self, next_tick: int) -> None:
-        """Sets `stopped` if the next tick is the last one before a requested end of the run.
+        """Sets the flag `stopped` if the run must end after the next tick, as a user requested.
 
-        If nobody has requested the end, nothing changes.
+        A tick is a period of the control loop.
         """
         if self._stop_tick is not None:
             self.stopped = next_tick + 1 >= self._stop_tick
 
     def _make_change(self, request: ChangeRequest, first: int) -> CoreChange:
-        """Returns the requested change of a link between sites, or of the weights of the peers.
+        """Converts a user's request into a change of a network link or of dominance factors.
 
-        The weights say how strongly the arm follows each of the other sites (peers).
+        Dominance factors say how strongly the arm follows each of the other arms.
 
         Args:
             request: The request.

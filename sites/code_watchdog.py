@@ -47,7 +47,10 @@ FIRST_CHECKS = 61
 
 
 def _read_thread_usage() -> tuple[int, int]:
-    """Returns how long this thread has computed, and how often it was interrupted.
+    """Returns the computing time of this thread, and how often the system interrupted it.
+
+    Two readings show whether a slow call has computed for long itself, or whether the operating
+    system ran other programs in the meantime.
 
     Returns:
         The computing time in ns, and the number of involuntary context switches. The values are
@@ -60,11 +63,10 @@ def _read_thread_usage() -> tuple[int, int]:
 
 
 class WatchedCode:
-    """Calls a user's own code, and measures its computing time.
+    """Calls a user's own code, such as a control law, and limits its computing time.
 
-    The code is for example a control law in Python, which the control loop of the arm calls in
-    every period. Code that is too slow would make the arm unsafe, and ends the run with an
-    error.
+    The control loop of the arm calls the code in every period, for example every millisecond.
+    Code that is too slow would make the arm unsafe, and ends the run with an error.
 
     Args:
         name: Name of the code, as in "the law mylaw:MyLaw".
@@ -109,10 +111,10 @@ class WatchedCode:
         self._checked_count = -1  # the number of finished calls at the last check
 
     def run(self, tick: int, call: Callable[[], T]) -> T:
-        """Calls the user's code, and measures how long it takes.
+        """Calls the user's code once, and measures its computing time.
 
-        If the operating system has interrupted the thread meanwhile, the time of other programs
-        does not count.
+        Time in which the operating system executed other programs does not count, because the
+        user's code is not to blame for it.
 
         Args:
             tick: Number of the tick, a period of the control loop, in which the code is called.
@@ -178,10 +180,14 @@ class WatchedCode:
             raise self._fail(tick, problem)
 
     def describe_hiccups(self) -> str:
-        """Describes the calls that took longer than a period of the control loop, for the user.
+        """Returns a sentence about slow calls of the user's code, for the end of the run.
+
+        A call is slow if it takes longer than a period of the control loop, for example 1 ms at
+        1 kHz. The arm then receives its torque too late.
 
         Returns:
-            A sentence with their number and the longest duration. Empty if there were none.
+            A sentence with the number of slow calls and the duration of the slowest. Empty if
+            no call was slow.
         """
         if not self.hiccups:
             return ""
@@ -192,14 +198,16 @@ class WatchedCode:
         )
 
     def check(self) -> None:
-        """Interrupts the code if the same call has been running for several checks in a row.
+        """Interrupts user code that does not return, such as a law with an endless loop.
 
-        The method is called by a signal handler every `_CHECK_S`, while the code runs. Checks
-        that are missed because the process was suspended do not count. A call is identified by
-        the number of finished calls before it.
+        A timer signal calls this method every second (`_CHECK_S`) while the code runs. If
+        several checks in a row see the same call, an error is raised inside of the call,
+        because otherwise the arm would never receive another torque. A call is identified by
+        the number of finished calls before it. Checks that were missed while the process was
+        suspended do not count.
 
         Raises:
-            Exception: The error of `fail`. It is raised inside of the user's code.
+            Exception: The error that the constructor's argument `fail` has made.
         """
         tick = self._running_tick
         is_running = tick >= 0
@@ -218,11 +226,10 @@ class WatchedCode:
 
 
 class CodeWatchdog:
-    """Interrupts a user's code that hangs, as a context manager.
+    """Context manager that interrupts a user's code if it hangs, such as in an endless loop.
 
-    The code is watched inside the `with` block. The object uses the signal SIGALRM, which
-    Python handles in the main thread only. In other threads, and on Windows, nothing is
-    interrupted.
+    The code is watched inside the `with` block. The timer uses the signal SIGALRM, which Python
+    handles in the main thread only. In other threads, and on Windows, nothing is interrupted.
 
     Args:
         *codes: The user's code to watch.
@@ -249,7 +256,7 @@ class CodeWatchdog:
             self._handler_before = None
 
     def _check(self, _number: int, _frame: FrameType | None) -> None:
-        """Raises an error in a user's code that hangs. It is the handler of the signal SIGALRM.
+        """Handles the timer signal SIGALRM: raises an error in a user's code that hangs.
 
         The signal arrives every `_CHECK_S`, also while the code is in an endless loop.
         """

@@ -114,7 +114,10 @@ class ExternalArm:
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement of the arm, without which the session cannot start.
+        """Waits for the first measurement of an arm outside of this program, such as a robot.
+
+        The session cannot start without it, because the controller would not know the arm's
+        pose.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -191,10 +194,10 @@ class ExternalArm:
         )
 
     def poll(self) -> None:
-        """Receives the waiting measurements, and checks how long the arm has been silent.
+        """Receives measurements of an arm outside of this program, and detects its silence.
 
-        The silence is the time since the last accepted measurement. The loop calls this method
-        in every tick, a period of the control loop.
+        The silence is the time since the last accepted measurement. The control loop calls this
+        method in every tick (period).
         """
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted
@@ -212,10 +215,10 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order to the site if measurements are missing, or arrive again.
+        """Returns the order with which the control loop reacts to missing measurements.
 
-        Each order is returned once, except that "arm_lost" is repeated until the site is in the
-        mode "fault".
+        Another order follows when measurements arrive again. Each order is returned once,
+        except that "arm_lost" is repeated until the site is in the mode "fault".
 
         Args:
             mode: Present mode of the site.
@@ -309,7 +312,10 @@ class ExternalArm:
 
 @dataclass
 class _Holder:
-    """Newest report of one program about whether somebody holds the dead-man switch.
+    """Newest report of one program on whether its user holds the dead-man switch of an arm.
+
+    An external arm (one outside of this program) moves only while somebody holds this switch,
+    for safety. Several programs may report for one arm.
 
     Attributes:
         n: Number of its newest message.
@@ -356,9 +362,10 @@ class DeadManSwitch:
         self._was_released = False
 
     def _list_holders(self) -> list[_Holder]:
-        """Lists the programs whose switch is pressed, and was not released by another program.
+        """Lists the programs whose dead-man switch is pressed and counts.
 
-        After a program has released the switch, the others must release it and press it again.
+        After any program has released the switch, all programs must release it and press it
+        again, so that nobody restarts an arm by accident.
         """
         return [
             program
@@ -387,10 +394,10 @@ class DeadManSwitch:
         return bool(holders) and not any(map(self._is_silent, holders))
 
     def poll(self) -> None:
-        """Receives the waiting reports, and updates whether the switch counts as held.
+        """Receives reports about the dead-man switch, and updates whether it is held.
 
         If a program that holds the switch has been silent for too long, the switch counts as
-        released.
+        released, because the program may have crashed.
         """
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message
@@ -424,9 +431,10 @@ class DeadManSwitch:
         return "held" if is_stopped_by_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
-        """Marks the switch as released, because some programs have released it or are silent.
+        """Marks the dead-man switch of the arm as released, so that the arm stops.
 
-        All other programs that hold the switch must release it and press it again.
+        Programs that still hold the switch must release it and press it again. In this way,
+        nobody restarts an arm by accident that somebody else has stopped.
 
         Args:
             released: The programs that have released it or are silent. If there are none,
@@ -486,9 +494,10 @@ class DeadManSwitch:
         program.counts = True
 
     def _forget_program(self) -> None:
-        """Forgets the program that appeared first, to make room for a new one.
+        """Removes the oldest program from the list of switch holders, to make room for another.
 
-        Programs that do not press the switch are forgotten before those that do.
+        Every program that reports on the dead-man switch has an entry, and their number is
+        limited. Programs that do not press the switch are removed before those that do.
         """
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))

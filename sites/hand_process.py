@@ -52,10 +52,10 @@ _VIEWS_KEPT = 64
 
 
 class HandProcess(SiteClient):
-    """Connects an operator that a user wrote with the site (process) whose arm it moves.
+    """Runs an operator class that a user wrote, and connects it with the arm that it moves.
 
-    The caller calls `serve` repeatedly. Each call replies to one view, a state that the site
-    has sent.
+    The arm is controlled by another process, its site. The caller calls `serve` repeatedly.
+    Each call replies to one view, a state that the site has sent.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.
@@ -120,7 +120,10 @@ class HandProcess(SiteClient):
             self._send(0, None)  # a message without a decision announces this process
 
     def _decide(self, message: HandViewMessage) -> None:
-        """Lets the user's class decide how to move the arm, and sends its decision to the site.
+        """Calls the user's operator class with the newest state, and sends its reply to a site.
+
+        The site is the process that controls the arm. The reply states how to move the arm. If
+        the class fails, the arm is released at once, because nothing guides it any more.
 
         Args:
             message: The view, the present state of the arm and the others, as received from the
@@ -162,7 +165,9 @@ class HandProcess(SiteClient):
 
 
 def _read_view(message: HandViewMessage) -> HandView:
-    """Converts a message about the state of a site to the object that a user's class receives.
+    """Converts a network message to the object that a user's operator class receives.
+
+    The object has the joint angles and other numbers as NumPy arrays, which user code expects.
 
     Args:
         message: The message, which the site sends so that the user's operator class can decide
@@ -173,7 +178,7 @@ def _read_view(message: HandViewMessage) -> HandView:
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
-        """Reads fields of a message by their names, and converts lists of numbers to arrays.
+        """Reads the fields of a message that have given names, with lists converted to arrays.
 
         The field "peers" is left out, because it is converted separately.
 
@@ -204,7 +209,11 @@ def run_hand(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Runs a user's operator class, which moves the arm of one site, until the session ends.
+    """Runs a user's operator class until the session ends, in a process of its own.
+
+    An operator class is Python code that moves an arm in place of a person. It receives the
+    state of the arm over the network, and replies with a torque or a target. In its own
+    process, it cannot delay the control loop of the arm.
 
     Args:
         scenario: Scenario (description) of the session. It names the operator class.

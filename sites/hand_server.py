@@ -241,7 +241,7 @@ class RemoteHand(HandPlayer):
         self._source = hand_site.source
 
     def track(self, site: Site, tick: int) -> list[float]:
-        """Reads the waiting decisions of the user's class, and returns how to move the arm.
+        """Reads the newest decision of the user's operator class on how to move the arm.
 
         The class runs in a process of its own. The control loop calls this in every tick.
 
@@ -258,9 +258,10 @@ class RemoteHand(HandPlayer):
         return super().track(site, tick)
 
     def request_action(self, tick: int, arrays: SiteArrays) -> None:
-        """Sends the state of the arm to the user's process, to request its next decision.
+        """Sends the state of the arm to the user's operator class, to request a new decision.
 
-        Such a message is called a view. The reply is read by `track` in a later tick.
+        The class runs in a process of its own. The control loop does not wait for the reply,
+        which `track` reads in a later tick.
 
         Args:
             tick: Number of the present tick, a period of the control loop.
@@ -276,7 +277,7 @@ class RemoteHand(HandPlayer):
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits until the operator's process announces itself.
+        """Waits until the process of the user's operator class announces itself.
 
         A session must not start before, because nobody could move the arm.
 
@@ -303,9 +304,10 @@ class RemoteHand(HandPlayer):
         return False
 
     def _read_decisions(self) -> Iterator[HandMessage]:
-        """Yields the waiting decisions of the user's class, which arrive from its process.
+        """Yields the received decisions of a user's operator class on how to move the arm.
 
-        Invalid messages, and those of other senders, are counted as dropped.
+        The class runs in a process of its own. Invalid messages, and messages from other
+        processes, are dropped and counted.
         """
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
@@ -342,9 +344,9 @@ class RemoteHand(HandPlayer):
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:
-    """Returns the fields of a view by name, in the types that a message can contain.
+    """Converts the state of an arm to fields of types that a network message can contain.
 
-    A view is the state of the site that the user's class decides upon. Arrays become lists.
+    Arrays become lists. The message is sent to a user's operator class.
     """
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value

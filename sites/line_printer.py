@@ -35,9 +35,10 @@ class LinePrinter:
         self._thread.join(1.0)
 
     def put(self, text: str) -> None:
-        """Adds a line to the lines that wait to be printed. The method does not wait.
+        """Queues a line that another thread prints, without waiting for the terminal.
 
-        The line is lost if too many lines wait already.
+        A control loop must not wait for a slow terminal. The line is lost if too many lines
+        wait already.
 
         Args:
             text: The line.

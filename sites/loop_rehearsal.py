@@ -16,10 +16,10 @@ from .site_loop import PeerInbox, StateBlock, run_loop
 
 
 def rehearse_loop(scenario: Scenario, name: str, clock: Clock) -> list[int]:
-    """Executes all ticks of a site in real time, without other sites.
+    """Executes the control loop of one arm in real time, to measure how punctual it is.
 
-    `trilat doctor` learns from the result whether this machine can run the site punctually. A
-    tick is one period of the control loop.
+    `trilat doctor` learns from the result whether this machine is fast enough. The loop runs
+    without other arms and without a network.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
@@ -54,10 +54,10 @@ class _Rehearsal(LoopStats):
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
-        """Executes all ticks (periods of the control loop) of the scenario in real time.
+        """Executes the control loop of one arm for the scenario's duration, in real time.
 
-        The loop runs without other sites: there are no links to receive samples from, and the
-        records are not sent anywhere.
+        This measures whether the machine is fast enough. The loop receives no messages of other
+        arms, and its results are not sent anywhere.
 
         Args:
             clock: Clock of this process.
@@ -88,7 +88,7 @@ class _Rehearsal(LoopStats):
         return self._late_us
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Adds one tick to the statistics, and stores its lateness.
+        """Stores how late one control period (tick) began, and how long it took.
 
         The loop calls the method in place of `LoopStats.count_tick`.
 
@@ -102,10 +102,9 @@ class _Rehearsal(LoopStats):
         self._late_us.append(late_us)
 
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Computes one tick of the site without samples from other sites, to test its timing.
+        """Computes one control period (tick) of an arm without other arms, to test its timing.
 
-        A tick is one period of the control loop. The loop calls this method in place of
-        `_LoopSite.step`.
+        The loop calls this method in place of `_LoopSite.step`.
 
         Args:
             tick: Number of the tick.

@@ -26,7 +26,10 @@ _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" incl
 
 
 class _ProcessorTimes(NamedTuple):
-    """Times that all processors of the machine have spent since its start, in system ticks.
+    """Idle and total time of all processors since the start of the machine.
+
+    Two readings give the load in between. The unit is the clock tick of the kernel, usually 10
+    ms.
 
     Attributes:
         idle: Time without work, summed over the processors.
@@ -38,9 +41,10 @@ class _ProcessorTimes(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "_ProcessorTimes":
-        """Parses the times from the content of /proc/stat, as proc_stat(5) describes it.
+        """Reads the idle and total processor times from the content of /proc/stat of Linux.
 
-        The first line of the file is used, which is the sum of all processors.
+        The first line of the file is used, which is the sum of all processors, see
+        proc_stat(5).
 
         Args:
             text: Content of the file.
@@ -52,7 +56,8 @@ class _ProcessorTimes(NamedTuple):
 def measure_busy_share(clock: Clock) -> float | None:
     """Measures the fraction of time in which the processors of this machine are busy.
 
-    On a busy machine, the control loops of the sites may be late.
+    It is for example 0.25 if one of four processors is always busy. On a busy machine, control
+    loops may begin their periods too late.
 
     Args:
         clock: Clock of this process.
@@ -72,9 +77,9 @@ def measure_busy_share(clock: Clock) -> float | None:
 
 
 def describe_load(busy_share: float | None) -> str:
-    """Returns a warning about a busy machine, with a remedy.
+    """Returns a warning with a remedy if other programs keep the machine busy.
 
-    On a busy machine, the control loops of the sites may be late.
+    On a busy machine, control loops may begin their periods too late.
 
     Args:
         busy_share: Fraction of time in which the processors are busy. None if it is not known.
@@ -97,7 +102,10 @@ def describe_load(busy_share: float | None) -> str:
 
 
 def check_machine_load(clock: Clock) -> str:
-    """Measures whether this machine is busy, and returns a warning if it is.
+    """Returns a warning if other programs keep this machine busy.
+
+    A control loop on a busy machine starts its periods late, which makes its arm move
+    differently.
 
     Args:
         clock: Clock of this process.

@@ -89,9 +89,10 @@ class PeerAdmission:
         self.has_given_up = self._is_peer_away_too_long(t_ns)  # ends the loop
 
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
-        """Returns True if a peer left longer ago than the option `leave_timeout_s` allows.
+        """Returns True if another arm's process left longer ago than the user permits.
 
-        The run then ends. Without this option, a peer may stay away for ever.
+        The run then ends. The limit is the option `leave_timeout_s`. Without it, a process may
+        stay away for ever.
 
         Args:
             t_ns: Present time, ns since the epoch.

@@ -102,7 +102,8 @@ class PeerMonitor:
     def all_stored(self) -> bool:
         """True if every recorder that is present has stored all messages of this site.
 
-        It is False if no recorder is present. The site may then not end without losing data.
+        It is False if no recorder is present. The site, the process that controls the arm, may
+        then not end without losing data.
         """
         return bool(self.stored) and self.recorders <= self.stored
 
@@ -195,11 +196,11 @@ class PeerMonitor:
     def _read_peer_events(
         self, inbox: Inbox, publisher: EventPublisher, t_ns: int
     ) -> Iterator[Event]:
-        """Receives the events of one peer (another site), and applies those about this site.
+        """Receives the events of another arm's process, and applies events about this process.
 
-        If the peer has admitted another start of this site, this process has been replaced and
-        must end. If it has admitted several starts, the last one counts: the earlier ones died
-        while they joined.
+        If the other process has admitted another start of this site, this process has been
+        replaced and must end. If it has admitted several starts, the last one counts: the
+        earlier ones died while they joined.
 
         Args:
             inbox: Queue of the events of the peer.
@@ -287,10 +288,10 @@ class PeerMonitor:
         event: Event,
         t_ns: int,
     ) -> None:
-        """Publishes that this site admits or refuses a new process of another site.
+        """Announces whether a restarted process of another arm may join the session again.
 
         The other sites and the recorder learn the decision from this event, and the new process
-        from the other sites.
+        from the other sites. A site is a process that controls one arm.
 
         Args:
             kind: Kind of the event: "admit" or "refused".
@@ -312,7 +313,8 @@ class PeerMonitor:
     def read_stored(self, ticks: int) -> bool:
         """Receives the messages in which recorders confirm that they have stored all data.
 
-        After the run, the site waits until all recorders have the data of all of its ticks.
+        After the run, the process of the arm waits for them, because recorders may request lost
+        messages again until then.
 
         Args:
             ticks: Number of ticks (periods of the control loop) that this site has executed.
@@ -329,10 +331,9 @@ class PeerMonitor:
 
 
 def _set_membership(members: set[T], member: T, is_present: bool) -> None:
-    """Puts a member into a set if it is present on the network, and takes it out if it is not.
+    """Adds a member to a set if it is present on the network, and removes it otherwise.
 
-    A member that is already there, or already gone, changes nothing: tokens may be reported
-    twice.
+    The network may report the same presence twice. The second report changes nothing.
     """
     if is_present:
         members.add(member)

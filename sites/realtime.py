@@ -80,10 +80,15 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
 
 
 def _set_affinity(cpu: int | None) -> str:
-    """Binds the process to a processor. None leaves it as it is.
+    """Binds the process to one processor, so that the system does not move it between several.
+
+    Moving a process takes time and empties its cache, which makes control periods late.
+
+    Args:
+        cpu: Number of the processor. None changes nothing.
 
     Returns:
-        The processors that the process may use, for the log: "cpu 3" or "cpu 0,1".
+        The processors that the process may use, as a text for the log: "cpu 3" or "cpu 0,1".
     """
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
@@ -91,9 +96,10 @@ def _set_affinity(cpu: int | None) -> str:
 
 
 def _call_libc(setting: str, function: str, *arguments: int) -> str:
-    """Applies a real-time setting by calling a function of the C library.
+    """Calls a function of the C library that applies a real-time setting to this process.
 
-    The function must return 0 on success.
+    An example is `mlockall`, which keeps the memory of the process in RAM. The function must
+    return 0 on success.
 
     Args:
         setting: Description of the setting for the user, such as "locked" for memory.
@@ -119,9 +125,10 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
 
 
 def _stop_collector() -> str:
-    """Turns off garbage collection, whose pauses would make ticks late.
+    """Turns off Python's garbage collection, because its pauses make control periods late.
 
-    Returns a text for the log.
+    Returns:
+        A text for the log that says what was done.
     """
     process.disable_gc()
     return "frozen and off"

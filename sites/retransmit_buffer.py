@@ -86,9 +86,10 @@ class ChannelBuffer:
         self.oldest = number
 
     def store(self, payload: bytes) -> None:
-        """Stores a message under the next number.
+        """Stores a published message under the next number, so that it can be sent again.
 
-        If there is no room for it, the oldest messages are removed.
+        A recorder that finds a gap in the numbers requests the missing messages. If the buffer
+        is full, the oldest messages are removed.
 
         Args:
             payload: The encoded message.
@@ -114,9 +115,10 @@ class ChannelBuffer:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Stores empty messages in place of numbers that the site never publishes.
+        """Stores empty messages for numbers that the site never publishes.
 
-        The numbers of later messages thus remain right.
+        Message numbers follow the control periods. A skipped period has no message, and without
+        the empty ones all later messages would have wrong numbers.
 
         Args:
             count: Number of empty messages.
@@ -125,10 +127,10 @@ class ChannelBuffer:
             self.store(b"")
 
     def read_chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns as many consecutive stored messages as one reply can contain.
+        """Returns as many consecutive stored messages as fit into one network reply.
 
-        A recorder that has missed messages requests them again. It sends a further request for
-        those that do not fit into the reply.
+        A recorder that has missed messages requests them again. For messages that do not fit,
+        it sends a further request.
 
         Args:
             first: Number of the first requested message. If it is no longer stored, the reply
@@ -219,7 +221,9 @@ class RetransmitBuffer:
         self.channels[topics.LINK].skip(unpublished_statistics)
 
     def answer_query(self) -> bool:
-        """Answers the oldest waiting query of a recorder.
+        """Answers the oldest request of a recorder for messages that it has missed.
+
+        One call answers one request, so that many requests do not delay the control loop.
 
         Returns:
             True if a query was answered. False if no query was waiting.
@@ -231,11 +235,10 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-        """Finds the messages that a query requests, as `answer_backfill` needs them.
+        """Finds the stored messages that a recorder has missed and requests again.
 
-        Returns:
-            Number of the first message, the messages, and the number of the next message that
-            will be published.
+        Args:
+            wanted: The request, with the channel and the numbers of the missing messages.
         """
         buffer = self.channels[wanted.channel]
         first, payloads = buffer.read_chunk(wanted.first, wanted.last)

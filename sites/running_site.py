@@ -117,7 +117,11 @@ class RunningSite:
 
     @property
     def link_monitors(self) -> Sequence[LinkTimingMonitor]:
-        """Timing monitors of the links from the peers, in the order of the peers."""
+        """Monitors that measure the delays and losses of the messages from each peer.
+
+        A peer is another site, a process that controls one arm. The monitors have the order of
+        the peers.
+        """
         return self._timing.monitors
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:
@@ -249,9 +253,10 @@ class RunningSite:
             parts.say(line)
 
     def should_stop(self) -> bool:
-        """Reads the messages of the arm and its dead-man switch, and decides if the run ends.
+        """Decides at the beginning of each control period whether the run must end.
 
-        The control loop calls this method at the beginning of each tick (period).
+        Before that, it reads the messages of an external arm and of its dead-man switch,
+        because they can end the run.
 
         Returns:
             True if the site failed, if a member ended the run for all, if the user stopped the

@@ -38,7 +38,10 @@ _POLL_NS = 5_000_000
 
 
 class RunOutcome(NamedTuple):
-    """How the control loop of a site ended, from which its last event and exit code follow.
+    """How the control loop of a site ended: normally, or with an error.
+
+    A site is a process that controls one arm. Its last event and its exit code follow from the
+    outcome.
 
     Attributes:
         output: Record of the last tick. None if no tick was executed.
@@ -50,12 +53,15 @@ class RunOutcome(NamedTuple):
 
     @property
     def ticks(self) -> int:
-        """Number of the last tick plus 1. It is 0 if no tick was executed."""
+        """Number of control periods (ticks) up to the last executed one.
+
+        0 if none was executed.
+        """
         return 0 if self.output is None else self.output.tick + 1
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the last tick, in ns since the start of the session.
+        """Nominal time of the last control period (tick), in ns since the start of the session.
 
         It is -1 if no tick was executed.
         """
@@ -63,7 +69,7 @@ class RunOutcome(NamedTuple):
 
 
 def _summarise_loop(ticks: int, parts: SiteParts) -> str:
-    """Returns the sentence about the ticks and the dropped messages of a site at its end.
+    """Returns a sentence about the executed ticks and the dropped messages of an arm's process.
 
     The user sees there whether the control loop was punctual and whether the network lost
     messages. A tick is one period of the control loop.
@@ -158,10 +164,11 @@ class SiteEnd:
         return code
 
     def _publish_end(self) -> None:
-        """Publishes the events at the end of a run.
+        """Publishes why and when the run of this arm ended.
 
-        They are the failure if there was one, delays of the user's own code, and the event
-        `end`, whose sentence says how many ticks were executed and why the run ended early.
+        A failure has an event of its own, and so have delays of the user's code. The last
+        event, `end`, says how many ticks (control periods) were executed and why the run ended
+        early.
         """
         parts = self._parts
         output = self._outcome.output
@@ -190,9 +197,9 @@ class SiteEnd:
 
     @property
     def _departures(self) -> str:
-        """Sentences about the peers that left and did not come back.
+        """Sentences about the other sites that left the session and did not come back.
 
-        Empty if there are none.
+        A site is a process that controls one arm. The text is empty if no site has left.
         """
         return "; ".join(text for _, text in self._parts.monitor.departed.values())
 
@@ -231,7 +238,10 @@ class SiteEnd:
         return first_departed, f": {self._departures}"
 
     def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
-        """Publishes an event about the end of the run, with the number of its ticks.
+        """Publishes why and when the control loop of this arm ended.
+
+        The event contains the number of executed ticks, the periods of the control loop. The
+        recorder compares this number with the received records to find missing ones.
 
         Args:
             kind: Kind of the event, for example "end" or "law".

@@ -170,10 +170,10 @@ class PeerInbox:
         return last_tick
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
-        """Removes the samples that have arrived, and returns those that pass all checks.
+        """Returns the states of the other arms that have arrived and pass all checks.
 
-        The control loop calls this at the beginning of each tick. A sample is the state that a
-        peer, another site, has published.
+        The control loop calls this at the beginning of each tick (period). A state that another
+        arm has published is called a sample.
 
         Args:
             since_epoch_ns: Present time, in ns since the epoch (the common start of the
@@ -199,7 +199,10 @@ class PeerInbox:
         arrived_ns: int,
         since_epoch_ns: int,
     ) -> Arrival | None:
-        """Checks one sample, counts it if it is dropped, and measures its delay.
+        """Checks the state that another arm has sent, and measures its delay.
+
+        A message is dropped and counted if it cannot be decoded, comes from an unexpected
+        process, or lies too far in the future, so that a faulty sender cannot move this arm.
 
         Args:
             index: Index of the peer.
@@ -418,9 +421,10 @@ class StateBlock:
             self._send_waiting_samples(send)
 
     def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends all waiting samples to the peers, and moves their records to the next block.
+        """Sends the waiting states of this arm (samples) to the other arms.
 
-        A record states when its sample was sent, so it is complete only now.
+        The records of the same control periods become complete by this, because a record states
+        when its sample was sent. They move to the next block for the recorders.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -431,10 +435,10 @@ class StateBlock:
         self._waiting_records.clear()
 
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends everything that is waiting: the samples to the peers, then the records.
+        """Sends the waiting results of control periods over the network.
 
-        Records are the results of ticks, and samples are the parts of them that the peers need.
-        The records go to the recorders.
+        The other arms first receive their samples, the parts that their control laws need,
+        because they wait for these. The recorders then receive the complete records.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -452,21 +456,22 @@ class StateBlock:
 
 
 class _LoopSite(Protocol):
-    """What the loop requires of a site: the methods that it calls in a tick and between ticks.
+    """The methods that the control loop calls in each period and between periods.
 
-    `RunningSite` has them in a session, and `loop_rehearsal` replaces them. The loop ignores
-    the results that are `object`.
+    `RunningSite` has them in a session, and `loop_rehearsal` replaces them for measuring the
+    machine. The loop ignores the results of the type `object`.
     """
 
     def should_stop(self) -> bool:
         """Returns True if the present tick must not be executed, because the run is over."""
 
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Executes one tick.
+        """Executes one period of the control loop: reference, control law and motion of an arm.
 
         Args:
             tick: Number of the tick.
-            arrivals: Samples of the peers that have arrived since the previous tick.
+            arrivals: Samples (states of the other arms) that have arrived since the previous
+                tick.
 
         Returns:
             The record of the tick. None if the run ends because the tick failed.
@@ -479,23 +484,30 @@ class _LoopSite(Protocol):
         """Publishes encoded statistics of the loop and its links, which the recorder stores."""
 
     def run_housekeeping(self, output: TickRecord, /) -> object:
-        """Does what is due ten times a second: replies to queries, clocks, members, news.
+        """Executes the slow tasks of the control process, ten times a second.
+
+        They are replies to queries, clock comparison, the list of present processes, and news
+        for the user. They are not part of the control period, because they would make it too
+        long.
 
         Args:
             output: Record of the newest tick.
         """
 
     def report_tick(self, output: TickRecord, /) -> object:
-        """Reports what has changed in a tick, such as a new mode, by events and alarms.
+        """Publishes events and alarms about what has changed in a control period.
+
+        An example is an arm that stopped following the others, because their messages were
+        missing.
 
         Args:
             output: Record of the tick.
         """
 
     def use_slack(self) -> bool:
-        """Does one piece of work that can wait, in the time that is left before the next tick.
+        """Does one piece of work that can wait, in the time left before the next period.
 
-        A site answers a query of a recorder for lost messages.
+        An example is to answer a recorder's request for lost messages.
 
         Returns:
             True if more work may wait.
@@ -510,9 +522,9 @@ def _publish_sample(
     io: _LoopSite,
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    """Publishes the sample of a tick to the peers.
+    """Sends the state of this arm to the other arms after a control period (tick).
 
-    A sample is the part of the result that the peers (other sites) need for their control laws.
+    This message, the sample, has only the part of the result that their control laws need.
 
     Args:
         name: Name of this site.

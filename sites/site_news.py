@@ -151,9 +151,10 @@ class SiteNews:
             parts.say(f"*** {alarm}")
 
     def publish_news(self, output: TickRecord) -> None:
-        """Publishes what has happened since the last call, and prints the status line when due.
+        """Publishes events about what has happened since the last call, such as alarms.
 
-        The control loop calls this method ten times a second, in the time between two ticks.
+        The control loop calls this method ten times a second, between two periods. The status
+        line for the user is also printed when it is due.
 
         Args:
             output: Record of the newest tick.
@@ -175,7 +176,9 @@ class SiteNews:
             parts.say(self._describe_status(output))
 
     def _publish_entries(self, kind: str, news: list[tuple[int, str]]) -> None:
-        """Publishes an event for each entry of a list of news, and empties the list.
+        """Publishes one event for each entry of a list, and then empties the list.
+
+        The control loop only appends to the list, because publishing would take too long there.
 
         Args:
             kind: Kind of the events, for example "mark".
@@ -187,9 +190,10 @@ class SiteNews:
         news.clear()
 
     def publish_skipped(self, output: TickRecord) -> None:
-        """Publishes one event about the ticks that the site has skipped since the last call.
+        """Publishes one event about all control periods (ticks) skipped since the last call.
 
-        A site skips ticks only if its arm is external, and the loop was late.
+        Ticks are skipped only if the arm is external and the loop was late, because a real
+        robot cannot catch up.
 
         Args:
             output: Record of the newest tick.

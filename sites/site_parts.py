@@ -67,10 +67,9 @@ from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """Options of the user about how a site joins a session and waits for others.
+    """Options of the user about how an arm's process joins a session and waits for others.
 
-    A site is a process that runs one arm and its control loop. The options come from the
-    command line of `trilat site`.
+    Such a process is called a site. The options come from the command line of `trilat site`.
 
     Attributes:
         session: Name of the session.
@@ -101,9 +100,10 @@ class SiteOptions:
 
 
 class SiteParts:
-    """All parts of one site, a process that runs one arm and its control loop.
+    """All objects of which a site consists: arm, control law, network queues and buffers.
 
-    The constructor creates the parts that the scenario needs. All other parts are None.
+    A site is a process that runs one arm and its control loop. The constructor creates the
+    objects that the scenario needs. All others are None.
 
     Args:
         scenario: Scenario of the session.
@@ -196,11 +196,13 @@ class SiteParts:
         warm_up(scenario, name, clock)
 
     def _key(self, channel: str, member: str = "") -> str:
-        """Returns the network address ("key") of a channel of this site or of another member.
+        """Returns the network address ("key" in Zenoh) on which a process publishes a channel.
+
+        A key contains the names of the session, of the process, and of the channel.
 
         Args:
-            channel: Name of the channel, see `topics`.
-            member: Name of the other member. Empty for this site.
+            channel: Name of the channel, such as its records or events, see `topics`.
+            member: Name of another process of the session. Empty for this one.
         """
         return topics.key(self.options.session, member or self.name, channel)
 
@@ -249,11 +251,11 @@ class SiteParts:
         return code.run
 
     def _connect_hand(self) -> None:
-        """Creates the live operator of the site, if the scenario has one.
+        """Creates the object through which people or programs move the arm, if there are any.
 
-        A user's class runs in this process (`HandPlayer`) or in a process of its own
-        (`RemoteHand`). Without such a class, people and programs may move the arm
-        (`HandServer`).
+        A user's operator class runs in this process (`HandPlayer`) or in a process of its own
+        (`RemoteHand`). Without such a class, people and programs may move the arm over the
+        network (`HandServer`).
         """
         name = self.name
         live_hand = self.scenario.sites[name].find_live_hand()
@@ -288,7 +290,7 @@ class SiteParts:
         )
 
     def _connect_outside_arm(self) -> None:
-        """Makes the site receive measurements and switch reports, if its arm is external.
+        """Connects the site to the driver of an external arm, and to its dead-man switch.
 
         `arm` and `switch` stay None for an arm that the site simulates, or that has no such
         switch.
@@ -315,9 +317,10 @@ class SiteParts:
             self.switch = DeadManSwitch(name, ring, self.clock, self.stats.dropped)
 
     def _make_storing_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
-        """Returns a function that publishes messages, and keeps them for later requests.
+        """Returns a function that publishes messages and also stores them for a while.
 
-        A recorder that missed a message on the network requests it again.
+        A recorder that missed a message on the network requests it again, and receives the
+        stored copy.
 
         Args:
             channel: Channel of the messages, records or statistics.
@@ -326,7 +329,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages for retransmission, and publishes them in larger blocks.
+            """Stores messages for sending them again, and publishes them in larger blocks.
 
             Args:
                 payloads: The encoded messages.

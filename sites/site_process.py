@@ -47,9 +47,11 @@ def run_site(
     options: SiteOptions,
     say: Callable[[str], None],
 ) -> int:
-    """Runs one site of a scenario from its start to its end.
+    """Runs the control loop of one arm as a member of a session, from its start to its end.
 
-    A site is a process that runs one arm and its control loop.
+    Such a process is called a site. It waits for the other sites of the scenario, exchanges the
+    state of its arm with them over the network in every control period, and publishes its
+    results for the recorder.
 
     Args:
         scenario: Scenario of the session.
@@ -104,10 +106,10 @@ def run_site(
 
 
 def join_and_run(parts: SiteParts) -> int:
-    """Joins a session with the parts of a site, runs the site, and leaves the session.
+    """Joins a session, runs the control loop of the arm until its end, and leaves the session.
 
-    A site with an external arm, or with an operator program in another process, first waits for
-    the first message from there.
+    With an external arm, or with an operator program in another process, the first message from
+    there is awaited before.
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.
@@ -138,9 +140,9 @@ def join_and_run(parts: SiteParts) -> int:
 
 
 def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
-    """Announces the site, and waits for the other members and for the start of the session.
+    """Announces this process to the session, and waits for the others and for a common start.
 
-    The members agree on the epoch, the common start time of the session.
+    All processes agree on the epoch, the start time of the session.
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.

@@ -116,14 +116,15 @@ class AlignedRecords(NamedTuple):
 
     @property
     def h_s(self) -> float:
-        """The tick period, in s."""
+        """The period of the control loop (tick), in s: 0.001 at a rate of 1 kHz."""
         return 1.0 / self.rate_hz
 
     @property
     def t_s(self) -> Array:
-        """Time of every row on the ideal grid of ticks, tick / rate_hz, shape (K,), in s.
+        """Nominal time of every row, tick / rate_hz, shape (K,), in s.
 
-        A tick that was computed late has the same time as one that was computed punctually.
+        A tick is a period of the control loop. If it was computed late, its nominal time is the
+        same.
         """
         return self._ticks / self.rate_hz
 
@@ -178,7 +179,7 @@ class AlignedRecords(NamedTuple):
         return is_known_at_start & is_known_at_end
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Marks the rows in the last seconds of the run that are recorded, not interpolated.
+        """Marks the rows in the last seconds of a run that were recorded, not interpolated.
 
         Metrics of the end of a run, such as the last error, use these rows alone.
 
@@ -289,9 +290,9 @@ def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
-    """Marks the records in which a site brings its arm to rest, or did so shortly before.
+    """Marks the records in which an arm is brought to rest, or was so shortly before.
 
-    The torque of these records may differ from that of the control law. The site is in one of
+    The torque of these records may differ from that of the control law. The arm is in one of
     the `RESTING_MODES`, or was so in the last `RESUMING_S`.
 
     Args:
@@ -381,7 +382,7 @@ def _fill_tick_grid(
 
 
 class _PeerMotion(NamedTuple):
-    """Motion of another site (a peer) at K times, computed from its records.
+    """Motion of another arm (a peer) at K times, computed from its records.
 
     Joint by joint, the motion has n coordinates, in rad. In task space it has the m coordinates
     of the end effector, in m. Units below are for joints.
@@ -462,11 +463,15 @@ class PeerTrajectory:
         return _PeerMotion(q, qd, squares, known)
 
     def _interpolate(self, row: Ints, fraction: Array) -> tuple[Array, Array, Array]:
-        """Returns the motion between two ticks: q, qd, and the integral of qd squared.
+        """Interpolates the recorded motion of another arm between two control periods (ticks).
 
         Args:
-            row: Row of the tick before each time, shape (K,).
-            fraction: Share of the tick period that has passed at each time, shape (K,).
+            row: Row of the record before each of K times, shape (K,).
+            fraction: Fraction of the period, 0 to 1, that has passed at each time, shape (K,).
+
+        Returns:
+            Joint angles q, in rad, joint velocities qd, in rad/s, and the integral of qd
+            squared over time, at each of the K times.
         """
         records = self.records
         h = records.h_s
@@ -497,9 +502,10 @@ class PeerTrajectory:
 
 
 class DelayedPeer(NamedTuple):
-    """Motion of a peer, both as it is and as a site receives it, with delay.
+    """Motion of another arm (a peer), both as it is and as this arm receives it, with delay.
 
-    In each of its K ticks the site uses one sample, a state that the peer sent earlier.
+    In each of its K ticks (control periods) this arm uses one sample, a state that the peer
+    sent earlier.
 
     Attributes:
         now: Motion of the peer at the site's ticks, K rows.
@@ -536,10 +542,10 @@ _BEFORE_EPOCH_S = -1.0
 
 
 def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
-    """Returns the motion of a peer as a site receives it, with the delay of the link.
+    """Returns the motion of another arm as this arm received it, with the network delay.
 
-    The records of the site say which sample it used in each tick, and the motion of the peer
-    says what this sample contained.
+    The records of this arm say which message was used in each tick (control period), and the
+    motion of the other arm says what this message contained.
 
     Args:
         records: Records of the site, which name the sample in use at every tick.
@@ -561,10 +567,10 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Finds the last tick of a site at or before each of some times.
+    """Finds the last record of an arm at or before each of several times.
 
-    It relates sites whose control loops have different rates: a time of one site is looked up
-    in the records of another one.
+    It relates arms whose control loops have different rates: a time of one arm is looked up in
+    the records of another one.
 
     Args:
         records: Records of the site, with one row per tick.
@@ -587,10 +593,10 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Finds rows at which several sites can be compared at the same instant.
+    """Finds the records at which several arms can be compared at the same time.
 
-    The instants are the ticks of the first site. For each site, the row of its latest tick at
-    that instant is returned.
+    The times are the ticks (control periods) of the first arm. For each other arm, the row of
+    its latest tick at each time is returned, since the rates may differ.
 
     Args:
         sites: Records of the sites.

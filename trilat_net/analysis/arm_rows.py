@@ -66,7 +66,10 @@ B).
 
 
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
-    """Multiplies a matrix and a vector, separately for each of many records.
+    """Multiplies many matrices by many vectors in one call, one product per log record.
+
+    Numbers of the records are on the last axes, so that NumPy computes all records at once
+    instead of a slow Python loop.
 
     Args:
         matrix: Entries of the matrices, shape (a, b, ...). The axes "..." count the records.
@@ -80,7 +83,9 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
-    """Solves the linear systems A y = b, separately for each of many records.
+    """Solves many small linear systems A y = b in one call, one system per log record.
+
+    An example is the acceleration of an arm, where A is the inertia matrix and b the torque.
 
     Args:
         A: Square matrices, shape (m, m, ...). The axes "..." count the records.
@@ -122,9 +127,9 @@ class PlacedArm:
     q: Numbers
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), which maps accelerations to torques, in kg m^2.
+        """Returns the inertia matrix M(q), from joint accelerations to torques, in kg m^2.
 
-        The shape is (2, 2, ...), with one matrix per record.
+        The shape is (2, 2, ...), with one matrix per pose.
 
         Args:
             theta: The five dynamic parameters of the arm, which combine masses, lengths and
@@ -230,9 +235,10 @@ class PlacedArm:
         return 0.0 * v
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns the joint accelerations under a torque, shape (2, ...), in rad/s^2.
+        """Returns the joint accelerations of the arm under a torque, in rad/s^2.
 
         The accelerations qdd solve the equation of motion M qdd + C qd + G = torque, Eq. (8).
+        The shape is (2, ...).
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -259,9 +265,10 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian J of the end effector's position: its velocity is J qd.
+        """Returns the matrix J from joint velocities to the velocity of the end effector (tip).
 
-        The shape is (2, 2, ...), in m/rad. Rows are x and y, columns are the two joints.
+        J is called the Jacobian. The shape is (2, 2, ...), in m/rad. Rows are x and y, columns
+        are the two joints.
         """
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
@@ -273,9 +280,9 @@ class PlacedArm:
 
 
 class EndEffectorRows(NamedTuple):
-    """Motion of an end effector over K poses.
+    """Position and velocity of an end effector (the tip of an arm) in K poses.
 
-    The planar arm moves in two coordinates, and a chain in three.
+    The planar arm moves in two coordinates, and a chain of joints in three.
 
     Attributes:
         position: Position in the frame of the base, shape (K, 2) or (K, 3), in m.
@@ -310,7 +317,7 @@ class EndEffectorRows(NamedTuple):
 
 
 class PlanarArmRows(NamedTuple):
-    """The planar arm with two joints, for computations over K poses at once.
+    """Model of the planar arm with two joints that is evaluated in K poses at once.
 
     In contrast to `PlacedArm`, every array has a row for each pose. `ChainArmRows` has the same
     methods for arms with more joints.
@@ -336,17 +343,18 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """Marks the parameters on which the gravity torque depends, shape (5,).
+        """Marks the parameters of the arm on which the gravity torque depends, shape (5,).
 
         The entries are True for theta_4 and theta_5, the products of masses and lever arms. The
-        other parameters describe inertia alone.
+        other three describe inertia alone.
         """
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns an object that computes the dynamics of the arm in K poses.
+        """Returns the dynamics of the arm, such as its inertia matrix, in each of K poses.
 
-        Its arrays have the poses on their last axis.
+        Functions of the poses alone, such as sines of the angles, are computed only once. The
+        arrays of the returned object have the poses on their last axis.
 
         Args:
             q: Joint angles of the K poses, shape (K, 2), in rad.
@@ -354,7 +362,7 @@ class PlanarArmRows(NamedTuple):
         return PlacedArm(self.g, self.lengths_m, q.T)
 
     def weightless(self) -> "PlanarArmRows":
-        """Returns the same arm without gravity.
+        """Returns a model of the same arm without gravity.
 
         The torque of such an arm is linear in the reference velocity v and acceleration a, so
         that the effects of parts of a motion can be computed separately and added.
@@ -362,7 +370,7 @@ class PlanarArmRows(NamedTuple):
         return self._replace(g=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Returns the product M(q) x of the inertia matrix and a vector, in each of K poses.
+        """Multiplies the inertia matrix M(q) by a vector x, in each of K poses.
 
         With velocities, the products are momenta, and with accelerations they are torques.
 
@@ -433,7 +441,9 @@ class PlanarArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) that holds the arm against gravity in K poses, in N m.
+        """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
+
+        K poses are evaluated at once.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -488,7 +498,10 @@ class PlanarArmRows(NamedTuple):
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns position, velocity and Jacobian of the end effector in each of K poses.
+        """Returns position, velocity and Jacobian of the end effector (tip) of a planar arm.
+
+        The Jacobian is the matrix from joint velocities to the velocity of the end effector. K
+        poses are evaluated at once.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -507,7 +520,7 @@ class PlanarArmRows(NamedTuple):
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle between a link and the direction straight down, in rad.
 
-        A small angle means that the arm hangs down, as it does after a fall.
+        A small angle means that the arm hangs down, as an arm does that was not held up.
 
         Args:
             q: Joint angles of one pose, shape (2,), in rad.
@@ -654,7 +667,7 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """Settings of an arm that follows the end effectors of other arms, such as its axes.
+        """Settings for following other arms with the end effector (tip), such as its axes.
 
         None if the arm follows other arms joint by joint.
         """
@@ -688,9 +701,9 @@ class ChainArmRows(NamedTuple):
         return self._replace(chain=chain)
 
     def weightless(self) -> "ChainArmRows":
-        """Returns the same chain without gravity and Coulomb friction.
+        """Returns a model of the same arm without gravity and dry (Coulomb) friction.
 
-        The torque of this chain is linear in the reference velocity v and acceleration a, so
+        The torque of this model is linear in the reference velocity v and acceleration a, so
         that the effects of parts of a motion can be computed separately and added.
         """
         bare = self._replace_in_joints(coulomb=0.0)
@@ -699,9 +712,10 @@ class ChainArmRows(NamedTuple):
         return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
-        """Returns the same chain without the inertia of the drives and without friction.
+        """Returns a model of the same arm without friction and without its motors' inertia.
 
-        The torque of this chain is linear in the parameters theta, as estimation requires.
+        The torque of this model is linear in the parameters theta (masses and inertias), which
+        is required for estimating them.
         """
         return self._replace_in_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
 
@@ -802,7 +816,9 @@ class ChainArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) that holds the chain against gravity, in N m.
+        """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
+
+        The arm is a chain of n joints, and K poses are evaluated at once.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -820,13 +836,19 @@ class ChainArmRows(NamedTuple):
         )
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Computes the end effector's position and Jacobian, and the potential energy.
+        """Computes the end effector's position and Jacobian, and an arm's potential energy.
+
+        The Jacobian is the matrix from joint velocities to the velocity of the end effector. K
+        poses are evaluated at once.
+
+        Args:
+            q: Joint angles of n joints, shape (K, n), in rad.
 
         Returns:
             Position of the end effector, shape (K, 3), in m.
             Its Jacobian, with three rows for the velocity and three for the angular velocity,
             shape (K, 6, n).
-            Potential energy, shape (K,), in J.
+            Potential energy due to gravity, shape (K,), in J.
         """
         poses, joints = q.shape
         position = np.zeros((poses, 3))
@@ -854,7 +876,9 @@ class ChainArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that the joints need to overcome their friction, dry and viscous.
+        """Returns the torque that overcomes the dry and viscous friction of the joints.
+
+        Dry friction has a constant size, and viscous friction grows with the velocity.
 
         Args:
             speed: Joint velocities at K times, shape (K, n) for n joints, in rad/s.
@@ -898,9 +922,10 @@ class ChainArmRows(NamedTuple):
         return lower_stop - upper_stop
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns position, velocity and Jacobian of the end effector in each of K poses.
+        """Returns position, velocity and Jacobian of the end effector (tip) in each of K poses.
 
-        All are expressed in the frame of the base.
+        The Jacobian is the matrix from joint velocities to the velocity of the end effector.
+        All are expressed in the frame of the arm's base.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -1001,10 +1026,10 @@ ArmRows = PlanarArmRows | ChainArmRows
 
 
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
-    """Returns the model of a site's arm, for computations over many poses at once.
+    """Returns the model of an arm for computations over many poses at once.
 
-    Certificate and metrics evaluate inertia and energy at every record, for which one call per
-    record would be too slow.
+    Certificate and metrics evaluate inertia and energy at every record of a log, for which one
+    call per record would be too slow.
 
     Args:
         scenario: The description of the experiment, which defines the arm.
@@ -1025,7 +1050,7 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     """Returns the positions of the base, the joints and the end effector, for drawing an arm.
 
-    Lines through these points, in their order, are the links.
+    Lines between successive points are the links of the arm.
 
     Args:
         arm: The arm.
@@ -1045,7 +1070,7 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
 
 
 def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
-    """Returns the positions of base, joints and end effector of a chain, for drawing, in m.
+    """Returns the positions of base, joints and end effector of an arm, for drawing, in m.
 
     Their shape is (K, n + 2, 3) for K poses of n joints.
     """
@@ -1098,7 +1123,7 @@ DEPENDENT_SHARE = 1e-9
 
 
 class _BaseParameters(NamedTuple):
-    """Base parameters of an arm: the combinations of its parameters that torques determine.
+    """Base parameters of an arm: combinations of masses and inertias that torques determine.
 
     No measurement of torque and motion can determine every dynamic parameter theta of a chain
     by itself. It determines only the B linear combinations in the rows of `combination`, so
@@ -1152,9 +1177,10 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
-    """Returns the base parameters of a chain by a QR decomposition (Gautier 1991).
+    """Finds the base parameters of a serial arm by a QR decomposition (Gautier 1991).
 
-    A column of the stacked regressors that depends on the columns before it belongs to a
+    Base parameters are the combinations of masses and inertias that joint torques determine. A
+    column of the stacked regressors that depends on the columns before it belongs to a
     parameter that torques do not determine by itself.
 
     Args:
@@ -1248,10 +1274,10 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Finds for each link whether a rigid body with its parameters can exist.
+    """Finds the links whose learnt masses and inertias are those of a possible rigid body.
 
-    The condition is that the link's pseudo-inertia (see `find_pseudo_inertias`) is positive
-    definite (Wensing et al. 2018).
+    A negative mass, for example, is impossible. The condition is that the link's pseudo-inertia
+    (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).
 
     Args:
         theta: Parameters of the links, shape (10 n,).

@@ -26,7 +26,10 @@ _SYMBOLS = (
 
 
 class _BlasFunctions(NamedTuple):
-    """Functions of one copy of OpenBLAS.
+    """Functions that read and set the number of threads of OpenBLAS.
+
+    OpenBLAS is the library behind the linear algebra of NumPy. NumPy and SciPy each contain a
+    copy, and each copy has its own number of threads.
 
     Attributes:
         get_threads: Returns the number of threads.
@@ -61,7 +64,9 @@ def limit_blas_threads() -> Iterator[None]:
 
 @cache
 def _find_blas_functions(module_name: str) -> _BlasFunctions | None:
-    """Returns the functions for the number of threads of the OpenBLAS that a module uses.
+    """Finds the functions that control the threads of the OpenBLAS library of a module.
+
+    NumPy and SciPy are such modules. Their wheels contain a copy of OpenBLAS each.
 
     Args:
         module_name: Name of an imported module that is linked to the library.

@@ -93,10 +93,10 @@ def _find_near_period_s(
     cycles: Iterable[Fraction],
     rates_hz: Sequence[int],
 ) -> float | None:
-    """Returns a time after which delays repeat to within half a tick, in s.
+    """Returns a time after which network delays repeat to within half a tick, in s.
 
-    The shortest time with a deviation of at most `_SLIP` is preferred, then the time with the
-    least deviation.
+    A tick is a control period. The shortest time with a deviation of at most `_SLIP` is
+    preferred, then the time with the least deviation.
 
     Args:
         cycles: Periods of the delays of the links, in s.
@@ -124,7 +124,10 @@ def _find_near_period_s(
 
 
 class _DelayPeriod(NamedTuple):
-    """The period after which the delays of all links and the ticks of all sites repeat.
+    """The time after which all network delays and control periods repeat together.
+
+    For example, a delay that alternates every 20 ms repeats after 40 ms. The exact stability
+    analysis of a sampled loop needs such a period.
 
     Attributes:
         true_s: The period, in s. None if some delay never repeats.
@@ -198,7 +201,9 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
 
 
 def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
-    """Finds the period of all delays and ticks that are in force at the end of a scenario.
+    """Finds the time after which all delays and control periods repeat at the end of a run.
+
+    Models and rates that the scenario changes earlier do not count.
 
     Args:
         scenario: Description of the experiment.

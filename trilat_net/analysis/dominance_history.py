@@ -34,10 +34,9 @@ RAMP_TIME_TOLERANCE_S = 5e-10
 
 
 class DominanceHistory(NamedTuple):
-    """Dominance factors with which a site follows its P peers, over time.
+    """Weights (dominance factors) over time with which an arm follows each of P other arms.
 
-    A dominance factor is the weight with which an arm follows a peer, another site. The peers
-    are in scenario order.
+    A factor lies between 0 and 1. The other arms (peers) are in scenario order.
 
     Attributes:
         alpha: Factors at every row, shape (K, P).
@@ -53,7 +52,10 @@ class DominanceHistory(NamedTuple):
 
     @property
     def constant(self) -> bool:
-        """True if no factor ever changes."""
+        """True if no dominance factor changes during the run.
+
+        A dominance factor is the weight, from 0 to 1, with which one arm follows another.
+        """
         has_steps = bool(np.any(self.alpha != self.alpha[0]))
         has_ramps = bool(self.rate.any())
         return not has_steps and not has_ramps
@@ -123,9 +125,9 @@ def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
-    """Finds the slave that several users control together, and the users.
+    """Finds the slave arm that several users control together, and these users.
 
-    A user moves the arm of a master.
+    Each user moves the arm of a master, and the slave follows the masters.
 
     Args:
         scenario: The description of the experiment.
@@ -219,9 +221,10 @@ def _is_held_by_policy(log: Log, site: str) -> bool:
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the weights with which the slave arm follows each of its users over time.
+    """Returns the weights with which the slave arm follows the arm of each user over time.
 
-    `find_users` determines the slave and the users.
+    The slave is the arm at the task, which several users guide together. `find_users`
+    determines the slave and the users.
 
     Args:
         scenario: The description of the experiment.
@@ -256,9 +259,9 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Finds the times at which a site continued without a peer that it had lost.
+    """Finds the times at which an arm continued without another arm that it had lost.
 
-    A peer is lost if nothing was heard of it for some time, see `core.lost_peers`.
+    An arm is lost if nothing was heard of it for some time, see `core.lost_peers`.
 
     Args:
         log: The log of the run.
@@ -287,9 +290,10 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 class PeerLoss(NamedTuple):
-    """Span of time in which a site continued without a peer that it no longer heard.
+    """Interval of time in which an arm continued without another arm whose messages stopped.
 
-    The site then follows the remaining peers alone, which changes its dominance factors.
+    The arm then follows the remaining arms alone, which changes its dominance factors, the
+    weights with which it follows them.
 
     Attributes:
         site: Name of the site.
@@ -339,9 +343,9 @@ def list_losses(log: Log) -> list[PeerLoss]:
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Lists how the scenario plans to change the dominance factors of a site.
+    """Lists the changes of dominance factors that the scenario plans for an arm.
 
-    They are the weights with which the site follows its P peers.
+    They are the weights with which the arm follows its P peers, the other arms.
 
     Args:
         scenario: The description of the experiment.
@@ -362,10 +366,10 @@ def drop_finished_ramps(
     ramps: Sequence[DominanceRamp],
     from_s: float,
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Simplifies the history of dominance factors before a given time.
+    """Removes changes of dominance factors that were complete before a given time.
 
-    Ramps that have finished before this time are left out, and the start factors are changed so
-    that the factors from this time on stay the same.
+    A ramp is a linear change of the factors, the weights with which an arm follows others. The
+    start factors are changed so that the factors from this time on stay the same.
 
     Args:
         start: Factors at the start of the session, shape (P,).
@@ -447,7 +451,10 @@ def evaluate_ramps(
 
 
 def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
-    """Returns the dominance factors of a site over time, as the scenario plans them.
+    """Returns the dominance factors of an arm over time, as its scenario plans them.
+
+    A dominance factor is the weight, from 0 to 1, with which an arm follows another one. A
+    scenario can shift these weights during the run, for example from a teacher to a student.
 
     Args:
         scenario: The description of the experiment.
@@ -467,10 +474,10 @@ KD_SHAPE_TOLERANCE = 1e-9
 
 
 class _LyapunovWeights(NamedTuple):
-    """Weights beta of the N sites in the energy function V of the stability proof.
+    """Weights beta of the N arms in the energy function V of the stability proof.
 
-    With these weights the energies that sites transfer to each other cancel in V. They follow
-    from the matrix alpha of the dominance factors and from the gains Kd of the sites.
+    With these weights the energies that arms transfer to each other cancel in V. They follow
+    from the matrix alpha of the dominance factors and from the damping gains Kd.
 
     Attributes:
         beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each
@@ -488,11 +495,10 @@ class _LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of sites that follow each other, and that follow nobody else.
+    """Finds the groups of arms that follow each other, and that follow nobody else.
 
-    A site is the process that runs one arm. It may follow another site directly or through
-    further sites. If there are several groups, the weights of the sites in the energy function
-    V are not unique.
+    An arm may follow another one directly or through further arms. If there are several groups,
+    the weights of the arms in the energy function V are not unique.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

@@ -64,7 +64,10 @@ Absences = Mapping[str, Sequence[tuple[int, int]]]
 
 
 class _Messages(NamedTuple):
-    """Numbers of all messages of a channel, in the order of the file.
+    """Times, numbers and sizes of all messages of one channel of an MCAP file.
+
+    Each array has one entry per message, in the order of the file. The contents of the messages
+    are not kept, because a log may be larger than the memory.
 
     Attributes:
         log_ns: Times at which the recorder received the messages, in ns.
@@ -78,7 +81,7 @@ class _Messages(NamedTuple):
 
 
 class FileInventory:
-    """What one or several MCAP files contain, apart from the meaning of their messages.
+    """Contents of one or several MCAP files: channels, message counts, times and damage.
 
     MCAP is the file format of the logs. Several files are treated as the parts of one log.
 
@@ -115,7 +118,7 @@ class FileInventory:
             bytes_before += path.stat().st_size
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
-        """Adds the channels, the message numbers and the facts of a file, such as damage.
+        """Adds a file to the inventory: its channels, the numbers of its messages, its damage.
 
         Args:
             path: The file.
@@ -153,10 +156,9 @@ class FileInventory:
         rates_hz: Mapping[str, int],
         absences: Absences,
     ) -> dict[str, JsonObject]:
-        """Describes the messages in each channel of the files, for `trilat log info`.
+        """Describes the messages in each channel (topic) of the files, for `trilat log info`.
 
-        A channel contains the messages of one topic. Missing messages are counted only for a
-        session whose tick rates are known.
+        Missing messages are counted only for a session whose rates are known.
 
         Args:
             session: Name of the session. Empty to count no missing messages.
@@ -182,7 +184,7 @@ class FileInventory:
         return channels
 
     def _describe_channel(self, topic: str) -> JsonObject:
-        """Returns number, size, times and encoding of the messages of a channel.
+        """Returns the number, sizes, times and encoding of the messages of one channel.
 
         Args:
             topic: Topic of the channel.
@@ -265,9 +267,9 @@ def _count_gaps(
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """Overview of one or several recorded files, returned by `info`.
+    """Overview of one or several recorded MCAP files, returned by `info`.
 
-    The files are MCAP files. A log that was recorded in several files is described as a whole.
+    A log that was recorded in several files is described as a whole.
 
     Attributes:
         facts: The overview as plain values. The keys are those of `trilat log info --json`.
@@ -276,7 +278,10 @@ class FileOverview(Result):
     facts: JsonObject
 
     def headline(self) -> str:
-        """Returns one line such as "run.mcap: 120345 messages", with the paths of all files."""
+        """One line with the paths of all files and the number of messages, for the user.
+
+        An example is "run.mcap: 120345 messages".
+        """
         channels = self.facts["channels"].values()
         messages = sum(channel["messages"] for channel in channels)
         message_count = count_nouns(messages, "message")
@@ -365,7 +370,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
 
 def _describe_log(log: Log) -> JsonObject:
-    """Returns the facts of a log of this program: of its session, its sites and its links.
+    """Returns the contents of a log as plain values: its session, its arms and network links.
 
     Args:
         log: The log.
@@ -443,9 +448,9 @@ def _describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Collects how completely a site was recorded, and how punctual its control loop was.
+    """Collects how completely an arm was recorded, and how punctual its control loop was.
 
-    The timing is None in virtual time, in which no clock is read.
+    The timing is None in a simulation, in which no clock is read.
 
     Args:
         log: The log of the run.
@@ -519,7 +524,7 @@ def _compute_percentiles(
     shares: Mapping[str, float] = PERCENTILES,
     unit: float = 1.0,
 ) -> dict[str, float] | None:
-    """Computes some percentiles of a list of numbers.
+    """Computes percentiles, such as the median, of a list of numbers.
 
     Args:
         values: The numbers.
@@ -538,9 +543,9 @@ def _compute_percentiles(
 
 
 def _count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks that a site executed, as the site itself reported.
+    """Returns how many control periods (ticks) an arm's process executed, by its own report.
 
-    The site reports it at the end of a run, in its event "end".
+    The process reports the number at the end of a run, in its event "end".
 
     Args:
         log: The log of the run.
@@ -572,9 +577,9 @@ def _parse_number(text: str) -> int | None:
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Collects the key numbers of a recorded run, for the file `summary.json`.
+    """Collects the most important numbers of a run, for the file `summary.json`.
 
-    The log may be torn, short or empty. Numbers that it does not determine are None.
+    The log may be torn, short or empty. Numbers that the log does not determine are None.
 
     Args:
         log: The log of the run.
@@ -634,7 +639,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
-    """Returns the numbers of a site for `summary.json`, such as its largest errors and torques.
+    """Returns the most important numbers of one arm in a run, such as its largest error.
+
+    They are written to `summary.json`, so that other programs can read them.
 
     Args:
         log: The log of the run.

@@ -89,7 +89,7 @@ class JointFollowing(NamedTuple):
     ) -> tuple[Array, Array]:
         """Returns the joint velocity that should reduce the errors, and its derivative.
 
-        The velocity is -Lambda e, with the error e of the joints and the gain Lambda.
+        The velocity is -Lambda e, with the error e of the joints and the gain Lambda, in 1/s.
 
         Args:
             rows: Rows of the records. They have no effect, because the result depends on no
@@ -105,9 +105,9 @@ class JointFollowing(NamedTuple):
         return -self.Lambda * e, -self.Lambda * ed
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
-        """Returns the jump of the filtered error r when the error e jumps, shape (K, n).
+        """Returns the jump of the filtered error r when a new message of another arm is used.
 
-        As r = qd + Lambda e, the jump is Lambda de.
+        The error e jumps by de. As r = qd + Lambda e, the jump is Lambda de, shape (K, n).
 
         Args:
             rows: Rows of the records. Not needed here, as the result depends on no pose.
@@ -197,6 +197,9 @@ class TaskFollowing:
     def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
         """Returns the joint velocity with which the end effector should reduce its error.
 
+        The end effector is the tip of the arm. The arm follows other arms with this tip, and
+        not joint by joint.
+
         Args:
             rows: Rows of the records whose pose is used.
             e: Differences between the position of the end effector and the position that it
@@ -240,9 +243,10 @@ class TaskFollowing:
         return self.compute_joint_torque(rows, y)
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
-        """Returns the joint torque J'f that acts like a force f at the end effector.
+        """Returns the joint torque J'f that acts like a force f at the end effector (tip).
 
-        The shape is (K, n), in N m.
+        J is the Jacobian, from joint velocities to the velocity of the tip. The shape is (K,
+        n), in N m.
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -252,7 +256,7 @@ class TaskFollowing:
         return torque
 
     def project_torque(self, torque: Array) -> Array:
-        """Returns the force at the end effector that corresponds to a joint torque, in N.
+        """Returns the force at the end effector (tip) that corresponds to a joint torque, in N.
 
         `compute_joint_torque` is the reverse conversion.
 
@@ -266,10 +270,10 @@ class TaskFollowing:
         return self._solve(slice(None), along_axes)
 
     def without_posture(self) -> "TaskFollowing":
-        """Returns a copy of this object in which free joints keep their positions.
+        """Returns a copy in which the arm does not move its free joints to a preferred posture.
 
-        They do not move to a preferred posture. The reference velocity is then linear in the
-        error of the end effector.
+        An arm may have more joints than the task needs. The reference velocity is then linear
+        in the error of the end effector.
         """
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)
@@ -316,9 +320,9 @@ def build_following(
     qd: Array,
     Lambda: Array,
 ) -> Following:
-    """Builds the object that computes how an arm moves its joints to follow other arms.
+    """Returns the object that computes how an arm moves its joints to follow other arms.
 
-    An arm follows either joint by joint or with its end effector.
+    An arm follows either joint by joint or with its end effector (tip).
 
     Args:
         arm: The arm. If it has a task for its end effector, it follows with the end effector.

@@ -117,7 +117,10 @@ The records of so many ticks need half a gigabyte of memory.
 
 
 class _VirtualJudgement(NamedTuple):
-    """Judgement of a simulated run without a log.
+    """Judgement whether a simulated run is stable, if the simulation wrote no log.
+
+    Parameter sweeps use it, because writing and reading a log for each run would take longer
+    than the run.
 
     Attributes:
         end: How the motion ends.

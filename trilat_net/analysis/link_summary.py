@@ -95,10 +95,9 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> _PredictedDelivery:
-    """Computes when a site may use each of the first samples that another site sent.
+    """Computes when each message of another arm comes into use, as the scenario defines.
 
-    A site is the process that runs one arm, and a sample is the state that it sends in every
-    tick. The scenario delays samples in a repeatable way to emulate a network.
+    The scenario delays the messages (samples) in a repeatable way to emulate a network.
 
     Args:
         log: The log of the run, which contains the scenario and the changes of the delays.
@@ -144,7 +143,9 @@ def predict_delivery(
 
 
 class _Arrivals(NamedTuple):
-    """Samples that arrived at a site over a link, in the order in which they arrived.
+    """Messages ("samples") that arrived at an arm over one network link, in order of arrival.
+
+    A sample contains the state of the sending arm in one tick, a period of its control loop.
 
     Attributes:
         tick: Ticks in which the receiver accepted the samples, shape (A,).
@@ -172,10 +173,9 @@ class _Arrivals(NamedTuple):
 
 
 def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
-    """Reads from a log which samples of other sites arrived at a site, and when.
+    """Reads from a log which messages of other arms arrived at an arm, and when.
 
-    A site is the process that runs one arm, and a sample is the state that it sends in every
-    tick.
+    Such a message, called a sample, has the state that an arm sends in every control period.
 
     Args:
         log: The log of the run.
@@ -211,9 +211,7 @@ def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
 
 
 def _count_sent(log: Log, peer: str, newest_sample: int) -> int:
-    """Returns the number of samples that a peer has sent, as far as the log shows.
-
-    A sample is the state that a site publishes in one tick of its control loop.
+    """Returns how many messages with its state an arm has sent, as far as the log shows.
 
     Args:
         log: The log of the run.
@@ -284,7 +282,9 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """Mean, standard deviation, percentiles and extremes of some numbers, in their unit.
+    """Mean, standard deviation, percentiles and extremes of numbers, such as delays in ms.
+
+    All attributes have the unit of the numbers.
 
     Attributes:
         mean: Arithmetic mean.
@@ -306,7 +306,9 @@ class ValueStatistics(NamedTuple):
 
 
 class _AgeHistogram(NamedTuple):
-    """Number of ticks by the age of the sample in use, in bins of equal width.
+    """Number of control periods (ticks) by the age of the other arm's state that was used.
+
+    The bins have equal width.
 
     Attributes:
         first_ms: Lower edge of the first bin, in ms.
@@ -320,9 +322,10 @@ class _AgeHistogram(NamedTuple):
 
 
 class ClockSummary(NamedTuple):
-    """The clock of a link's sender, compared with the receiver's.
+    """Difference between the clocks of the two ends of a network link.
 
-    docs/reference/metrics.md defines the quantities under `clock.*`.
+    Measured one-way delays are only as accurate as this difference. docs/reference/metrics.md
+    defines the quantities under `clock.*`.
 
     Attributes:
         offset_us: Last estimate of the sender's clock minus the receiver's, in microseconds.
@@ -357,9 +360,9 @@ class ClockSummary(NamedTuple):
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns the estimates of a peer's clock that a site made during a session.
+    """Returns how far the clocks of two arms differ, as one of them estimated in a session.
 
-    The age of a sample is known only as well as the offset between both clocks.
+    The age of a message is known only as well as this difference.
 
     Args:
         log: The log of the run.
@@ -397,10 +400,10 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 
 
 class SampleCounts(NamedTuple):
-    """Numbers of samples of a link, counted from the receiver's records.
+    """Numbers of sent, used, lost and late messages of a network link, from the receiver's log.
 
-    A sample is the state that a site publishes in one tick. docs/reference/metrics.md
-    defines the numbers under `samples.*`.
+    Such a message, called a sample, has the state of an arm in one control period.
+    docs/reference/metrics.md defines the numbers under `samples.*`.
 
     Attributes:
         sent: Samples that the peer sent.
@@ -470,7 +473,7 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link as in scenarios: "m1->s" for samples that m1 sends to s."""
+        """Name of the link as in scenarios: "m1->s" for messages from arm m1 to arm s."""
         return f"{self.peer}->{self.site}"
 
     @property
@@ -486,7 +489,9 @@ class LinkSummary(NamedTuple):
 
 
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """Returns True if a link gives every sample the same delay, and loses no sample.
+    """Returns True if a network link delays every message equally, and loses none.
+
+    The stability theorem requires constant delays.
 
     Args:
         states: Delay models of the link over time.
@@ -498,7 +503,9 @@ def has_one_constant_delay(states: list[StatedModel]) -> bool:
 
 
 def summarise_links(log: Log) -> list[LinkSummary]:
-    """Returns a summary of every link, by receiver and then by peer, in scenario order.
+    """Returns delays, losses and message counts of every network link of a run.
+
+    The summaries have the order of the receivers, and then of the senders, in the scenario.
 
     Args:
         log: The log of the run.
@@ -532,7 +539,9 @@ def summarise_links(log: Log) -> list[LinkSummary]:
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
-    """Returns how old the peer's state was that a site used, at every tick, in ns.
+    """Returns the age of the other arm's state that a control loop used, at every tick, in ns.
+
+    A state is older than the network delay if the next message is late or lost.
 
     Args:
         log: The log of the run.
@@ -550,7 +559,7 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Computes mean, standard deviation, percentiles and extremes, for example of the ages.
+    """Computes mean, standard deviation, percentiles and extremes of numbers, such as delays.
 
     Args:
         values: The numbers.
@@ -576,7 +585,7 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
 
 
 def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
-    """Returns a histogram of ages in at most `MOST_AGE_BINS` bins.
+    """Counts ages in a histogram of at most `MOST_AGE_BINS` bins.
 
     The width of a bin is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
 
@@ -609,7 +618,7 @@ def _summarise_link(
     sent: int,
     arrivals: _Arrivals,
 ) -> LinkSummary:
-    """Returns the summary of the link from a peer to a site.
+    """Returns delays, losses and message counts of the network link from one arm to another.
 
     Args:
         log: The log of the run.
@@ -690,7 +699,9 @@ def _count_samples(
     sent: int,
     judged: int,
 ) -> SampleCounts:
-    """Counts the samples of a link by what happened to them, see `SampleCounts`.
+    """Counts the messages (samples) of a network link by their fate, see `SampleCounts`.
+
+    Examples are samples that were used, lost, or replaced by a newer one before their use.
 
     Args:
         site_log: Log of the receiver.
@@ -727,7 +738,10 @@ def _count_samples(
 
 
 class DelayDistribution(NamedTuple):
-    """Delays and ages of all samples on one link, for a histogram.
+    """Delays and ages of all messages (samples) on one network link, for a histogram.
+
+    The delay is the time from sending to the first use. The age is the time since a state was
+    measured, at a later tick at which it is still used.
 
     Attributes:
         peer: Name of the sender.
@@ -744,7 +758,9 @@ class DelayDistribution(NamedTuple):
 
 
 def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Collects the delays and ages of the samples on every link of a run, for histograms.
+    """Collects the delays of all messages on every network link of a run, for histograms.
+
+    The ages at which control loops used the messages are added.
 
     Args:
         log: Log of the run.

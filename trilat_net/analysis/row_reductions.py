@@ -18,7 +18,7 @@ _SEQUENTIAL_COLUMNS = 7
 
 
 def sum_rows(values: Array) -> Array:
-    """Returns the sum of each row, shape (K,).
+    """Returns the sum of each row of a table of numbers, shape (K,).
 
     Args:
         values: Numbers, shape (K, n).
@@ -34,7 +34,7 @@ def sum_rows(values: Array) -> Array:
 
 
 def max_rows(values: Array) -> Array:
-    """Returns the largest number of each row, shape (K,). A row with NaN gives NaN.
+    """Returns the largest number in each row of a table, shape (K,). NaN makes the result NaN.
 
     Args:
         values: Numbers, shape (K, n), with at least one column.
@@ -46,7 +46,7 @@ def max_rows(values: Array) -> Array:
 
 
 def any_in_rows(values: NDArray[np.generic]) -> NDArray[np.bool_]:
-    """Returns for each row whether any of its values is true or not zero, shape (K,).
+    """Returns True for each row of a table that contains any value that is true or not zero.
 
     Args:
         values: Numbers or truth values, shape (K, n).

@@ -136,11 +136,11 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class RunEnd(NamedTuple):
-    """How a run ends, and the numbers that show it.
+    """How the motion of a run ends, such as at rest or growing, with the numbers that show it.
 
-    The trends of the synchronisation error e and of the joint velocity qd over the last part of
-    the run decide. The object describes all sites of the run, or a single joint while the
-    joints are compared.
+    The trends of the tracking error e and of the joint velocity qd over the last part of the
+    run decide. The object describes all arms of the run, or a single joint while the joints are
+    compared.
 
     Attributes:
         behaviour: Behaviour of the worst joint, such as settled or growing.
@@ -206,10 +206,9 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for the user on how the run ends.
+        """A sentence for the user on how the motion ends, with the numbers that show it.
 
-        It contains the behaviour at the end, the numbers that show it, and the reasons why the
-        run cannot be called stable.
+        The sentence also has the reasons why the run cannot be called stable.
         """
         return "; ".join([self._behaviour_text, *self.reasons])
 
@@ -264,7 +263,7 @@ class RunEnd(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log) -> "RunEnd":
-        """Judges from a log whether the motion died away at the end of the run.
+        """Judges from a log whether the motion of the arms died away at the end of the run.
 
         A log that is torn or empty leaves the end undecided. If the run ends in a bounded
         oscillation, its frequency is computed too.
@@ -430,10 +429,10 @@ def reduce_to_buckets(
 
 
 def trace_log(log: Log) -> RunTrace:
-    """Reduces a log to the data that are needed to judge the end of the run.
+    """Reduces a log to the data that are needed to judge the end of its run.
 
-    The reduced data of a long log fit into memory, and simulations without a log produce the
-    same.
+    The reduced data of a long log fit into memory. Simulations without a log produce data of
+    the same kind.
 
     Args:
         log: The log of the run.
@@ -488,10 +487,11 @@ def _find_unscripted_push_s(log: Log, site_log: SiteLog) -> float:
 
 
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
-    """Returns |e|, |qd| and q of each site in every 50 ms interval, shape (K, 3, n) each.
+    """Returns |e|, |qd| and q of each arm in every 50 ms interval, shape (K, 3, n) each.
 
-    `RunTrace.buckets` stores these side by side in one row, and may have columns for more
-    joints than the site has. These columns are removed.
+    They are error, joint velocity and joint angle. `RunTrace.buckets` stores these side by side
+    in one row, and may have columns for more joints than the arm has. These columns are
+    removed.
     """
     sites = []
     for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
@@ -540,10 +540,10 @@ def _find_worst_joint(
     columns: Sequence[Array],
     sites: Sequence[Array],
 ) -> RunEnd:
-    """Returns the end of the joint with the worst behaviour.
+    """Returns how the motion of the joint with the worst behaviour ends.
 
-    Of several joints with the worst behaviour the fastest one is returned. The largest |e| and
-    |qd| of the last second are those of all joints.
+    Growing is worse than oscillating, for example. Of several such joints the fastest one is
+    returned. The largest |e| and |qd| of the last second are those of all joints.
 
     Args:
         scenario: Scenario of the run.
@@ -615,7 +615,9 @@ def _judge_joint(
     motion: Array,
     t_s: Array,
 ) -> EndBehaviour:
-    """Returns the behaviour of a single joint at the end of the run, without regard to others.
+    """Judges how the motion of a single joint ends: at rest, decaying, oscillating or growing.
+
+    The other joints are not considered.
 
     Args:
         scenario: Scenario of the run.
@@ -914,10 +916,10 @@ def _find_disagreement(
 
 
 def _compares_sites_by_error(scenario: Scenario, sites: Iterable[str]) -> bool:
-    """Returns True if the error |e| itself shows whether sites agree.
+    """Returns True if the tracking error |e| alone shows whether two arms agree.
 
-    This holds for laws that compare positions, and for arms that follow end effectors. For
-    other sites the joint angles must be compared.
+    This holds for control laws that compare positions, and for arms that follow end effectors.
+    For other arms the joint angles must be compared.
     """
     for site in sites:
         compares_positions = scenario.sites[site].control.compares_positions
@@ -964,7 +966,7 @@ def _find_held_sites(
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
-    """Yields a sentence if arms end in a pose that a controller should not have brought about.
+    """Yields a sentence if arms end in a pose that no good controller should cause.
 
     Such arms hang down, or are far from every start pose although nobody pushed.
 
@@ -1079,7 +1081,7 @@ def _find_last_change(scenario: Scenario, span_s: float) -> float:
 
 
 def _find_frequency_hz(site_logs: list[SiteLog]) -> float | None:
-    """Estimates the frequency of an oscillation from the changes of sign of the fastest joint.
+    """Estimates how fast the arms oscillate, from the changes of sign of the fastest joint.
 
     Args:
         site_logs: Logs of all sites. The second half of each is used.

@@ -33,9 +33,9 @@ LARGE_AGE_SHARE = 0.05
 
 
 def list_remarks(log: Log) -> tuple[str, ...]:
-    """Lists the conditions of a run that a reader of its judgement should know.
+    """Lists circumstances of a run that may explain why it was judged stable or not.
 
-    They do not change the judgement, but may explain it.
+    An example is a motor at its torque limit.
 
     Args:
         log: Log of the run.
@@ -56,9 +56,9 @@ def list_remarks(log: Log) -> tuple[str, ...]:
 
 
 def _describe_programs(log: Log) -> str:
-    """Returns a remark that the judgement takes no account of how programs react to the arms.
+    """Returns a remark that programs moved arms, and that the judgement ignores how they react.
 
-    It is empty if no program moved an arm.
+    The remark is empty if no program moved an arm.
     """
     sites = list_program_sites(log)
     if not sites:
@@ -72,9 +72,10 @@ def _describe_programs(log: Log) -> str:
 
 
 def _describe_torque_limits(log: Log) -> str:
-    """Returns a clause on how long each site was at its torque limit. Empty if none was.
+    """Returns a clause on how long each arm's motors were at their torque limit.
 
-    At its limit a drive does not apply the torque that the control law demands.
+    At its limit a motor does not apply the torque that the control law demands. The clause is
+    empty if no motor was at its limit.
 
     Args:
         log: The log of the run.
@@ -94,7 +95,9 @@ def _describe_torque_limits(log: Log) -> str:
 
 
 def _describe_large_pushes(log: Log) -> str:
-    """Returns how much operators and walls pushed, if it is a large share of the torque limit.
+    """Returns a remark if operators or walls pushed with a large part of the torque limit.
+
+    Motors that work near their limit cannot follow the control law any more.
 
     Returns:
         The clause. Empty if every push was small at every joint.
@@ -113,9 +116,9 @@ def _describe_large_pushes(log: Log) -> str:
 
 
 def _describe_late_ticks(log: Log) -> str:
-    """Returns a clause on the ticks of each site that began late by a period or more.
+    """Returns a remark on control periods (ticks) that began late by a period or more.
 
-    Empty if all ticks began in time.
+    Such periods occur on a busy machine. The text is empty if all began in time.
     """
     counts = {}
     for site in log.sites:

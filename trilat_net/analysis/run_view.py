@@ -31,7 +31,9 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """One arm in a recorded run: its motion, its torques, and how it follows the other arms.
+    """Motion and torques of one arm in a recorded run, and how the arm follows other arms.
+
+    A site is the process that controls the arm.
 
     Attributes:
         records: Records of the site, with one row for every tick.
@@ -46,9 +48,9 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A recorded run, with everything that several metrics need, computed at most once.
+    """A recorded run, with quantities that several metrics need, each computed at most once.
 
-    Every metric receives this object and reads sites, links and walls from it.
+    Every metric receives this object and reads arms, network links and walls from it.
 
     Args:
         log: The log of the run.
@@ -64,10 +66,10 @@ class RunView:
         self._results: dict[Callable[[RunView], Any], Any] = {}
 
     def compute_once(self, compute: Callable[["RunView"], T]) -> T:
-        """Returns the result of a function of this view, which is called only the first time.
+        """Returns the result of a function of this run, which is called only the first time.
 
-        Later calls with the same function return the stored result. Metrics share intermediate
-        results in this way.
+        Later calls with the same function return the stored result, so that several metrics
+        share intermediate results.
 
         Args:
             compute: The function.
@@ -78,9 +80,9 @@ class RunView:
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
-        """The sites with records, by name.
+        """Motion and torques of every arm with records, by the name of its site (process).
 
-        Metrics of the other sites have a reason in place of a value.
+        Metrics of the other arms have a reason in place of a value.
         """
         runs = {}
         for site, records in align_records(self.log).items():
@@ -106,22 +108,22 @@ class RunView:
 
     @cached_property
     def absent(self) -> list[str]:
-        """Names of the sites without any record, which a log of a failed session may have."""
+        """Names of the arms without any record, which a log of a failed session may have."""
         return [site for site in self.log.sites if site not in self.sites]
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """Summaries of all links (delays, losses, clocks) by name, computed at first use.
+        """Summaries of network links (delays, losses, clocks) by name, computed at first use.
 
-        The name "m1->s" denotes the link from site m1 to site s.
+        The name "m1->s" denotes the link from arm m1 to arm s.
         """
         return {link.name: link for link in summarise_links(self.log)}
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, TorqueSource]]:
-        """All virtual walls by name, each with the site whose arm can touch it.
+        """All virtual walls by name, each with the arm that can touch it.
 
-        The name "s/1" denotes the first wall of site s. Walls of a site are counted from 1.
+        The name "s/1" denotes the first wall of arm s. Walls of an arm are counted from 1.
         """
         walls = {}
         for site in self.log.sites:
@@ -130,7 +132,7 @@ class RunView:
         return walls
 
     def list_subjects(self, kind: str) -> Iterable[str]:
-        """Lists the names of the sites, links or walls for which a metric is computed.
+        """Lists the names of all arms, network links or walls for which a metric is computed.
 
         Args:
             kind: "site", "link", "wall", or "run". For "run" the list has a single empty name.

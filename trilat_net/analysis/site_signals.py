@@ -41,9 +41,9 @@ P is 5 for the planar arm and 10 n for a chain.
 
 
 def follows_in_task_space(log: Log) -> bool:
-    """Returns True if the sites follow each other with their end effectors.
+    """Returns True if the arms follow each other with their end effectors (tips).
 
-    Their errors are then along axes in space, and not at joints.
+    Their errors are then measured along axes in space. Otherwise, they are joint angles.
 
     Args:
         log: The log of the run.
@@ -62,7 +62,9 @@ def external_torques(site_log: SiteLog) -> Array:
 
 
 class JointError(NamedTuple):
-    """The largest error |e| in some records, with the joint and the time at which it occurred.
+    """Largest tracking error of an arm, with the joint and the time at which it occurred.
+
+    The tracking error is the difference between the pose of the arm and its reference.
 
     Attributes:
         value: The error, in the unit of the shared coordinates.
@@ -78,7 +80,9 @@ class JointError(NamedTuple):
 
     @classmethod
     def find_largest(cls, site_log: SiteLog, from_s: float = -math.inf) -> "JointError | None":
-        """Finds the largest error |e| of a site, the first one if it occurs repeatedly.
+        """Finds the largest tracking error of an arm.
+
+        If it occurs several times, the first counts.
 
         Args:
             site_log: Log of the site.
@@ -102,9 +106,9 @@ class JointError(NamedTuple):
 
     @classmethod
     def find_in_last_second(cls, site_log: SiteLog) -> "JointError | None":
-        """Finds the largest error |e| of a site in the last second of its records.
+        """Finds the largest tracking error of an arm in the last second of its records.
 
-        The last second, rather than the last record, does not miss an oscillation.
+        The last record alone could miss an oscillation.
 
         Args:
             site_log: Log of the site.
@@ -118,9 +122,9 @@ class JointError(NamedTuple):
 
 
 def find_last_error(log: Log) -> JointError | None:
-    """Finds the largest error |e| of all sites in the last second of their records.
+    """Finds the largest tracking error of all arms in the last second of their records.
 
-    It shows whether the arms agree at the end of the run.
+    This error shows whether the arms agree at the end of the run.
 
     Args:
         log: Log of the run.
@@ -136,6 +140,8 @@ def find_last_error(log: Log) -> JointError | None:
 def largest_magnitude(values: Array) -> Array:
     """Returns the largest absolute value of each row, for example over the joints of an arm.
 
+    For example, the row [0.1, -0.3] gives 0.3.
+
     Args:
         values: Values, shape (K, n).
 
@@ -148,9 +154,9 @@ def largest_magnitude(values: Array) -> Array:
 
 
 def largest_remaining_error(site_log: SiteLog) -> Array:
-    """Returns for each record the largest error of any joint from there to the end.
+    """Returns the largest error from each record to the end of the run.
 
-    The arm has settled where this value falls below a bound.
+    The arm has settled at the first record where this value is below a bound.
 
     Args:
         site_log: Log of the site.
@@ -165,9 +171,9 @@ def largest_remaining_error(site_log: SiteLog) -> Array:
 
 
 def settling_time_s(site_log: SiteLog) -> float | None:
-    """Returns the last time at which an error exceeded `SETTLED_ERROR_RAD`, in s.
+    """Returns the time from which on the error of an arm stays small, its settling time, in s.
 
-    From this time on, the arm stays close to its reference for the rest of the run.
+    This is the last time at which an error exceeded `SETTLED_ERROR_RAD`.
 
     Returns:
         The time. 0 if no error ever exceeded the bound. None if the last record has an error
@@ -186,7 +192,10 @@ def settling_time_s(site_log: SiteLog) -> float | None:
 
 
 def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
-    """Returns the time at which the last site has settled, in s, for a run as a whole.
+    """Returns the time at which the last arm of a run has settled, in s.
+
+    An arm has settled when its error stays small from then on. For example, 1.2 s and 3.4 s
+    give 3.4 s.
 
     Args:
         times_s: Settling time of each site, from `settling_time_s`. None for a site that has

@@ -57,10 +57,11 @@ _UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 
 
 class LoopRoots(NamedTuple):
-    """Characteristic roots of the control loop, linearised at the pose at which a run ended.
+    """Growth rates (roots) of small motions about the pose at which a run ended.
 
-    The roots show whether small motions about this pose die away. `theory.loop_roots` computes
-    them for every command.
+    They are characteristic roots of the linearised control loop. If the real parts of all of
+    them are negative, small motions die away. `theory.loop_roots` computes them for every
+    command.
 
     Attributes:
         verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
@@ -91,9 +92,9 @@ class LoopRoots(NamedTuple):
 
     @property
     def is_proof(self) -> bool:
-        """True if the roots prove that small motions about the final pose die away.
+        """True if the roots (growth rates) prove that small motions about the final pose decay.
 
-        This needs exact roots: those of a loop with its ticks and its repeating delays.
+        Only exact roots prove it: those of a loop with its ticks and its repeating delays.
         """
         return self.exact and self.verdict == "stable"
 
@@ -112,9 +113,9 @@ class LoopRoots(NamedTuple):
 
     @property
     def is_refutation(self) -> bool:
-        """True if the roots prove that small motions about the final pose grow.
+        """True if the roots (growth rates) prove that small motions about the final pose grow.
 
-        This needs exact roots: those of a loop with its ticks and its repeating delays.
+        Only exact roots prove it: those of a loop with its ticks and its repeating delays.
         """
         return self.exact and self.verdict == "unstable"
 
@@ -152,7 +153,7 @@ class LoopRoots(NamedTuple):
 
 
 class StabilityDecision(NamedTuple):
-    """Decision whether a run is stable, and what it rests on.
+    """Decision whether a run of coupled arms is stable, with the evidence for it.
 
     Attributes:
         stability: The decision.
@@ -168,7 +169,7 @@ class StabilityDecision(NamedTuple):
 
 
 class RunFindings(NamedTuple):
-    """Everything that is known about the stability of a run: the input of `decide_stability`.
+    """All evidence on the stability of a run, from which `decide_stability` decides.
 
     Attributes:
         end: How the motion ends.
@@ -190,9 +191,9 @@ class RunFindings(NamedTuple):
 
     @property
     def all_proofs(self) -> list[str]:
-        """Phrases for everything that proves the control loop stable, exact roots last.
+        """Phrases that name every proof that the control loop is stable, exact roots last.
 
-        Empty if there is no proof. A decision joins the phrases to the text after "rests on:".
+        Empty if there is no proof. The texts appear after "rests on:".
         """
         proofs = list(self.proofs)
         if self.has_stable_roots:
@@ -202,7 +203,7 @@ class RunFindings(NamedTuple):
 
     @property
     def has_stable_roots(self) -> bool:
-        """True if exact roots were computed, and prove that small motions die away.
+        """True if the exact roots (growth rates) of the loop prove that small motions die away.
 
         Roots that are not exact never count as a proof.
         """
@@ -210,9 +211,9 @@ class RunFindings(NamedTuple):
 
 
 def decide_stability(run: RunFindings) -> StabilityDecision:
-    """Decides whether a run is stable, settled, not stable, or open.
+    """Decides from all evidence whether a run is stable, settled, not stable, or open.
 
-    The module's docstring defines the words.
+    The module's docstring defines these words.
 
     Args:
         run: Everything that is known about the run.
@@ -261,7 +262,7 @@ def is_decided_by_roots(run: RunFindings) -> bool:
 
 
 def _list_reasons(run: RunFindings) -> tuple[str, ...]:
-    """Lists the sentences that prevent the judgement stable or settled, in order.
+    """Lists the sentences that prevent the judgements "stable" and "settled", in order.
 
     They come from the end of the run, from missing records, from the runs with small pushes,
     from doubts about the analyses, and from roots that show growth.
@@ -287,7 +288,10 @@ def _list_reasons(run: RunFindings) -> tuple[str, ...]:
 
 
 def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDecision | None:
-    """Decides about a run by its end and its exact roots alone.
+    """Decides whether a run is stable from its end and its exact roots alone.
+
+    The roots are growth rates of small motions, computed from the linearised control loop. If
+    all of them are negative, small motions die away.
 
     Args:
         run: Everything that is known about the run.
@@ -342,9 +346,10 @@ def _find_refutation(run: RunFindings) -> str:
 
 
 def _agrees_with_proof(run: RunFindings) -> bool:
-    """Returns True if neither the end of a run nor its twins contradict a proof.
+    """Returns True if neither the end of a run nor its repetitions contradict a proof.
 
-    A run that is shorter than the period of its delays contradicts nothing: it may show a beat.
+    A repetition, a twin, has a small push. A run that is shorter than the period of its delays
+    contradicts nothing: it may show a beat.
     """
     end = run.end
     twins = run.twins
@@ -361,7 +366,9 @@ def _agrees_with_proof(run: RunFindings) -> bool:
 def _confirms_slowest_root(run: RunFindings) -> bool:
     """Returns True if the slowest push decays at the rate that the slowest root predicts.
 
-    A push that shows no clear trend then agrees with a proof by roots: it merely decays slowly.
+    A push is a small disturbance in a repetition of the run, and a root the growth rate of
+    small motions. A push that shows no clear trend then agrees with the roots: it merely decays
+    slowly.
     """
     roots = run.roots
     worst = None if run.twins is None else run.twins.worst
@@ -448,7 +455,7 @@ def _describe_pushes(run: RunFindings) -> str:
 
 
 def _explain_open(run: RunFindings) -> str:
-    """Returns why a run is open although nothing contradicts a stable run.
+    """Returns the reason why the stability of a run stays open although nothing contradicts it.
 
     Several reasons may apply. The first that applies is stated, from proofs that disagree with
     the run to an end of the run that does not settle the question.
@@ -479,9 +486,10 @@ def _explain_open(run: RunFindings) -> str:
 
 
 def _estimate_needed_s(run: RunFindings) -> float | None:
-    """Returns the length of a run in which the slowest root decays clearly, in s.
+    """Returns how long a run must be so that its slowest motion decays clearly, in s.
 
-    The root decays by itself only after the last action of an operator and the last change.
+    The motion decays by itself only after the last action of an operator and the last change of
+    a setting.
     """
     roots = run.roots
     if roots is None or roots.rate_per_s is None or not roots.rate_per_s < 0.0:

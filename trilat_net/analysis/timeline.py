@@ -75,7 +75,9 @@ def list_effective_commands(log: Log) -> list[Change]:
 
 
 class _AppliedChange(NamedTuple):
-    """A change that a site carried out, from the scenario or from a command during the run.
+    """A change of a setting during the run, such as another network delay, at one arm.
+
+    The scenario planned the change, or a command requested it.
 
     Attributes:
         change: The change of a link or of dominance factors, or the order to a site, with its
@@ -119,9 +121,9 @@ class _AppliedChange(NamedTuple):
 
 
 class _ModeInterval(NamedTuple):
-    """An interval of time in which a site did not follow its peers.
+    """Interval of time in which an arm did not follow the other arms.
 
-    Instead it held its position, braked, or returned to following.
+    Instead, the arm held its position, braked, or returned to following.
 
     Attributes:
         mode: Name of the mode in which the site was.
@@ -135,15 +137,15 @@ class _ModeInterval(NamedTuple):
 
     @property
     def meaning(self) -> ModeMeaning:
-        """An explanation of what the arm does in this mode, such as holding its position.
+        """A sentence on what the arm does in this mode, such as holding its position.
 
-        Texts for people use it, because names of modes such as "hold" explain little.
+        Names of modes such as "hold" explain too little to a reader.
         """
         return MODES[self.mode]
 
 
 class StatedModel(NamedTuple):
-    """A delay model that the scenario, or a change during the run, prescribes for a link.
+    """Delay model that the scenario, or a change during the run, prescribes for a network link.
 
     Measured delays are compared with it.
 
@@ -203,7 +205,9 @@ def list_stated_models(
     link: str,
     changed: Sequence[_AppliedChange],
 ) -> list[StatedModel]:
-    """Lists the delay models of a link: the one at the start, and one after every change.
+    """Lists the delay models that a network link had during a run.
+
+    The first one is in force at the start, and each change adds another.
 
     Args:
         log: The log of the run.
@@ -219,7 +223,7 @@ def list_stated_models(
 
 
 def recorded_end_s(log: Log) -> float:
-    """Returns the time at which the last record's tick period ends, in s.
+    """Returns the time at which the last recorded control period of a run ends, in s.
 
     If there are no records, it is the planned end of the run.
 
@@ -286,9 +290,9 @@ class _RaisedAlarm(NamedTuple):
 
 
 def list_alarms(log: Log) -> list[_RaisedAlarm]:
-    """Lists the alarms of all sites, in the order of their start.
+    """Lists the alarms of all arms, in the order of their start.
 
-    If somebody ordered a site to stop, the reason of the alarm names this person.
+    If somebody ordered an arm to stop, the reason of the alarm names this person.
 
     Args:
         log: The log of the run.

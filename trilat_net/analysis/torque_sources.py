@@ -44,7 +44,7 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
 
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
-    """Returns how deep an end effector is in a virtual wall, in m.
+    """Returns how deep the end effector (tip of the arm) is inside a virtual wall, in m.
 
     The force of the wall grows with the depth. Outside the wall there is no force.
 
@@ -289,9 +289,10 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """The operator's whole torque, shape (K, n), in N m.
+        """Whole torque of the operator on the arm, shape (K, n), in N m.
 
-        It is the sum of the continuous torque and the torque that is held over a tick.
+        It is the sum of a continuous torque and a torque that is held over a tick (control
+        period).
         """
         return self.operator_now + self.operator_held
 
@@ -305,7 +306,7 @@ class TorqueSplit(NamedTuple):
 
     @classmethod
     def of_records(cls, records: AlignedRecords, scenario: Scenario) -> "TorqueSplit":
-        """Splits the recorded external torque on an arm into operator and environment.
+        """Splits the recorded external torque on an arm into those of operator and environment.
 
         The environment's torque is computed from the scenario. The rest belongs to the
         operator. Use `attribute_torque` to find also what the scenario plans for the operator.
@@ -407,7 +408,7 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
 
 
 def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
-    """Returns a scripted torque over time, as if it never started or ended.
+    """Returns a planned torque signal over time, without regard to its start and end times.
 
     Args:
         source: A pulse, a recorded torque, a chirp or a multisine.
@@ -538,9 +539,10 @@ class WallEnergy(NamedTuple):
 
 
 def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
-    """Lists the stiff walls of a site whose force is computed once per tick and held.
+    """Lists the stiff walls of an arm whose force is computed once per tick and held.
 
-    Only such walls can generate energy.
+    A tick is a period of the control loop. Only such walls can generate energy, because the arm
+    moves while their force is constant.
 
     Args:
         spec: Description of the site.

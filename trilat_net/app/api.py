@@ -205,7 +205,9 @@ def metrics(log: AnyLog) -> LogMetrics:
 
 
 def choose_report_folder(log: Path) -> Path:
-    """Returns the default folder of a log's report, which is named after the log.
+    """Returns the folder in which the report of a log is stored, next to the log.
+
+    For example, the report of "run.mcap" is in the folder "run".
 
     Args:
         log: File of the log. If its name has no suffix, the folder ends in "-report".

@@ -73,7 +73,7 @@ RECORDER_NS = 2 * NS_PER_S
 
 @dataclass(slots=True)
 class SessionResult:
-    """Outcome of a session that `run_demo` has run.
+    """Outcome of a session that `run_demo` has run: its log, its problems and its exit code.
 
     Attributes:
         log: Path of the log. The file exists only if the session has begun.
@@ -90,7 +90,7 @@ class SessionResult:
 
 
 class SessionProcess:
-    """State of one process of a session: a site, a recorder or an operator program.
+    """State of one process of a session: of an arm, the recorder or an operator program.
 
     `ProcessStarter` creates this object, and updates it with the reports of the starter
     process.
@@ -111,7 +111,9 @@ class SessionProcess:
         self._signalled = False
 
     def end(self, number: int) -> None:
-        """Ends the process with a signal. Nothing happens if the process has ended already.
+        """Ends the process by sending it a signal, such as SIGTERM.
+
+        The call has no effect if the process has ended already.
 
         Args:
             number: Number of the signal in the operating system.
@@ -121,7 +123,7 @@ class SessionProcess:
             self._starter.signal(self, number)
 
     def problem(self) -> str | None:
-        """Returns a sentence about how the process failed, for the user.
+        """Returns a sentence that explains to the user how the process failed.
 
         Returns:
             A sentence with the exit code or signal, and the last line that the process printed.
@@ -150,10 +152,10 @@ class SessionProcess:
 
 
 def create_file(path: Path) -> BinaryIO:
-    """Creates a file for writing without a buffer. An earlier file of that name is deleted.
+    """Creates the file to which a process of a session writes its output.
 
-    The output of each process of a session goes to such a file, where the user finds its
-    errors.
+    The user finds the errors of the process there. The file is not buffered, so that nothing is
+    lost in a crash. An earlier file of that name is deleted.
 
     Args:
         path: Path of the file.
@@ -426,7 +428,9 @@ def _start(
     endpoints: list[str],
     wait_s: int,
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
-    """Starts the processes of all sites, and those of the user's own operator programs.
+    """Starts one process for every arm of the scenario, and for users' operator programs.
+
+    The processes find each other over the network, as they would on several machines.
 
     Args:
         scenario: The scenario.
@@ -486,7 +490,9 @@ def _start(
 
 
 def _needs_hand_process(scenario: Scenario, site: str) -> bool:
-    """Returns True if the user of a site is a program that runs in a process of its own.
+    """Returns True if an arm is moved by a user's program that needs a process of its own.
+
+    A slow program then cannot delay the control loop of the arm.
 
     Args:
         scenario: The scenario.
@@ -498,6 +504,8 @@ def _needs_hand_process(scenario: Scenario, site: str) -> bool:
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     """Returns True if the session is over: a process has failed, or all processes have ended.
+
+    If one process fails, the other ones are not left running.
 
     Args:
         children: The processes.
@@ -516,10 +524,10 @@ def _end_all(
     interrupt: Interrupt,
     say: Callable[[str], None],
 ) -> None:
-    """Ends the processes of a session: first the sites, and then the recorder.
+    """Ends the processes of a session: first those of the arms, and then the recorder.
 
-    In this order, the recorder stores the last messages of the sites. If the user presses
-    Ctrl-C a second time, all processes receive another signal, which ends them at once.
+    In this order, the recorder stores the last messages of the arms. If the user presses Ctrl-C
+    a second time, all processes receive another signal, which ends them at once.
 
     Args:
         starter: Starter of the processes.
@@ -567,9 +575,9 @@ def _end_group(
     ends_now: Callable[[], bool],
     announce: Callable[[], None],
 ) -> None:
-    """Sends processes a signal to end, and waits until all have ended.
+    """Sends the processes of a session a signal to end, and waits until all have ended.
 
-    A process that does not end within `END_TIMEOUT_NS` is killed.
+    A process that does not end within `END_TIMEOUT_NS` is killed, so that none is left running.
 
     Args:
         starter: Starter of the processes.
@@ -634,7 +642,9 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
 
 
 class _StarterProcess:
-    """Executes the requests to the starter process, and keeps track of its copies.
+    """Starts the processes of a session on request, as copies (forks) of itself.
+
+    A fork is faster than a new Python process, because all modules are imported already.
 
     Args:
         pipe: Connection to the requesting process.
@@ -730,7 +740,7 @@ class _StarterProcess:
 
 
 def _become_process(arguments: list[str], output: Path) -> None:
-    """Turns a copy of the starter into a process like one that a shell has started.
+    """Turns a forked copy of this process into a process like one that a shell has started.
 
     The copy receives its own process session, output file, signal handling and process title.
 

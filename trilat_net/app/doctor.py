@@ -78,7 +78,9 @@ MIN_PUNCTUAL_SHARE = 0.99
 
 
 class DoctorFinding(NamedTuple):
-    """Result of one check of this machine, which `trilat doctor` prints as one line.
+    """Result of one check of this machine, for example of the free disk space.
+
+    `trilat doctor` prints it as one line.
 
     Attributes:
         check: Subject of the check, such as "keys" or "disk".
@@ -100,7 +102,7 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Performs all checks of this machine, and yields each result as soon as it is known.
+    """Checks whether this machine can run a session, and yields each result at once.
 
     Some checks take seconds, so that the user sees progress.
 
@@ -131,6 +133,8 @@ def examine_machine(
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
     """Checks if a member's keys are valid, for how long, and if other users can read them.
+
+    Keys encrypt the connections of a session, and prove which process a message comes from.
 
     Args:
         folder: Folder of a member's keys. None if there is none.
@@ -186,7 +190,9 @@ def examine_links(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Checks if each endpoint can be listened at or reached, and if it is encrypted.
+    """Checks if each network endpoint can be opened or reached, and if it is encrypted.
+
+    An endpoint is an address with a protocol, such as "tls/[::1]:7447".
 
     Args:
         connection: Endpoints to listen at and to connect to.
@@ -234,7 +240,7 @@ def _describe_untried(endpoint: str) -> DoctorFinding:
 
 
 def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
-    """Checks if this machine can listen at an endpoint, by listening there for a moment.
+    """Checks if this machine can listen at a network endpoint, by listening for a moment.
 
     The port may be in use already. An endpoint without encryption causes a warning.
 
@@ -268,9 +274,9 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 def _examine_reaching(
     endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
-    """Checks if another member of a session answers at an endpoint of TCP or TLS.
+    """Checks if another process of a session answers at a TCP or TLS endpoint.
 
-    The user learns before a session whether its members can reach each other, and whether the
+    The user learns before a session whether its processes can reach each other, and whether the
     connection is encrypted.
 
     Args:
@@ -328,7 +334,7 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
 
 
 def _tls_context(folder: Path | None) -> ssl.SSLContext:
-    """Returns the TLS settings with which a member connects.
+    """Returns the settings of an encrypted (TLS) test connection to another machine.
 
     Args:
         folder: Folder of this member's keys. None accepts any certificate.
@@ -346,7 +352,7 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
 
 
 def _split_address(endpoint: str) -> tuple[str, int] | None:
-    """Splits an endpoint of TCP, TLS or QUIC into its host and its port.
+    """Splits a network endpoint such as "tls/[::1]:7447" into its host and its port.
 
     Args:
         endpoint: The endpoint, such as "tls/[::1]:7447".
@@ -411,10 +417,9 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
 def _examine_offsets(
     connection: Connection, clock: Clock, session: str
 ) -> Iterator[DoctorFinding]:
-    """Compares the clock of this machine with those of a session's members.
+    """Compares the clock of this machine with the clocks of a session's other processes.
 
-    The delays of messages are computed from these clocks. They are only as accurate as the
-    known offset between the clocks.
+    Measured delays of messages are only as accurate as the offset between the clocks is known.
 
     Args:
         connection: Endpoints of the session, and keys.
@@ -512,7 +517,7 @@ def examine_rights() -> Iterator[DoctorFinding]:
 
 
 def examine_system() -> DoctorFinding:
-    """Reports which parts of the program are supported on this operating system.
+    """Reports which parts of the program work on this operating system.
 
     Returns:
         A single finding. It is "ok" on Linux. On other systems, it names what is missing.
@@ -529,9 +534,9 @@ def examine_system() -> DoctorFinding:
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Measures how punctual the control loop is on this machine, at decreasing tick rates.
+    """Measures how punctual the control loop is on this machine, at decreasing rates.
 
-    The measurement ends at the first rate that the machine achieves.
+    The measurement ends at the first rate that the machine achieves, for example 1 kHz.
 
     Args:
         clock: Clock of this process.
@@ -556,7 +561,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if a machine achieves a tick rate, judged by how late its ticks are.
+    """Returns True if a machine achieves a control rate, judged by how late its periods begin.
 
     The rate is achieved if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
 
@@ -577,10 +582,10 @@ _RATES_CODE = (
 
 
 def examine_rate() -> DoctorFinding:
-    """Returns the highest tick rate that a single control loop achieves on this machine.
+    """Measures the highest rate at which a control loop is punctual on this machine.
 
-    A tick is one period of the control loop. Each rate of `RATES_HZ` is tried for
-    `REHEARSAL_S`, until the loop is punctual.
+    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until the loop begins its periods on
+    time. An example is 1000 Hz.
     """
     if not is_core_cached():
         return DoctorFinding(
@@ -657,7 +662,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """Result of `trilat doctor`: whether this machine is ready for a session.
+    """Result of `trilat doctor`: whether this machine is ready for a live session.
 
     Attributes:
         findings: Result of each check, in the order of the checks.
@@ -673,14 +678,17 @@ class DoctorReport(Result):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all findings as plain values, with the keys of `trilat doctor --json`.
+        """Converts all findings to plain values, with the keys of `trilat doctor --json`.
 
         The only key is "findings". Its value has the rows of `to_rows`.
         """
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one table row per check, with the fields of `DoctorFinding` as columns."""
+        """Converts the results to a table with a row per check, for example for pandas.
+
+        The fields of `DoctorFinding` are the columns.
+        """
         return [finding._asdict() for finding in self.findings]
 
     def blocks(self) -> Iterator[Any]:

@@ -49,13 +49,17 @@ class Device(Protocol):
     rate_hz: ClassVar[int]
 
     def __enter__(self) -> Self:
-        """Connects to the device. Raises OSError if the device is not present."""
+        """Connects to the input device, such as a haptic handle.
+
+        Raises:
+            OSError: The device is not present.
+        """
 
     def __exit__(self, *_: object) -> None:
-        """Ends the force of the device, and closes the connection."""
+        """Ends the force of the input device, and closes the connection to the device."""
 
     def read(self) -> DeviceState:
-        """Returns the newest state of the device: the motion of its handle, and its buttons.
+        """Returns the newest motion of the device's handle and the state of its buttons.
 
         The method is called `rate_hz` times a second.
 
@@ -65,7 +69,7 @@ class Device(Protocol):
         """
 
     def render(self, force_n: Vector) -> None:
-        """Applies a force to the person who holds the device.
+        """Applies a force with the device's motors to the person who holds the handle.
 
         A device without motors does nothing.
 

@@ -95,10 +95,9 @@ def describe_site(
 
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
-    """Returns the texts of a site's row that follow from its newest record.
+    """Returns the texts of an arm's table row that follow from its newest record.
 
-    The display of `trilat demo` and `trilat watch` has one row per site, the process that runs
-    one arm.
+    The display of `trilat demo` and `trilat watch` has one row per arm.
 
     Args:
         scenario: Scenario of the session.
@@ -130,9 +129,9 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
 
 
 def _describe_hold(hand: HandInForce | None) -> str:
-    """Returns the text of the column "held": whether a person or a program moves the arm.
+    """Returns the table text that says whether a person or a program moves the arm.
 
-    An operator holds an arm while the person or program moves it.
+    It stands in the column "held".
 
     Args:
         hand: State of the operator in the record. None if nobody may move the arm during the
@@ -152,7 +151,7 @@ def _describe_hold(hand: HandInForce | None) -> str:
 
 
 def describe_angles(q: Sequence[float]) -> str:
-    """Formats the joint angles of an arm, so that many joints fit into a column of the table.
+    """Formats the joint angles of an arm so briefly that they fit into a table column.
 
     Args:
         q: Joint angles in rad.
@@ -164,9 +163,10 @@ def describe_angles(q: Sequence[float]) -> str:
 
 
 def describe_row(row: SiteRow) -> str:
-    """Returns the state of a site as one line of text, for outputs without a table.
+    """Returns the state of one arm in a session as a line of text.
 
-    The line contains only the most important columns.
+    Outputs that cannot show a table, such as a file, use it. The line contains only the most
+    important columns.
 
     Args:
         row: The texts of the row, by the headings of the columns.
@@ -209,7 +209,7 @@ def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
 
 
 class SessionDisplay:
-    """Terminal output of a session: a table of the sites, and lines above it.
+    """Terminal output of a running session: a table of the arms, and lines above it.
 
     The object is a context manager that restores the terminal.
 
@@ -244,7 +244,9 @@ class SessionDisplay:
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line, such as an event, that stays in the terminal above the table of sites.
+        """Prints a line, such as an event, that stays in the terminal above the table of arms.
+
+        The table below is refreshed all the time.
 
         Args:
             text: The line.
@@ -254,7 +256,7 @@ class SessionDisplay:
     def show(
         self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
     ) -> None:
-        """Shows the present state of the session: a table of the sites, and alarms above it.
+        """Refreshes the table of the arms in the terminal, and the alarms above the table.
 
         An alarm remains visible as long as it is present.
 
@@ -285,7 +287,7 @@ class SessionDisplay:
 
 
 class SessionMonitor:
-    """Receives the messages of all sites of a session, and shows them on a display.
+    """Receives the messages of all arms of a session, and shows them on a display.
 
     The program of a user who watches the session creates this object and calls `poll`
     repeatedly.
@@ -320,7 +322,7 @@ class SessionMonitor:
             self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and updates the display if that is due.
+        """Receives the messages that have arrived, and refreshes the display if that is due.
 
         Important events are printed as lines above the table. The method does not wait.
         """

@@ -87,7 +87,7 @@ def _parse_header(payload: bytes) -> tuple[int, ...] | None:
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
-    """Sends each message of a benchmark back to its sender, until the connection is closed.
+    """Sends each test message of a network benchmark back, until the connection is closed.
 
     This is the work of the far end. The near end measures the round trip times.
 
@@ -142,9 +142,9 @@ class NearEnd:
         self._put(sample.ljust(size_bytes, b"\0"))
 
     def _read_replies(self) -> Iterator[tuple[int, int]]:
-        """Yields the number and the round trip time in ns of each reply that has arrived.
+        """Yields number and round trip time, in ns, of each test message that has come back.
 
-        Replies to other near ends are ignored.
+        Replies to other measuring processes are ignored.
         """
         while (entry := self._inbox.poll()) is not None:
             header, arrived_ns = entry
@@ -223,9 +223,9 @@ def _open(
     listens: bool,
     insecure: bool,
 ) -> tuple[ZenohBus, str]:
-    """Opens the network connection of one end of the benchmark.
+    """Opens the network connection of one end of a benchmark.
 
-    The near end sends messages, and the far end sends them back.
+    The near end sends test messages, and the far end sends them back.
 
     Args:
         endpoint: Endpoint to listen at or to connect to.
@@ -274,7 +274,7 @@ def run_far_end(
     insecure: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Runs the far end of a benchmark, which sends every message back to the near end.
+    """Runs the far end of a network benchmark, which sends every test message back.
 
     It runs on the other machine, where the user starts it with `trilat ping --answer`.
 
@@ -306,8 +306,8 @@ def run_far_end(
 def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
     """Runs the far end of a benchmark in a process on this machine, as a context manager.
 
-    The far end sends back the messages of the benchmark, over each protocol. Without another
-    machine, only this machine itself is measured.
+    The far end sends back the test messages. Without another machine, only this machine itself
+    is measured.
 
     Args:
         duration_s: Duration of the benchmark, in s. The process ends some time later by itself.
@@ -340,9 +340,10 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
 
 
 class _ScenarioNeeds(NamedTuple):
-    """Requirements of a scenario on the network.
+    """What a scenario demands of the network: message size, rate, and largest delay.
 
-    They follow from its message rate and from the delays for which its control loop is stable.
+    The demands follow from the rate of the control loops, and from the delays for which they
+    are stable.
 
     Attributes:
         sample_bytes: Size of a sample of the largest arm, in bytes.
@@ -492,9 +493,10 @@ def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, An
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """Result of measuring a network for a scenario, with a verdict for each transport.
+    """Result of measuring whether the network is good enough for a scenario.
 
-    A transport is the protocol that carries the messages: TCP, TLS or QUIC.
+    There is a verdict for each transport, the protocol that carries the messages: TCP, TLS or
+    QUIC.
 
     Attributes:
         scenario: Name of the scenario.
@@ -515,14 +517,15 @@ class NetworkBenchmark(Result):
 
     @property
     def good(self) -> bool:
-        """True if every measured transport (TCP, TLS or QUIC) is good enough for the scenario.
+        """True if the network is good enough for the scenario with every measured transport.
 
-        The exit code of `trilat ping --benchmark` depends on it.
+        Transports are TCP, TLS and QUIC. The exit code of `trilat ping --benchmark` depends on
+        it.
         """
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result with the keys of `trilat ping --benchmark --json`.
+        """Converts the result to plain values, as `trilat ping --benchmark --json` prints them.
 
         "needs" states what the scenario requires of the network, "transports" judges each
         transport, and "rows" has the measurements.
@@ -538,7 +541,7 @@ class NetworkBenchmark(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per message size, message rate and transport, with times in us.
+        """Returns one table row per message size, message rate and transport, with times in us.
 
         The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are None if
         no message came back.
@@ -623,10 +626,9 @@ def _measure_endpoint(
     needs: _ScenarioNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
-    """Measures the transport of one endpoint, with all message sizes and rates.
+    """Measures round trips to another machine, with all message sizes and rates.
 
-    A program on another machine (the far end) returns each message, so that round trips are
-    measured.
+    A program on that machine, the far end, returns each message.
 
     Args:
         endpoint: Endpoint of the far end.

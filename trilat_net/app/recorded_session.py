@@ -13,13 +13,15 @@ from ..scenario import parse_embedded
 def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
     """Returns the function with which a recorder reads the scenario of its session.
 
+    A scenario is the TOML text that describes the arms, their control laws and the network.
+
     Args:
         views_hz: Rate of the messages for viewers in the log, in Hz, see
             `log.view_rates`. With 0, the log contains none.
     """
 
     def read_scenario(text: str, source: str) -> RecordedScenario:
-        """Reads the text of a scenario that a process of the session has sent.
+        """Reads the scenario (TOML text) that a process of the session has sent.
 
         Args:
             text: TOML text of the scenario.

@@ -82,10 +82,10 @@ def _never_stopped() -> bool:
 
 
 class ShareHistory:
-    """Keeps the weights with which a site follows the others, over time and with all changes.
+    """Weights with which an arm follows the others, over the time of a session.
 
     Such a weight is called a dominance factor. The scenario states the factors at the start,
-    and scripted changes. Users request further changes during the session. Each change is a
+    and planned changes. Users request further changes during the session. Each change is a
     linear ramp from the present factors to other ones.
     """
 
@@ -97,7 +97,7 @@ class ShareHistory:
         self._shares_before = self._ramp.alpha
 
     def add_change(self, change: str) -> None:
-        """Adds a change of the weights to the history, as an event of the site reports it.
+        """Adds a change of dominance factors, which an arm's process has reported as an event.
 
         Changes of other settings are ignored, and so are texts that do not describe a change.
 
@@ -111,10 +111,9 @@ class ShareHistory:
                 self._later_ramps.append(ramp)
 
     def advance_to(self, t_ns: int) -> tuple[float, ...]:
-        """Computes the dominance factors of the site at a time.
+        """Computes the dominance factors of an arm at a given time of the session.
 
-        A dominance factor is the weight with which a site follows one of its peers, the other
-        sites.
+        A dominance factor is the weight, from 0 to 1, with which the arm follows another one.
 
         Args:
             t_ns: The time, in ns after the start of the session. It must not be earlier than in
@@ -171,7 +170,9 @@ class RunningSession:
         self._blocks: list[tuple[ExitStack, Bus | None]] = []
 
     def __enter__(self) -> "RunningSession":
-        """Opens one connection to the session, which all calls in the `with` block use.
+        """Opens one network connection to the session, which all calls in the `with` block use.
+
+        Without a `with` block, each call opens a connection of its own, which takes longer.
 
         Raises:
             SessionError: No site of the session replies in time.
@@ -183,7 +184,7 @@ class RunningSession:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Closes the connection of the `with` block. The session itself goes on."""
+        """Closes the network connection of the `with` block. The session itself goes on."""
         opened, self._bus = self._blocks.pop()
         opened.close()
 
@@ -230,10 +231,10 @@ class RunningSession:
 
     @contextmanager
     def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
-        """Waits until a site runs, and connects to its session, as a context manager.
+        """Waits until the process of an arm runs, and connects to its session.
 
-        A site is the process that controls one robot arm. The connection is closed at the end
-        of the `with` block.
+        Such a process is called a site. This is a context manager, and the connection is closed
+        at the end of the `with` block.
 
         Args:
             site: Name of the site.
@@ -316,9 +317,9 @@ class RunningSession:
             say(f"{site}: {device_hand.describe()}")
 
     def stop(self, *sites: str) -> list[str]:
-        """Stops some arms at once, while the session continues.
+        """Stops some arms at once, while the other arms of the session continue.
 
-        The command `trilat stop` does the same. The other arms are not stopped.
+        The command `trilat stop` does the same.
 
         Args:
             *sites: Names of the sites whose arms are stopped. All sites if no name is given.
@@ -343,9 +344,10 @@ class RunningSession:
         return _read_replies(self.send_order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
-        """Clears the fault of arms, so that they can be enabled again.
+        """Clears the fault of arms, such as lost measurements, so that they can move again.
 
-        A fault whose reason persists is not cleared. The command `trilat reset` does the same.
+        The arms can then be enabled. A fault whose reason persists is not cleared. The command
+        `trilat reset` does the same.
 
         Args:
             *sites: Names of the sites. All sites if no name is given.
@@ -392,7 +394,15 @@ class RunningSession:
             return [self._send_change(bus, name, request) for name in addressed]
 
     def _send_change(self, bus: Bus, site: str, request: ChangeRequest) -> ChangeReply:
-        """Sends a request to one site, and returns its reply, accepted or refused.
+        """Sends a request to the process of one arm, and returns its reply.
+
+        Args:
+            bus: Network connection.
+            site: Name of the process, the site of the arm.
+            request: The requested change.
+
+        Returns:
+            The reply, which says whether the site accepts or refuses the change.
 
         Raises:
             SessionError: The site does not reply in time.
@@ -402,9 +412,10 @@ class RunningSession:
         )
 
     def end(self) -> list[str]:
-        """Ends the session in an orderly way, as `trilat stop --end` does.
+        """Ends the session for all arms at the same time, as `trilat stop --end` does.
 
-        All sites end at the same time of the session, about half a second from now.
+        This time is about half a second from now, so that all processes receive the request
+        before.
 
         Returns:
             One sentence per site: its reply, in the order of the sites.
@@ -478,9 +489,9 @@ class RunningSession:
         return scenario, infos
 
     def _find_members(self, bus: Bus) -> Iterator[Info]:
-        """Asks all members of the session who they are, and yields their replies.
+        """Asks all processes of the session who they are, and yields their replies.
 
-        A member may reply several times. The replies end after `REPLY_TIMEOUT_S`.
+        A process may reply several times. The replies end after `REPLY_TIMEOUT_S`.
         """
         return find_members(
             bus, self._clock, self.name, stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S
@@ -541,10 +552,10 @@ class RunningSession:
         return self._change(link.partition("->")[2], link=link, to=to)
 
     def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
-        """Changes the weights with which a site follows its peers, as `trilat set dominance`.
+        """Changes the weights with which an arm follows the other arms.
 
-        A site is the process that runs one arm. The arm follows a weighted mean of the other
-        arms. With other weights, another operator leads it.
+        With other weights, another operator leads the arm. For example, a trainer hands over to
+        a trainee. The command `trilat set dominance` does the same.
 
         Args:
             site: Name of the site.
@@ -561,7 +572,14 @@ class RunningSession:
         return self._change(site, dominance=site, to=dict(shares), ramp_s=ramp_s)
 
     def _change(self, site: str, **change: Any) -> str:
-        """Requests a change from a site, and returns its reply.
+        """Requests a change from one running arm, and raises an error if it is refused.
+
+        Args:
+            site: Name of the site, the process that controls the arm.
+            **change: Fields of a `ChangeRequest`.
+
+        Returns:
+            The text of the reply.
 
         Raises:
             RunFailed: The site has refused the change.
@@ -572,7 +590,9 @@ class RunningSession:
         return reply.text
 
     def change(self, site: str, request: ChangeRequest) -> ChangeReply:
-        """Requests a change, such as another link delay, from the site that carries it out.
+        """Requests a change of a setting, such as another link delay, from one running arm.
+
+        An arm's process carries out the change at its next tick, a period of its control loop.
 
         Args:
             site: Name of the site.
@@ -612,9 +632,9 @@ class RunningSession:
                 inboxes.append(bus.inbox(key, STATES_KEPT))
 
             def receive() -> list[State]:
-                """Returns the records of the sites that have arrived since the last call.
+                """Returns the records of all arms that have arrived since the last call.
 
-                A record contains what a site measured and computed in one period of its control
+                A record contains what was measured and computed in one period of a control
                 loop. The list is empty if none has arrived.
                 """
                 return [record for inbox in inboxes for record in read_records(inbox)]
@@ -647,16 +667,16 @@ class RunningSession:
             picture_delay: PictureDelay | None = None  # created when the first record arrives
 
             def find() -> dict[str, State]:
-                """Returns one record of each site, by the name of the site.
+                """Returns the newest known state of every arm, by the name of its site.
 
-                A record is the stored result of one tick, a period of a site's control loop.
-                Without `as_site`, it is the newest record that has arrived. With `as_site`, it
-                is the record of the pose that the user of that site sees. The dictionary is
-                empty until the first record has arrived.
+                A site is the process that controls an arm. The state is a record, the stored
+                result of one tick (period of a control loop). The dictionary is empty until the
+                first record has arrived.
 
-                The records that arrive from `inbox` are kept in `latest_records`, because the
-                user may see an older pose than the newest. `picture_delay` computes which tick
-                of each peer the user sees, as the scenario may delay the user's picture.
+                With `as_site`, the states are those that the user of that site sees. This may
+                be an older pose, because the scenario may delay the user's picture.
+                `picture_delay` computes which tick of each arm the user sees, and
+                `latest_records` keeps the records that arrive from `inbox`.
                 """
                 nonlocal picture_delay
                 for record in read_records(inbox):
@@ -738,7 +758,7 @@ class RunningSession:
 
     @contextmanager
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
-        """Subscribes to the weights with which a site follows the others, as a context manager.
+        """Subscribes to the weights with which an arm follows the others, as a context manager.
 
         These weights, the dominance factors, may change during the session.
 
@@ -760,10 +780,10 @@ class RunningSession:
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:
-                """Returns the present weight with which the site follows each other site.
+                """Returns the present weights with which an arm follows each other arm.
 
-                The keys are the names of the other sites. The present time is the time of the
-                newest record that has arrived from the site.
+                The keys are the names of the other arms' sites. The present time is the time of
+                the newest record that has arrived from the arm's process.
                 """
                 nonlocal now_ns
                 for event in read_messages(events, Event):
@@ -776,9 +796,10 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures round trip times and clock offsets of the session, as `trilat ping` does.
+        """Measures round trip times and clock offsets between the processes of the session.
 
-        A member is a process of the session: a site, which runs one arm, or a recorder.
+        The command `trilat ping` does the same. A member is a process of the session: a site,
+        which runs one arm, or a recorder.
 
         Args:
             count: Number of pings to each member.
@@ -914,7 +935,9 @@ def open_hand(
     *,
     repeats: bool = True,
 ) -> Hand:
-    """Opens a connection to an arm, through which a program moves the arm as its operator.
+    """Opens a connection through which a program moves an arm of a running session.
+
+    The program takes the place of the person who would otherwise hold the arm.
 
     Args:
         bus: Network connection that reaches the site.
@@ -953,7 +976,13 @@ def open_hand(
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
-    """Returns the texts of the replies if all sites have accepted.
+    """Returns the texts of the arms' replies, if all of them have accepted a request.
+
+    Args:
+        replies: Reply of each site, the process that controls an arm.
+
+    Returns:
+        The text of each reply.
 
     Raises:
         RunFailed: A site has refused. The message lists the refusals first.
@@ -966,7 +995,7 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
 
 
 def _list_present(scenario: Scenario, infos: dict[str, Info]) -> list[str]:
-    """Lists the sites that a request to all sites addresses.
+    """Lists the arms' processes that a request to all arms addresses.
 
     These are all sites of the scenario. If the scenario allows sites to leave, they are only
     the running sites, as long as at least one site runs.

@@ -54,7 +54,7 @@ ns.
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Measured round trips, clock offsets and delays of a session's network.
+    """Measured network delays between the processes of a session, and their clock offsets.
 
     Attributes:
         session: Name of the session.
@@ -69,9 +69,9 @@ class PingReport(Result):
     links: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per member of the session, for a table or a data frame.
+        """Returns one table row per process of the session, for example for pandas.
 
-        The links between sites are left out, because they have other columns.
+        The network links between the arms are left out, because they have other columns.
         """
         return self.members
 
@@ -139,7 +139,7 @@ class SessionPing:
 
     @property
     def _boots(self) -> set[int]:
-        """Random numbers (boots) of the processes that have replied as members of the session.
+        """Random numbers that identify the processes that have replied as session members.
 
         Only pings of these processes are evaluated.
         """
@@ -247,7 +247,7 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures the network of a running session once, and returns round trip times and delays.
+    """Measures round trip times and delays in the network of a running session once.
 
     Args:
         connection: Endpoints of the session, and keys.
@@ -321,7 +321,7 @@ class TopicDelays(Result):
     publishers: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one row per program that publishes on the topic, for a table or a data frame.
+        """Returns a table row for each program that publishes on the ROS 2 topic.
 
         A row contains the number of messages of the program, and their delays.
         """
@@ -400,10 +400,10 @@ def ping_topic(
 
 
 def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
-    """Returns the row of a publisher, with a histogram of its delays.
+    """Returns the table row of one publisher on a ROS 2 topic, with a histogram of its delays.
 
-    A publisher is a program that sends messages on the ROS 2 topic. The table lets the user
-    compare the publishers.
+    A publisher is a program that sends messages on the topic. The table lets the user compare
+    the publishers.
 
     Args:
         samples: Number and delay in ns of each message that arrived. The publisher numbers its

@@ -23,9 +23,9 @@ DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3
 
 
 def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS) -> list[str]:
-    """Returns the colours of a scenario's sites, in the order of the sites.
+    """Returns the colours of a scenario's arms, in the order of the scenario.
 
-    A site has the same colour in all figures and on all pages.
+    An arm has the same colour in all figures and on all pages.
 
     Args:
         scenario: Scenario with the sites.
@@ -42,9 +42,9 @@ PAGE_IN = 7.0
 
 
 class FigureSize(NamedTuple):
-    """Width, type sizes and resolution of a figure.
+    """Width, type sizes and resolution of figures.
 
-    They differ between the report on a screen and a printed paper.
+    They differ between a report on a screen and a printed paper.
 
     Attributes:
         width_in: Width of the figure, in inches.

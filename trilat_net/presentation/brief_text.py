@@ -81,9 +81,12 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
 
 
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
-    """Returns the judgement and the most important other lines, in their original order.
+    """Selects the most important lines of a stability certificate, in their original order.
 
     Lines that speak against stability are more important than lines that confirm it.
+
+    Args:
+        lines: All lines of the certificate, of which the first is the judgement.
     """
     ranks = [_MARK_RANKS[line.mark] for line in lines]
     ranks[0] = -1

@@ -65,10 +65,9 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
-    """Yields the text of a stability certificate.
+    """Yields the text of a stability certificate: judgement, reasons, and tables.
 
-    The judgement and its reasons come first. Tables of the premises (the conditions of the
-    stability theorem) and of the energies follow.
+    The tables have the premises (conditions of the stability theorem) and the energies.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -142,7 +141,7 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """A sentence of a stability certificate, with a mark such as "ok" or "FAIL".
+    """One line of a stability certificate: a sentence with a mark such as "ok" or "FAIL".
 
     Attributes:
         mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against
@@ -210,7 +209,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the lines that follow the judgement: its meaning and the remarks about the run.
+    """Explains in sentences what the judgement of a run means, with remarks about the run.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -252,7 +251,7 @@ def _explain_judgement(certificate: Certificate) -> str:
 
 
 def describe_settling(certificate: Certificate) -> str:
-    """Returns what was observed of a run that settled, and that no proof exists, as a clause.
+    """Returns a clause on what was observed of a run that settled, without a stability proof.
 
     A settled run has become slow, or its motion decays. Its arms need not be at rest.
 
@@ -576,10 +575,10 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of V that no listed energy explains, shape (T,), in J.
+    """Returns the change of the energy V that no known cause explains, shape (T,), in J.
 
-    The table of energies lists it as "unexplained". It should be close to 0, except in gaps of
-    the records.
+    V belongs to the stability proof. The table of energies lists this change as "unexplained".
+    It should be close to 0, except in gaps of the records.
     """
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
@@ -589,9 +588,10 @@ def _compute_rest(balance: EnergyBalance) -> Array:
 
 
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
-    """Returns an entry for V at a tick: its name, and its value in J.
+    """Returns the name and the value in J of the energy function V at one tick.
 
-    A V that is smaller than rounding errors counts as 0.
+    The name is for example "V at 2.5 s". A tick is a control period. A V that is smaller than
+    rounding errors counts as 0.
     """
     energy_j = float(balance.V[index])
     shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0

@@ -79,7 +79,9 @@ PICTURE_SIDE = 4.0
 
 
 class _PageCharts(NamedTuple):
-    """The charts of a report's page, as `ChartBuilder.build` returns them.
+    """All charts of a run's report, as `ChartBuilder.build` returns them.
+
+    The report is a web page whose scripts draw the charts.
 
     Attributes:
         data: Data that the scripts of the page draw.
@@ -92,7 +94,7 @@ class _PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Computes the charts of the page that reports a run, from the run's log.
+    """Computes from a log the charts of the web page that reports the run.
 
     The numbers become tables, from which the scripts of the page draw the charts in the
     browser.
@@ -251,7 +253,7 @@ class ChartBuilder:
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
-        """Adds a line per site with the largest value of a signal in each short interval.
+        """Adds a line per arm with the largest value of a signal in each short interval.
 
         Within an interval, the line is constant. A line of the values themselves would be a
         broad band wherever they oscillate.
@@ -285,10 +287,9 @@ class ChartBuilder:
         return series
 
     def _build_motion_charts(self) -> Iterator[TimeChart]:
-        """Yields the charts of torques, positions, errors, estimates and displacements.
+        """Yields charts of the arms' torques, positions, errors, estimates and displacements.
 
-        Some of them are yielded only if the run has the quantity, such as the operator's
-        torque.
+        A chart is left out if the run lacks the quantity, such as the operator's torque.
         """
         log = self._log
         operated_sites = plot_signals.sites_with_operator(log)
@@ -324,7 +325,7 @@ class ChartBuilder:
         yield from self._chart_joints("control", "control torque", "N m", torques)
 
     def _build_timing_charts(self) -> Iterator[Chart]:
-        """Yields the charts of sample ages, delays, lateness of ticks and computing time.
+        """Yields charts of the network delays and of the timing of the control loops.
 
         Charts of delays need a delay that varies, and charts of the loop need a run in real
         time.
@@ -345,9 +346,9 @@ class ChartBuilder:
             yield from self._chart_histograms()
 
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
-        """Adds a table of values to the data of the page, from which its scripts draw curves.
+        """Adds a table of numbers to the report, from which its scripts draw curves.
 
-        A table contains encoded binary numbers, which are shorter than their texts.
+        The numbers are encoded in binary form, which is shorter than text.
 
         Args:
             site: Name of the site, whose tick rate converts ticks (control periods) to times.
@@ -383,10 +384,9 @@ class ChartBuilder:
         return self._add_table(site, trace.tick, trace.values)
 
     def _add_records(self, site: str, values: Values) -> int:
-        """Decimates values that belong to the records of a site, and adds them as a table.
+        """Reduces one arm's recorded values to what a page can show, and adds them as a table.
 
-        The records of a long run are more than the page can show. Decimation keeps their
-        extremes.
+        The records of a long run are more than the page can show. Their extremes are kept.
 
         Args:
             site: Name of the site.
@@ -401,7 +401,7 @@ class ChartBuilder:
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
     ) -> dict[str, list[TableSeries]]:
-        """Adds the values of a signal, such as joint torques, to the page for several sites.
+        """Adds the values of a signal, such as joint torques, to the report, for several arms.
 
         Args:
             signal: Function that computes the values of the signal, shape (K, C), from the K
@@ -421,7 +421,7 @@ class ChartBuilder:
     def _add_columns(
         self, site: str, tick: Ints, t_s: Array, values: Values
     ) -> list[TableSeries]:
-        """Decimates the values of one site, and adds them to the page.
+        """Reduces the values of one arm to what a screen can show, and adds them to the page.
 
         All columns share one table if there are few of them. Otherwise each column has its own
         table, which is smaller in total, see `__init__`.
@@ -446,7 +446,7 @@ class ChartBuilder:
         return [self._make_series(site, table, column) for column in columns]
 
     def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
-        """Returns a line in the colour of a site.
+        """Returns a line of a chart in the colour of an arm.
 
         Args:
             site: Name of the site.
@@ -466,7 +466,7 @@ class ChartBuilder:
         sites: Sequence[str] = (),
         **options: Any,
     ) -> TimeChart:
-        """Returns a chart over time, without the lines that have no value to draw.
+        """Returns a chart over time, without lines that have no value to draw.
 
         Args:
             section: Key of the section of the page, as in `report.toml`.
@@ -495,7 +495,7 @@ class ChartBuilder:
         series_by_site: dict[str, list[TableSeries]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
-        """Yields a chart per joint, each with a line per site.
+        """Yields one chart per joint, in which each arm has a line.
 
         Args:
             section: Key of the section of the page, as in `report.toml`.
@@ -511,10 +511,9 @@ class ChartBuilder:
             yield self._make_chart(section, f"{title}, {name}", unit, series)
 
     def _chart_positions(self) -> Iterator[TimeChart]:
-        """Yields a chart per site and joint, with the actual and the desired angle.
+        """Yields a chart per arm and joint, with the actual and the desired angle over time.
 
-        The desired angle is the one that the controller makes the joint follow, computed from
-        the received states of the other arms.
+        The desired angle follows from the received states of the other arms.
         """
         for site in self._log.sites:
             records = self._log[site]
@@ -726,7 +725,7 @@ class ChartBuilder:
             )
 
     def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
-        """Adds the motion of a site's arm and of the bodies that it touches.
+        """Adds the motion of an arm, and of bodies that it touches, for the moving picture.
 
         The script of the page draws planar arms from their joint angles and link lengths. Other
         arms, called chains, are handled by `_build_chain`.
@@ -828,7 +827,7 @@ def _lateness_ms(records: SiteLog) -> Values:
 
 
 def _encode(column: Values, kind: str) -> str:
-    """Returns numbers as base64 text.
+    """Encodes numbers as base64 text, so that a web page can contain them compactly.
 
     Args:
         column: The numbers, shape (P,).

@@ -137,9 +137,10 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
 
 
 def _state_settings(scenario: Scenario) -> Iterator[str]:
-    """Yields the sentences on the control laws with their gains, and on the delays.
+    """Yields sentences for a paper on the control laws with their gains, and on the delays.
 
-    Sites with the same law and gains share an entry, and so do links with the same delay.
+    Arms with the same law and gains share an entry, and so do network links with the same
+    delay.
     """
     law_texts = {}
     for name, site in scenario.sites.items():
@@ -190,10 +191,7 @@ def _format_commit() -> str:
 
 
 def _list_sources(certificate: Certificate) -> list[str]:
-    """Returns the BibTeX entries of the papers with the methods that a judgement rests on.
-
-    Methods that the judgement did not use are not cited.
-    """
+    """Returns the BibTeX entries of the papers whose methods a judgement has used."""
     sources = []
     if certificate.roots is not None and certificate.roots.verdict:
         sources.append(_ROOTS)

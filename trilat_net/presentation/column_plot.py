@@ -51,9 +51,9 @@ Joints = int | str | Sequence[int | str] | None
 
 
 class _Line(NamedTuple):
-    """The values of one column at one site.
+    """Values over time of one table column of an arm, which a figure draws as a line.
 
-    A panel of the figure has such a line for each site that has the column.
+    A panel of the figure has such a line for each arm that has the column.
 
     Attributes:
         site: Name of the site.
@@ -117,10 +117,14 @@ def plot_log(
 
 
 def _select_sites(log: Log, sites: str | Iterable[str] | None) -> list[str]:
-    """Returns the selected sites in the order of the scenario.
+    """Returns the arms that a user selected for a figure, in the order of the scenario.
+
+    Args:
+        log: The log.
+        sites: Name or names of the arms' sites. None selects all.
 
     Raises:
-        UnknownName: There is no such site.
+        UnknownName: A site does not exist.
         UsageError: No site is selected.
     """
     if sites is None:
@@ -136,7 +140,15 @@ def _select_sites(log: Log, sites: str | Iterable[str] | None) -> list[str]:
 def _check_interval(
     log: Log, from_s: float | None, until_s: float | None
 ) -> tuple[float, float]:
-    """Returns the first and the last time to draw, in s.
+    """Checks the interval of time that a user selected for a figure.
+
+    Args:
+        log: The log.
+        from_s: Start, in s. None for the start of the log.
+        until_s: End, in s. None for the end of the log.
+
+    Returns:
+        The first and the last time to draw, in s.
 
     Raises:
         UsageError: The first time is not before the last one, or the log ends before.
@@ -237,7 +249,7 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
-    """Returns the error message for an unknown column, with the most similar name.
+    """Returns the error message for an unknown column, which suggests a similar name.
 
     The user has probably misspelled the name.
     """
@@ -287,10 +299,15 @@ def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
 
 
 def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
-    """Checks that each selected joint is a joint of at least one selected site.
+    """Checks that each joint that a user selected for a figure exists at some selected arm.
+
+    Args:
+        log: The log.
+        sites: Names of the selected arms' sites.
+        joints: The selected joints.
 
     Raises:
-        UnknownName: There is no such joint.
+        UnknownName: A joint does not exist.
     """
     if joints is None:
         return
@@ -309,7 +326,7 @@ def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
 
 
 def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Panels:
-    """Removes the columns of joints that are not selected.
+    """Removes the table columns of joints that the user did not select for the figure.
 
     Columns that belong to no joint, such as the age of a sample, are kept.
 
@@ -356,7 +373,7 @@ def _draw_groups(
     sites: Sequence[str],
     interval_s: tuple[float, float],
 ) -> Figure:
-    """Draws groups of panels below each other in one figure. A group begins in a new row.
+    """Draws groups of panels below each other in one figure, each group in new rows.
 
     Args:
         log: The log.

@@ -39,7 +39,7 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """The text and the files with which a finished run is presented to its user.
+    """Text and files with which a finished run is presented to its user.
 
     `conclude` creates this object after a run was recorded.
 
@@ -79,7 +79,7 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """The file that the user should open first: the HTML report of the run.
+        """File that the user should open first: the HTML report of the run.
 
         If no report was written, it is the path of the first log file.
         """
@@ -97,7 +97,7 @@ class Conclusion(CheckReport):
         return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
-        """Returns the table of the sites, one dictionary per site.
+        """Returns the table of the arms, one dictionary per arm.
 
         The keys are the headers of the columns. The values are texts, as in the terminal.
         """
@@ -128,7 +128,7 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Checks the log of a finished run, and writes its page and summary into a folder.
+    """Checks the log of a finished run, judges the run, and writes its report into a folder.
 
     The checks execute the log again in a second process, while this process judges the run and
     draws the figures.
@@ -220,7 +220,7 @@ def conclude(
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Simulates the run of a log without the people or programs that moved the arms.
+    """Simulates the run of a log again without the people or programs that moved the arms.
 
     The difference between the two runs shows how far the operators displaced the arms.
 
@@ -244,7 +244,7 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
-    """Returns a table with a row per site: number of records, timing, and largest final error.
+    """Returns a table with a row per arm: number of records, timing, and largest final error.
 
     The error is the largest one of any joint in the last second, or of the whole run if the run
     was shorter. The table names the joint.
@@ -295,7 +295,7 @@ def conclude_files(
 ) -> tuple[Log, Conclusion]:
     """Checks a log that was just recorded, writes its report, and prints the result.
 
-    If the user interrupts the work, a note gives the command that draws the report later.
+    If the user interrupts the work, a note gives the command that writes the report later.
 
     Args:
         paths: Files of the log.

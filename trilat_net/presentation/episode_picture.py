@@ -45,7 +45,9 @@ _BASE: dict[str, Any] = {
 
 
 class EpisodePicture:
-    """Draws pictures of an episode, one after another, into the same panels.
+    """Draws pictures of the arms in a learning episode, one after another, into one figure.
+
+    An episode is one attempt of a learning program at a task.
 
     Args:
         scenario: Scenario of the task, with the arms.
@@ -108,7 +110,7 @@ class EpisodePicture:
         return self._read_pixels()
 
     def _draw_bodies(self, axes: Axes, site: str, bodies: Mapping[str, Array]) -> None:
-        """Draws the edges of the bodies that a site's arm can touch.
+        """Draws the edges of the bodies, such as boxes, that an arm can touch.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.
@@ -132,7 +134,9 @@ class EpisodePicture:
 
 
 def _scale_panel(axes: Axes, points_m: Array) -> None:
-    """Sets the axis limits of a panel to the reach of its arm, the sum of its links' lengths.
+    """Sets the axis limits of a panel so that the arm fits in every pose.
+
+    The limits are the reach of the arm, the sum of its links' lengths.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -145,7 +149,7 @@ def _scale_panel(axes: Axes, points_m: Array) -> None:
 
 
 def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
-    """Draws the links, joints and base of an arm.
+    """Draws the links, joints and base of an arm into a panel of a figure.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -159,7 +163,9 @@ def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
 
 
 def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
-    """Tells whether the goal of a task is a position that can be drawn.
+    """Returns True if the goal of a task can be drawn as a point in space.
+
+    Goals may also be numbers of another kind, such as joint angles.
 
     Args:
         goal: Numbers that describe the goal.

@@ -107,7 +107,7 @@ class Exporter:
             import_extra(*self._format.extra)
 
     def export(self, *logs: Log, progress: Progress = lambda _done, _total: None) -> str:
-        """Writes logs to the path of this export.
+        """Writes recorded logs in another file format, for example as CSV tables.
 
         Args:
             *logs: The logs. Most formats accept only one.
@@ -273,7 +273,9 @@ def _describe_table(table: Table) -> JsonObject:
 
 
 def _describe_folder(log: Log, folder: Path, about: str) -> None:
-    """Writes the files that explain an exported folder: a description and the scenario.
+    """Writes files that explain an exported folder to its later readers.
+
+    They are a description of the columns, and the scenario of the run.
 
     Args:
         log: Log of the run that is exported.
@@ -300,9 +302,9 @@ def name_inside(table: Table, name: str, separator: str) -> str:
 
 
 def read_texts(column: Column) -> NDArray[Any]:
-    """Reads the texts of a column as an array of NumPy strings, shape (K,).
+    """Reads the texts of a table column as an array of NumPy strings, shape (K,).
 
-    Formats for numbers store texts in this way.
+    Formats for numbers, such as .npz, store texts in this way.
 
     Args:
         column: Column of a table with K rows.

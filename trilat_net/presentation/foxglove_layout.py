@@ -53,9 +53,9 @@ Tree = str | JsonObject
 
 
 def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
-    """Arranges the channels of a log or of a session in panels.
+    """Returns a layout of plots for Foxglove, a program that shows data of robots.
 
-    Foxglove is a program that shows recorded or live data of robots. It opens the layout from a
+    It shows the channels of a log or of a running session. Foxglove opens the layout from a
     file.
 
     Args:
@@ -78,7 +78,7 @@ def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
 
 
 class _Panels:
-    """Collects the settings of panels, and gives each panel an identifier.
+    """Collects the panels of a layout for Foxglove, and gives each one an identifier.
 
     Foxglove is a viewer for data of robots. Its layout file refers to panels by their
     identifiers.
@@ -91,12 +91,15 @@ class _Panels:
         self.settings: dict[str, JsonObject] = {}
 
     def add(self, kind: str, settings: JsonObject, title: str = "") -> str:
-        """Adds a panel, and returns its identifier.
+        """Adds a panel, such as a plot, to the layout of the viewer Foxglove.
 
         Args:
             kind: Type of the panel, such as "Plot".
             settings: Settings of the panel.
             title: Title of the panel. Empty for the default title.
+
+        Returns:
+            The identifier of the panel.
         """
         identifier = f"{kind}!{len(self.settings) + 1}"
         title_settings = dict.fromkeys(_TITLE_KEYS, title) if title else {}
@@ -104,10 +107,13 @@ class _Panels:
         return identifier
 
     def add_tabs(self, trees: Mapping[str, Tree]) -> str:
-        """Adds a panel whose tabs contain other panels, and returns its identifier.
+        """Adds a panel with tabs to the layout, each of which contains other panels.
 
         Args:
             trees: Contents of each tab, by its title.
+
+        Returns:
+            The identifier of the panel.
         """
         tabs = [{"title": title, "layout": tree} for title, tree in trees.items()]
         return self.add("Tab", {"activeTabIdx": 0, "tabs": tabs})
@@ -212,7 +218,7 @@ def _add_plot(panels: _Panels, channels: Ros2Channels, plot: CurvePlot) -> str:
 
 
 def _get_list_path(channels: Ros2Channels, entity: str) -> str:
-    """Returns the message path of the list from which curves are drawn.
+    """Returns the path in a Foxglove message of the list of numbers that a plot shows.
 
     Args:
         channels: Standard channels by topic.
@@ -226,9 +232,13 @@ def _get_list_path(channels: Ros2Channels, entity: str) -> str:
 
 
 def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
-    """Adds a panel that shows the modes of all arms over time, such as "resting".
+    """Adds a panel that shows the mode of every arm over time, such as "resting".
 
     An arm that rests or holds its position does not follow the other arms.
+
+    Args:
+        panels: Panels of the layout, to which the panel is added.
+        channels: Standard channels by topic.
 
     Returns:
         The identifier of the panel. Empty if there are no modes.

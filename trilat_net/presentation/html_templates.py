@@ -26,9 +26,9 @@ _CODE = re.compile(r"`([^`]+)`")
 
 
 def render_template(name: str, /, **values: Any) -> Markup:
-    """Renders a whole template, such as the page of a report.
+    """Renders a whole Jinja template, such as the web page of a report.
 
-    Values that are plain strings are escaped.
+    Values that are plain strings are escaped, so that they cannot insert HTML.
 
     Args:
         name: File name of the template.
@@ -38,7 +38,7 @@ def render_template(name: str, /, **values: Any) -> Markup:
 
 
 def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
-    """Renders a macro, a part of a template with parameters, such as a table.
+    """Renders a macro of a Jinja template, a part with parameters such as a table.
 
     Args:
         template: File name of the template.
@@ -51,7 +51,7 @@ def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
 
 @cache
 def _make_environment() -> Environment:
-    """Returns the settings and functions that all templates share.
+    """Returns the Jinja environment of the report: settings and functions of all templates.
 
     The result is cached, so that each template is compiled only once.
     """
@@ -73,10 +73,9 @@ def _make_environment() -> Environment:
 
 
 def _mark_hashes(text: str) -> Markup:
-    """Converts plain text to HTML, and keeps each hash on a single line.
+    """Converts plain text to HTML, and keeps each hash on a single line for copying.
 
-    A hash is a long hexadecimal number that identifies a file. Without a line break, a user can
-    copy it.
+    A hash is a long hexadecimal number that identifies a file.
 
     Args:
         text: Plain text.

@@ -79,7 +79,7 @@ def _describe_scan(scan: EdgeScan, name: str) -> str:
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields lines about the pose of rest (equilibrium) at which the loop was linearised.
+    """Yields lines about the pose of rest (equilibrium) about which the arms were linearised.
 
     They state how the equilibrium was computed, its residual, and the pose of each arm. If all
     arms have the same joint angles, a single line has them.

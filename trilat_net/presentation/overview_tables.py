@@ -68,7 +68,7 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
 
 
 def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
-    """Yields the lines about the recorded session: its name, scenario, duration and records.
+    """Yields lines about a recorded session: its name, scenario, duration and records.
 
     A scenario is the text that defines the run. Its hash shows whether the log contains the
     text that was executed.
@@ -218,7 +218,9 @@ def _compose_channels(
 
 
 def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
-    """Returns ranges of missing numbers as text, at most `_MAX_GAPS` of them.
+    """Writes the numbers of missing messages as ranges, for example "12-15, 20".
+
+    At most `_MAX_GAPS` ranges are listed.
 
     Args:
         gaps: First and last number of each range.
@@ -273,7 +275,7 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    """Yields the versions of the software and the machine that recorded the log.
+    """Yields the versions of the software and the machine that recorded a log.
 
     A run can be repeated bit for bit only with the same versions and the same arithmetic.
     """
@@ -327,7 +329,7 @@ def _compose_line(heading: str, text: str) -> Iterator[Block]:
 def _tabulate(
     headers: Sequence[str], rows: Iterable[Sequence[object]], text_columns: int = 1
 ) -> Iterator[Block]:
-    """Yields an empty line and a table.
+    """Yields an empty line and then a table for the terminal.
 
     Args:
         headers: Header of each column.

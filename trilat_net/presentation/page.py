@@ -52,7 +52,7 @@ def write_report(
     twin: Log | None = None,
     verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
-    """Writes report.html and summary.json into a folder.
+    """Writes the report of a run, report.html and summary.json, into a folder.
 
     The page shows the results of a run to people, and the JSON file has the same numbers for
     programs.
@@ -102,7 +102,7 @@ def render_report(
     verdict: Markup = Markup(),  # noqa: B008
     reasons: Markup = Markup(),  # noqa: B008
 ) -> Markup:
-    """Composes the HTML page that reports a run.
+    """Composes the web page (HTML) that reports a run: judgement, charts and tables.
 
     Args:
         log: Log of the run.

@@ -45,7 +45,7 @@ _ARM_NOTE = (
 
 
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
-    """Renders the first view of the report: the moving arms, who leads, errors and delays.
+    """Renders the top of a report: the moving arms, who leads, errors and delays.
 
     Somebody who opens the page should understand the run without reading further.
 
@@ -131,7 +131,9 @@ def render_chart_groups(
 def _render_group(
     section: str, heading: str, note: str, count: int, is_open: bool, is_small: bool
 ) -> Markup:
-    """Returns a group of charts, as an empty container that unfolds.
+    """Renders a group of charts that readers can unfold.
+
+    It is an empty container, into which a script of the page draws the charts.
 
     Args:
         section: Key of the section, as in `report.toml`.

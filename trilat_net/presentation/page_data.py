@@ -26,9 +26,10 @@ The lines of references, true values and limits have the colour "limit".
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
-    """Numbers of a site over time, as the browser page gets them.
+    """Numbers of one arm over time, as the report's web page contains them.
 
-    A table has one row per shown tick. The lines of charts refer to its columns.
+    A table has one row per shown tick (control period). The lines of charts refer to its
+    columns.
 
     Attributes:
         rate_hz: Tick rate of the site, which converts ticks to times.
@@ -63,7 +64,7 @@ class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HistogramSeries(msgspec.Struct, frozen=True):
-    """A line of a histogram, which shows how often the times of a site lie in each bin.
+    """One line of a histogram, which shows how often the times of an arm lie in each bin.
 
     The bins belong to the chart, and are the same for all of its lines.
 
@@ -79,7 +80,9 @@ class HistogramSeries(msgspec.Struct, frozen=True):
 
 
 class DistributionSeries(msgspec.Struct, frozen=True):
-    """A line of a cumulative distribution, which shows the percentage of values up to each x.
+    """One line of a cumulative distribution: the percentage of values up to each x.
+
+    For example, 95 % of the delays are up to 20 ms.
 
     Attributes:
         label: Name of the line in the legend.
@@ -95,7 +98,9 @@ class DistributionSeries(msgspec.Struct, frozen=True):
 
 
 class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
-    """A horizontal dashed line at a value that the scenario states, such as a mean delay.
+    """Dashed horizontal line in a chart at a value of the scenario, such as the mean delay.
+
+    Readers compare it with the measured values.
 
     Attributes:
         value: The value, in the unit of the chart.
@@ -111,7 +116,7 @@ class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": 
 
 
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
-    """A chart of the report over the time of the run, such as the joint angles.
+    """A chart of a report that shows a quantity, such as joint angles, over time.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.
@@ -168,7 +173,7 @@ class HistogramChart(
 class DistributionChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="distribution", tag_field="kind"
 ):
-    """A chart of the page with cumulative distributions of samples or ticks, in percent.
+    """A chart of a report that shows cumulative distributions, for example of delays.
 
     Attributes:
         section: Key of the section of the page, as in `report.toml`.
@@ -191,7 +196,7 @@ Chart = TimeChart | HistogramChart | DistributionChart
 
 
 class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
-    """Data with which the report draws an arm of two links that moves in a plane.
+    """Data with which a report draws an arm of two links that moves in a plane.
 
     Attributes:
         site: Name of the site, the process that runs the arm.
@@ -212,7 +217,7 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
 
 
 class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """Data with which the report draws an arm that moves in space, as a picture in a plane.
+    """Data with which a report draws an arm that moves in space, as a picture in a plane.
 
     Attributes:
         site: Name of the site, the process that runs the arm.
@@ -234,10 +239,10 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
 
 
 class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
-    """Who leads a slave over time, for a slave whose dominance factors change.
+    """Data of a bar that shows over time which arms lead a slave arm.
 
-    A slave follows its peers with weights, the dominance factors. Between two points in time
-    the factors change linearly.
+    A slave follows its peers, the other arms, with weights, the dominance factors. Between two
+    points in time the factors change linearly.
 
     Attributes:
         site: Name of the slave.
@@ -271,9 +276,9 @@ class MarkedChange(msgspec.Struct, frozen=True):
 
 
 class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """An interval in which a site did not follow its peers, which charts shade.
+    """An interval in which an arm did not follow the others, which charts shade.
 
-    It is sent to the page as a list.
+    The page receives it as a JSON list.
 
     Attributes:
         colour: Index of the site, on which its colour depends.
@@ -289,7 +294,9 @@ class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the sites, in the order of the scenario, as CSS writes them: "#004488".
+    """Colours of the arms for light and for dark screens.
+
+    The colours are in the order of the scenario, as CSS writes them: "#004488".
 
     Attributes:
         light: Colours for light screens.
@@ -301,7 +308,7 @@ class Palettes(msgspec.Struct, frozen=True):
 
 
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
-    """All numbers and texts that the scripts of a report's page draw.
+    """All numbers and texts that the scripts of a report's web page draw.
 
     Attributes:
         end_s: End of the time axis, in s.
@@ -327,6 +334,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Converts the data to plain values, which the page contains as JSON."""
+        """Converts the data to lists and dictionaries, which the page contains as JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

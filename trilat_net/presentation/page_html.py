@@ -21,7 +21,7 @@ NO_NUMBER = "–"
 
 
 def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Markup:
-    """Renders a section of the page: its heading, a sentence about its content, and the body.
+    """Renders a section of a report's web page: heading, explaining sentence and content.
 
     Args:
         heading: Heading, as plain text.
@@ -34,7 +34,7 @@ def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Ma
 
 
 def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Markup:
-    """Renders content that the reader can unfold, so that the page stays short at first.
+    """Renders content that readers can unfold, so that the page stays short at first.
 
     Args:
         summary: Line that is always visible, as plain text.
@@ -45,9 +45,9 @@ def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Mark
 
 
 def render_folds(folds: Iterable[Markup]) -> Markup:
-    """Renders parts that unfold, side by side while they are folded.
+    """Renders several parts that unfold side by side, for details that few readers need.
 
-    Details that few readers need take one line in this way.
+    While the parts are folded, they take one line.
 
     Args:
         folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
@@ -56,12 +56,16 @@ def render_folds(folds: Iterable[Markup]) -> Markup:
 
 
 def render_note(text: str) -> Markup:
-    """Renders a remark as a paragraph in small type, for example below a chart."""
+    """Renders a remark as an HTML paragraph in small type, for example below a chart.
+
+    Args:
+        text: The remark, as plain text.
+    """
     return _render("note", text=text)
 
 
 def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
-    """Renders a table with two columns: the name and the text of each fact.
+    """Renders a table with two columns: the name and the text of each fact about a run.
 
     If the table is wider than the screen, it scrolls inside its own frame.
     """
@@ -71,7 +75,7 @@ def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
 def render_table(
     columns: Mapping[str, str], rows: Iterable[Sequence[str]], text_columns: Sequence[int] = ()
 ) -> Markup:
-    """Renders an HTML table, which scrolls sideways where it is wider than the screen.
+    """Renders a table as HTML, which scrolls sideways if the screen is too narrow.
 
     Args:
         columns: Meaning of each column, by its header. Both are plain text. The meaning is
@@ -87,7 +91,7 @@ def render_table(
 
 
 def render_legend(columns: Mapping[str, str]) -> Markup:
-    """Renders the meanings of a table's columns as a line, for screens without a pointer.
+    """Renders the meanings of a table's columns as a line of text, for touch screens.
 
     With a pointer, a reader sees the meaning of a column at its header.
 
@@ -102,7 +106,7 @@ def render_legend(columns: Mapping[str, str]) -> Markup:
 
 
 def render_scrolling(content: Markup, label: str) -> Markup:
-    """Renders HTML in a region that scrolls sideways, also by the keyboard.
+    """Renders wide content in a region that scrolls sideways, also by the keyboard.
 
     The page itself then never becomes wider than the screen.
 
@@ -114,7 +118,13 @@ def render_scrolling(content: Markup, label: str) -> Markup:
 
 
 def render_code(text: str) -> Markup:
-    """Renders commands or the content of a file in a fixed-width type, with its line breaks."""
+    """Renders commands or the content of a file as HTML in a fixed-width type.
+
+    Line breaks are kept.
+
+    Args:
+        text: The commands or the content, as plain text.
+    """
     return _render("code", text=text)
 
 
@@ -163,5 +173,5 @@ def format_numbers(values: Iterable[float] | None) -> str:
 
 
 def to_percent(share: float | None) -> float | None:
-    """Converts a share from 0 to 1 to percent. None, an unknown share, stays None."""
+    """Converts a share from 0 to 1 to percent: 0.05 gives 5. None (unknown) stays None."""
     return None if share is None else 100.0 * share

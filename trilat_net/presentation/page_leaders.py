@@ -37,7 +37,9 @@ _SAME_SHARE = 1e-9
 
 
 class _Lead(NamedTuple):
-    """Who leads a slave over time.
+    """How strongly each user's arm leads the slave arm over time.
+
+    The slave follows the arms of several users, each with a dominance factor from 0 to 1.
 
     Attributes:
         slave: Name of the slave.
@@ -53,7 +55,7 @@ class _Lead(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """True if no dominance factor of the slave changes during the run.
+        """True if no weight with which the slave arm follows the others changes during the run.
 
         A sentence then says all, and a bar over time would show nothing.
         """
@@ -61,7 +63,7 @@ class _Lead(NamedTuple):
 
 
 def _name_role(scenario: Scenario, site: str) -> str:
-    """Returns the role of a site in words, such as "master 2", or "slave" if there is only one.
+    """Returns the role of an arm in words: "master 2", or "slave" if there is only one.
 
     Args:
         scenario: Scenario of the run.
@@ -73,7 +75,7 @@ def _name_role(scenario: Scenario, site: str) -> str:
 
 
 def caption_site(scenario: Scenario, site: str) -> str:
-    """Returns the caption of a site's arm in the drawing, for example "m1, master 1"."""
+    """Returns the caption of an arm in the drawing, for example "m1, master 1"."""
     return f"{site}, {_name_role(scenario, site)}"
 
 
@@ -123,7 +125,7 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that are needed to draw the shares as a line.
+    """Returns the indices of the points that are needed to draw weights over time as a line.
 
     Points on a straight line between others are left out. The first and the last are kept.
     """
@@ -155,7 +157,9 @@ def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
 
 
 def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
-    """Renders a bar for each slave whose dominance factors change, with an area for each peer.
+    """Renders a bar for each slave arm, whose areas show over time who leads it.
+
+    Slaves whose dominance factors never change have no bar.
 
     Args:
         log: Log of the run.
@@ -165,7 +169,7 @@ def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
 
 
 def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
-    """Returns a sentence for each slave whose dominance factors never change.
+    """Returns a sentence on who leads, for each slave arm whose leaders never change.
 
     The other slaves have bars, see `render_lead_bars`.
 

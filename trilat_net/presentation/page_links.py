@@ -79,7 +79,9 @@ _CLOCK_COLUMNS = {
 
 
 def render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
-    """Renders the section about the links: a sentence, and the tables of ages, samples, clocks.
+    """Renders the section about network links: a sentence, and tables of ages and losses.
+
+    A further table compares the clocks of the machines.
 
     Args:
         log: Log of the run.
@@ -139,7 +141,7 @@ def _summarise_links(facts: JsonObject) -> str:
 
 
 def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
-    """Returns the rows with each link's stated delay and the actual ages of its samples.
+    """Returns table rows with each network link's stated delay and the ages of its messages.
 
     The scenario may change the delay of a link during the run. Then the cell lists all stated
     delays, each with the time from which it applied.
@@ -162,7 +164,7 @@ def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
 
 
 def _render_samples(log: Log, facts: JsonObject) -> Markup:
-    """Returns the table that counts the delivered and the lost samples of each link.
+    """Renders the table of delivered and lost messages of each network link.
 
     The columns with measured one-way delays are added only if at least one link has them.
     """
@@ -186,9 +188,13 @@ def _render_samples(log: Log, facts: JsonObject) -> Markup:
 
 
 def _render_clocks(log: Log, facts: JsonObject) -> Markup:
-    """Returns the table that compares the clock of each sender with that of the receiver.
+    """Renders a table of the clock differences between the machines of a session.
 
-    Measured one-way delays are only as accurate as this comparison.
+    Measured one-way delays are only as accurate as these differences are known.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run.
 
     Returns:
         HTML of the table. Empty if all sites read the same clock.

@@ -35,9 +35,9 @@ _MAX_CHANGES = 3
 
 
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
-    """Renders the section with the commands, the scenario, the assumptions and the versions.
+    """Renders the section of a report with which a reader can repeat the run.
 
-    With these, a reader can repeat the run.
+    It has the commands, the scenario, the assumptions and the versions.
 
     Args:
         log: Log of the run.
@@ -149,7 +149,7 @@ def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
 
 
 def _describe_driver(log: Log) -> str:
-    """Returns how a run was executed: simulated, repeated from another log, or live.
+    """Returns a text on how a run was executed: simulated, repeated from a log, or live.
 
     A live session has the time of its start ("epoch").
     """
@@ -180,7 +180,7 @@ def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
 
 
 def _list_commands(log: Log, scenario: str) -> str:
-    """Returns the commands with which a reader can check and repeat the run, a line each.
+    """Returns the shell commands with which a reader can check and repeat the run.
 
     Args:
         log: Log of the run.
@@ -214,7 +214,7 @@ def _list_law_files(scenario: Scenario) -> list[str]:
 
 
 def _list_versions(log: Log) -> list[tuple[str, str]]:
-    """Returns the software and the machine that recorded a log, as pairs of a name and a text.
+    """Returns the software and the machine that recorded a log, as pairs of name and text.
 
     The fingerprint of the arithmetic tells whether another machine computes the same last
     digits.

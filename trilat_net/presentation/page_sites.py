@@ -44,7 +44,7 @@ _ANGLE_COLUMNS = {
 
 
 def render_sites(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with the records and the motion of each site, as tables.
+    """Renders the section of a report with tables of the motion and records of each arm.
 
     A reader sees there how well each arm followed the others, and how hard its controller
     worked.

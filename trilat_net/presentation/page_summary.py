@@ -78,7 +78,7 @@ The clause about a run that converged has numbers, see `_explain_end`.
 
 
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
-    """Renders the judgement whether the run was stable, with what the judgement rests on.
+    """Renders the judgement whether a run was stable, with the evidence for it.
 
     The page of a run begins with this judgement.
 
@@ -126,9 +126,12 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
 
 
 def _start_sentence(text: str) -> str:
-    """Returns a clause as the beginning of a sentence.
+    """Capitalises a clause, so that it can begin a sentence.
 
-    Names of sites, which are written as they are, keep their first letter.
+    Names of arms such as "m1", which are written as they are, keep their first letter.
+
+    Args:
+        text: The clause.
     """
     first_word = text.split(" ", 1)[0]
     is_name = any(letter.isdigit() for letter in first_word) or len(first_word) == 1
@@ -241,7 +244,7 @@ def _list_pushed_sites(log: Log) -> list[str]:
 
 
 class _KeyNumber(NamedTuple):
-    """A number of the first lines.
+    """One of the most important numbers of a run, which a report shows at its top.
 
     Attributes:
         name: Name of the quantity.
@@ -255,7 +258,7 @@ class _KeyNumber(NamedTuple):
 
 
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
-    """Renders the numbers that describe the run best: its errors and the delay in use.
+    """Renders the most important numbers of a run: its errors and the delay in use.
 
     They stand below the judgement, for readers who read nothing else.
 
@@ -272,7 +275,9 @@ def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
 
 
 def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
-    """Returns the largest error |e| of any joint in a run, with its joint and time.
+    """Finds the largest tracking error of any joint in a run, with its joint and time.
+
+    The tracking error is the difference between a joint angle and its reference.
 
     Args:
         log: Log of the run.
@@ -305,7 +310,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 
 
 def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
-    """Returns the largest error of some sites, with their largest error in the last second.
+    """Returns a text with the largest error of some arms, and that of the last second.
 
     The error e is the difference between the angles of an arm and the angles that it should
     have.
@@ -335,10 +340,10 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
 
 
 def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumber]:
-    """Returns the largest distance of the slaves from where the others were at the same time.
+    """Returns a text on how far the slave arms were from the others at the same time.
 
-    The error compares a slave with what its peers sent some time ago. A reader who sees the
-    arms apart on the screen looks for the distance at the same time.
+    The tracking error compares a slave with what the other arms sent some time ago. A reader
+    who sees the arms apart on the screen looks for the distance at the same time.
 
     Args:
         log: Log of the run.
@@ -375,9 +380,9 @@ def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
 
 
 def _describe_delay(facts: JsonObject) -> _KeyNumber:
-    """Returns the mean age of the samples that the controllers used, and its range.
+    """Returns a text on the mean age and the range of ages of the states that were used.
 
-    The age of a sample is the delay that a controller experiences.
+    The age of another arm's state is the delay that a controller experiences.
     """
     ages_ms = [link["age_ms"] for link in facts["links"].values()]
     means_ms = [age["mean"] for age in ages_ms if age["mean"] is not None]

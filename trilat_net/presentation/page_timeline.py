@@ -50,7 +50,7 @@ _DID = {
 
 
 class _RunMoment(NamedTuple):
-    """Something that happened in a run, at a time.
+    """Something that happened in a run at a certain time, such as a changed delay or an alarm.
 
     Attributes:
         t_s: Time at which it happened or began, in s.
@@ -152,9 +152,13 @@ def _list_hands(log: Log) -> Iterator[_RunMoment]:
 
 
 def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
-    """Yields the changes of settings during a run, such as another delay, as moments.
+    """Yields the changes of settings during a run, such as another delay, for the timeline.
 
-    They have the numbers with which charts mark them.
+    Charts mark the changes with the numbers that they have here.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run.
     """
     for number, change in enumerate(facts["changes"], 1):
         tick = change["taken_at_tick"]
@@ -206,7 +210,8 @@ def _list_pushes(log: Log) -> Iterator[_RunMoment]:
 def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
     """Returns the intervals of time in which a condition holds, as start and end in s.
 
-    Interruptions that are shorter than `_PAUSE_S` do not divide an interval.
+    For example, an operator pushes. Interruptions that are shorter than `_PAUSE_S` do not
+    divide an interval.
 
     Args:
         t_s: Times of K records, shape (K,).

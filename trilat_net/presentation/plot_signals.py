@@ -35,7 +35,7 @@ def reference_angles(part: SiteLog) -> Array:
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the rate of an arm's tracking error: its velocity minus the velocity to follow.
+    """Returns the velocity error of an arm: its velocity minus that of its reference.
 
     Args:
         part: The K records of the arm.
@@ -70,10 +70,10 @@ def shared_unit(log: Log) -> str:
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the delays that the control loop of a site experiences, in ms.
+    """Returns the age of the other arms' states that a control loop used, in ms.
 
-    In each tick, the loop uses the newest message (sample) of each peer, another site. The
-    delay is the age of this message.
+    In each control period, the loop uses the newest message of each other arm. Its age is the
+    delay that the loop experiences.
 
     Args:
         log: The log of the run.
@@ -93,7 +93,7 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Returns the sites at which a person or program may act on the arm.
+    """Returns the arms on which a person or program may act.
 
     They have an operator in the scenario, or recorded external torques.
 

@@ -25,14 +25,14 @@ _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
 
 
 def _find_plugin_hand(log: Log, site: str) -> LiveHand:
-    """Returns the operator through which the plugin moves the arm of a site.
+    """Finds the operator of an arm that stands for the program of a plugin.
 
     Args:
         log: Log of the run.
-        site: Name of the site.
+        site: Name of the site, the process that controls the arm.
 
     Raises:
-        UsageError: The scenario has no such operator at this site.
+        UsageError: No program can move the arm of this site in the scenario.
     """
     hand = log.scenario.sites[site].find_live_hand()
     if hand is None:

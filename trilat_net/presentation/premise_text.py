@@ -39,7 +39,9 @@ _PARAMETER_FAULTS = {
 
 
 def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str:
-    """Returns what the log of a run shows about a premise, as a sentence.
+    """Returns a sentence on what a run shows about a condition of the stability theorem.
+
+    An example of a condition is that all network delays are constant.
 
     Args:
         quantities: What was found about the premise.
@@ -65,9 +67,9 @@ def explain_no_functional(scenario: Scenario) -> str:
 def describe_missing_functionals(
     missing: Sequence[premise_quantities.MissingFunctional],
 ) -> str:
-    """Returns for which arms the energy function of the stability proof is missing, and why.
+    """Returns a text on the arms for which the stability proof has no energy function.
 
-    A run with such an arm is judged without the energy function.
+    The text says why. A run with such an arm is judged without the energy function.
 
     Args:
         missing: Sites of these arms, grouped by the reason.

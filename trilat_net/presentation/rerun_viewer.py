@@ -53,7 +53,7 @@ _QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 class ViewerOptions(NamedTuple):
-    """Options of the command that shows a log.
+    """Options of the command that shows a log in the viewer Rerun.
 
     Attributes:
         full: True to show every record instead of the decimated standard channels.
@@ -79,7 +79,7 @@ def open_rerun(
     print_line: Callable[[str], None],
     run_command: RunCommand = _run_process,
 ) -> None:
-    """Shows a log in the viewer Rerun, and returns when the viewer is closed.
+    """Shows a log in the viewer Rerun, and returns when the user closes the viewer.
 
     Args:
         paths: File of the log, or its parts.
@@ -121,7 +121,7 @@ def open_rerun(
 
 
 def _require_display(options: ViewerOptions) -> None:
-    """Checks that there is a display if the viewer would open a window.
+    """Checks that the machine has a display if the viewer Rerun would open a window.
 
     Without a display, the viewer itself fails with an obscure message.
 
@@ -138,7 +138,7 @@ def _require_display(options: ViewerOptions) -> None:
 
 
 def make_application_id(path: Path) -> str:
-    """Returns the name under which Rerun stores the settings of a log's views.
+    """Returns the name under which the viewer Rerun stores the layout of a log.
 
     It is the name of the log, with only the letters that Rerun allows.
 
@@ -204,7 +204,7 @@ _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 
 
 class _PlotCurves(NamedTuple):
-    """The curves that show the numbers of one channel in a plot.
+    """Curves of a plot in the viewer Rerun, which show the numbers of one channel.
 
     A channel is a series of messages with a topic.
 
@@ -238,9 +238,7 @@ PlotPage = list[list[CurvePlot]]
 
 
 class PlotLayout(NamedTuple):
-    """The layout of all views in which Rerun shows a log: pages, plots and arms.
-
-    `build_plot_layout` creates it, and `_save_blueprint` writes it for Rerun.
+    """Layout in which the viewer Rerun shows a log: pages, plots, and arms in space.
 
     Attributes:
         pages: Rows of plots on each page, by the name of the page.
@@ -254,7 +252,7 @@ class PlotLayout(NamedTuple):
 
 
 class _PlotRow(NamedTuple):
-    """A row of a page: a quantity with a plot per site.
+    """A row of plots on a page of the viewer Rerun: one quantity, with a plot for each arm.
 
     Attributes:
         quantity: Name of the quantity.
@@ -351,7 +349,7 @@ def _get_channel_name(topic: str) -> str:
 
 
 def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
-    """Returns a row for each quantity that control laws send to other sites.
+    """Returns a row of plots for each quantity that control laws send to other arms.
 
     The rows are in the order in which the laws declare the quantities. The metadata of a
     channel has the name and the unit of its quantity.
@@ -367,7 +365,7 @@ def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
 
 
 def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> list[CurvePlot]:
-    """Returns the plots of one quantity, such as the joint angles, for all sites that have it.
+    """Returns the plots of one quantity, such as the joint angles, one plot for each arm.
 
     Args:
         channels: Standard channels by topic.
@@ -506,9 +504,9 @@ _TIMELINE = "message_publish_time"
 
 
 def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
-    """Writes a layout as a blueprint, the file from which Rerun reads it.
+    """Writes the layout of a log for the viewer Rerun to a file, called a blueprint.
 
-    A blueprint tells the viewer which plots and views it arranges on the screen.
+    It tells the viewer which plots and views it arranges on the screen.
 
     Args:
         layout: The plots on each page, and what else is shown.
@@ -547,10 +545,9 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
 
 
 def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns Rerun's view of a plot, in which each channel has its own colors.
+    """Returns a plot for the viewer Rerun, in which each channel has its own colors.
 
-    Rerun is a viewer for data of robots. A legend with too many names would cover the curves,
-    and is hidden.
+    A legend with too many names would cover the curves, and is hidden.
     """
     styles_by_channel = {}
     for index, curves in enumerate(plot.curves):
@@ -570,7 +567,7 @@ def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
 
 
 def _style_curves(curves: _PlotCurves, first_color: int) -> Any:
-    """Returns the names and the colors of curves. References have pale colors.
+    """Returns the names and colors of curves in a plot. References have pale colors.
 
     Args:
         curves: The curves.

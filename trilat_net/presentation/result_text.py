@@ -69,7 +69,7 @@ class TextTable(NamedTuple):
 
     @property
     def to_the_right(self) -> list[bool]:
-        """For each column, True if its cells are aligned to the right, as numbers are.
+        """For each table column, True if its cells are aligned to the right, as numbers are.
 
         If `align` has fewer letters than there are columns, its last letter holds for the
         others.
@@ -179,7 +179,7 @@ class TextTable(NamedTuple):
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Formats a number as a cell of a table. A dash stands for None.
+    """Formats a number for the cell of a table: 0.123 for 0.12345, and a dash for None.
 
     Args:
         value: The number, or None.
@@ -192,7 +192,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 
 class MarkedText(NamedTuple):
-    """A line of text that begins with its result as a mark, such as a green "ok".
+    """A line of a result's text that begins with a mark, such as a green "ok".
 
     Attributes:
         mark: The mark in Rich's markup, as in "[green]ok[/green]". Empty for no mark.
@@ -205,7 +205,7 @@ class MarkedText(NamedTuple):
     failed: bool = False
 
     def lines(self) -> list[str]:
-        """Returns the mark and the text in one line without colours: "ok all records".
+        """Returns the text as one line without colours, such as "ok all records".
 
         Returns:
             A list with this line, because other parts of a result have several lines.
@@ -251,9 +251,9 @@ _BRIEF_COMPOSERS = {
 
 
 def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
-    """Collects the blocks of a result's text: lines and tables.
+    """Collects the lines and tables of which the text of a result consists.
 
-    Terminal, plain text and HTML all render these blocks.
+    The terminal, plain text and HTML all show them, so that the contents are equal everywhere.
 
     Args:
         result: What a command has computed, such as the measured numbers of a run.
@@ -279,10 +279,10 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
 def _import_composer(
     result: Result, composers: Mapping[str, str]
 ) -> Callable[[Result], Iterable[Block]]:
-    """Imports the function that composes the text of a result.
+    """Imports the function that composes the text of a result, only when it is needed.
 
-    A subclass of a listed class has the function of the listed class. Importing the module only
-    when it is needed keeps other commands fast.
+    Importing all such modules at the start would make every command slow. A subclass of a
+    listed class has the function of the listed class.
 
     Args:
         result: The result.
@@ -297,7 +297,7 @@ def _import_composer(
 
 
 def summarize(result: Result) -> str:
-    """Renders a result as plain text, for printing it in a Python session.
+    """Renders the result of a command as plain text, for printing it in a Python session.
 
     Args:
         result: Result of a command or function, which yields its text by `blocks`.
@@ -309,7 +309,7 @@ def summarize(result: Result) -> str:
 
 
 def render_html(result: Result) -> str:
-    """Renders a result as HTML with tables, for example for a notebook.
+    """Renders the result of a command as HTML with tables, for example for a notebook.
 
     Args:
         result: Result of a command or function, which yields its text by `blocks`.

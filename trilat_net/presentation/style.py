@@ -115,8 +115,8 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
 class _NotebookFigure(Figure):
     """A Matplotlib figure that a Jupyter notebook displays as a picture.
 
-    A plain Matplotlib figure that was made without pyplot would be displayed as its size in
-    words.
+    Without this class, a notebook would display only the size of the figure in words, because
+    figures are made without pyplot.
     """
 
     def _repr_png_(self) -> bytes:
@@ -135,7 +135,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels (parts of the figure with axes of their own) to a figure.
+    """Adds a grid of panels, parts with axes of their own, to a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -151,7 +151,7 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
 
 
 def site_colour(log: Log, site: str) -> str:
-    """Returns the colour of a site, which is the same in every figure of the log.
+    """Returns the colour of an arm, which is the same in every figure of the log.
 
     Args:
         log: Log with the site.
@@ -168,10 +168,9 @@ _THINNER_PT = 1.2
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
-    """Returns the colour, dashes and width of the lines that belong to a site.
+    """Returns the colour, dashes and width of the lines of an arm, for all figures.
 
-    A site is a process that runs one arm. If there are more sites than colours, colours are
-    repeated with dashes.
+    If there are more arms than colours, colours are repeated with dashes.
 
     Args:
         log: Log with the site.
@@ -196,7 +195,7 @@ def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
 
 
 def site_title(log: Log, site: str) -> str:
-    """Returns the name of a site with its role, such as master or slave, for legends.
+    """Returns the name of an arm with its role, such as master or slave, for legends.
 
     Args:
         log: Log with the site.
@@ -317,9 +316,9 @@ def name_joints(log: Log) -> list[str]:
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns titles for the coordinates with which the arms follow each other.
+    """Returns titles for the joints or axes with which the arms follow each other.
 
-    They are joints, or axes of the task space if the arms follow each other's end effectors.
+    Axes are those of the task space, if the arms follow each other's end effectors.
 
     Args:
         log: Log with the arms.
@@ -331,7 +330,7 @@ def name_shared(log: Log) -> list[str]:
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes a title, such as the joint's name, above each panel of a row.
+    """Writes the name of a joint above each panel of a row, or another title.
 
     Args:
         log: Log with the joints.
@@ -343,7 +342,7 @@ def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> N
 
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Writes a label beside a row of low panels, in several lines.
+    """Writes a label beside a row of low panels of a figure, in several lines.
 
     A low panel has no room beside it for a long label in one line.
 
@@ -371,7 +370,9 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class _JointPanels(NamedTuple):
-    """Panels of a figure in which each joint has a panel, as `add_joint_panels` creates them.
+    """Panels of a figure in which each joint of the arms has a panel of its own.
+
+    `add_joint_panels` creates them.
 
     Attributes:
         joints: A panel per joint.
@@ -500,7 +501,7 @@ _MAX_LEGEND_COLUMNS = 6
 
 
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
-    """Adds a legend of lines above the panels of a figure.
+    """Adds a legend, which names the lines, above the panels of a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -552,7 +553,7 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that contains only the reason why there is nothing to draw.
+    """Returns a figure that contains only a text: the reason why there is nothing to draw.
 
     A command that writes a figure thus always writes a file.
 
@@ -568,7 +569,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes into an empty panel why there is nothing to show.
+    """Writes into an empty panel of a figure why there is nothing to show.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -594,7 +595,7 @@ _UNDATED: dict[str, dict[str, Any]] = {
 
 
 def write_figure(figure: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure to a file, in the format that the suffix of the file names.
+    """Writes a figure to a file, in the format of the file's suffix, such as .pdf.
 
     Args:
         figure: The Matplotlib figure.
@@ -672,7 +673,7 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
     """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
-        """Returns the numbers and times of a site's K ticks, and the values to draw.
+        """Returns the ticks and times of an arm's K records, and the values to draw.
 
         Args:
             site: Name of the site.
@@ -694,7 +695,7 @@ def time_figure(
     height_in: float,
     interval_s: tuple[float, float] | None = None,
 ) -> Iterator["TimeFigure"]:
-    """Provides an empty figure over the time of a run, for use in a `with` statement.
+    """Provides an empty figure whose panels show a run over time, for use in a `with` block.
 
     Args:
         log: Log of the run.
@@ -764,10 +765,10 @@ class TimeFigure:
         plot_decimated(axes, records.tick, records.t_s, values, **line_options)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal over time, with a panel per joint and a line per site (arm).
+        """Draws a signal over time into a row of panels, a panel per joint and a line per arm.
 
-        Times in which a site does not follow other sites are shaded, and changes of settings
-        are marked.
+        Times in which an arm does not follow other arms are shaded, and changes of settings are
+        marked.
 
         Args:
             row: The panels, as Matplotlib axes.
@@ -855,7 +856,7 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Completes the figure with time axes, a legend, and a text about marked changes.
+        """Completes a drawn figure with time axes, a legend, and a text about marked changes.
 
         A function that draws a figure calls this last.
 
@@ -894,7 +895,9 @@ class TimeFigure:
             )
 
     def _explain_changes(self, *, links: bool) -> str:
-        """Returns a sentence that explains the numbered changes.
+        """Returns a sentence that explains the numbered marks of changes in a figure.
+
+        A change is for example another network delay from a certain time on.
 
         Args:
             links: True to explain changes of links only.

@@ -81,7 +81,7 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns lines about the notable facts of a run.
+    """Returns lines about notable facts of a run, such as alarms and changed delays.
 
     They concern alarms, user code, links, changes, modes and clocks. Long lists are cut, see
     `_limit_lines`.
@@ -157,10 +157,10 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def _format_change_lines(log: Log) -> list[str]:
-    """Returns a line for each change of a setting during the run.
+    """Returns a line of text for each change of a setting during the run.
 
-    A change is a command to an arm, another delay of a link, or other weights with which an arm
-    follows the others (dominance factors).
+    A change is a command to an arm, another delay of a network link, or other weights with
+    which an arm follows the others (dominance factors).
 
     Args:
         log: Log of the run.
@@ -233,7 +233,7 @@ def _format_stated_models(states: Sequence[StatedModel]) -> str:
 
 
 def _format_clock(use: link_summary.ClockSummary) -> str:
-    """Returns a description of how far the clocks of two machines differ.
+    """Returns a text on how far the clocks of two machines differ.
 
     Measured one-way delays are only as accurate as this difference is known.
 
@@ -260,7 +260,7 @@ def _format_clock(use: link_summary.ClockSummary) -> str:
 
 
 def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -> str:
-    """Returns the mean, deviation, 99th percentile and largest value of times, in ms.
+    """Formats the mean, deviation, 99th percentile and largest value of times, in ms.
 
     Args:
         spread: Statistics of the times.
@@ -279,9 +279,9 @@ def _format_number(value: float) -> str:
 
 
 def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
-    """Returns the number and percentage of a link's samples that were not used, by reason.
+    """Returns number and percentage of a network link's messages that were not used, by reason.
 
-    A sample is the state that one site sends to another in each control period.
+    Such a message has the state that one arm sends to another in each control period.
 
     Args:
         use: Summary of the link.
@@ -314,7 +314,7 @@ def _limit_lines(lines: list[str]) -> list[str]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields the result of the checks of a log: a line per check.
+    """Yields the results of the checks of a log for the user, one line per check.
 
     If all checks passed, the notable facts of the run follow.
 
@@ -352,7 +352,7 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
-    """Yields the result of the recovery of an unfinished log.
+    """Yields the outcome of recovering a log that was cut off.
 
     The first line names the new file. A table lists which records were recovered, and which
     were lost or are missing.
@@ -522,9 +522,13 @@ def _describe_link_effect(link: LinkEffect) -> str:
 
 
 def _format_difference(before: object, after: object) -> tuple[str, str]:
-    """Returns two different values as texts that differ.
+    """Formats two different values so that their texts differ.
 
-    Numbers have six digits. If these are equal, they have all digits.
+    Numbers have six digits. If the texts are then equal, they get all digits.
+
+    Args:
+        before: The value in the first log.
+        after: The value in the second log.
     """
     short_before = f"{before:.6g}" if isinstance(before, float) else str(before)
     short_after = f"{after:.6g}" if isinstance(after, float) else str(after)
@@ -534,7 +538,7 @@ def _format_difference(before: object, after: object) -> tuple[str, str]:
 
 
 def compose_doctor(report: Result) -> Iterator[Block]:
-    """Yields the result of examining whether this machine is fit for a session.
+    """Yields the results of checking whether this machine is ready for a session.
 
     Each finding has a line, with a mark for good, doubtful or bad.
 
@@ -600,10 +604,10 @@ _DELAY_KEYS = ("min", "p50", "p99", "max")
 
 
 def compose_topic_delays(report: Result) -> Iterator[Block]:
-    """Yields a table of the delays with which the messages of a ROS topic arrive.
+    """Yields a table of the delays with which the messages of a ROS 2 topic arrive.
 
-    There is a row per publisher. The last column is a histogram of the delays, from the
-    smallest to the largest one.
+    There is a row per publishing program. The last column is a histogram of the delays, from
+    the smallest to the largest one.
 
     Args:
         report: Result of the measurement.
@@ -638,7 +642,7 @@ def compose_topic_delays(report: Result) -> Iterator[Block]:
 
 
 def _draw_histogram(counts: Sequence[int]) -> str:
-    """Returns a histogram as text, with a bar of up to eight eighths per bin.
+    """Draws a histogram as one line of text, with a block character for each bin.
 
     Args:
         counts: Number of messages in each bin. At least one bin must have a message.
@@ -775,7 +779,7 @@ def _explain_missing(subject: str, reason: str) -> MarkedText:
 def _compose_group(
     group: str, members: Sequence[Quantity], metrics: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a table with a row per quantity and a column per subject.
+    """Yields a table of metrics with a row per quantity and a column per arm, link or wall.
 
     Rows and columns without any number that applies to the run are left out.
 
@@ -931,7 +935,7 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
-    """Returns the cells of one frequency: frequency, gain, phase, coherence and error.
+    """Returns the table cells of one frequency: frequency, gain, phase, coherence and error.
 
     If the ratio could not be estimated, the last cell has the reason, and the others are empty.
     """
@@ -962,7 +966,7 @@ def _format_value(value: float) -> str:
 def _tabulate(
     heads: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int
 ) -> Iterator[Block]:
-    """Yields a table and an empty line.
+    """Yields a table and then an empty line for the terminal.
 
     Args:
         heads: Header of each column. If the last one is empty, the last column has texts.

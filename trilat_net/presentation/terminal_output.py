@@ -35,15 +35,15 @@ if TYPE_CHECKING:
 
 
 class TextConsole(Console):
-    """Console of the package Rich that makes control characters of all texts visible.
+    """Console of the library Rich in which control characters of texts are made visible.
 
     A text from another program thus cannot control the terminal, not even in a table.
     """
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Converts a string to the type of Rich, with names in place of control characters.
+        """Converts a string to Rich's type of text, with control characters replaced by names.
 
-        Rich calls this for every text that it prints.
+        Rich, the library that prints to the terminal, calls this for every text.
 
         Args:
             text: The text.
@@ -70,9 +70,9 @@ _PIPE_WIDTH = 160
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
-    """Prints a text from an unknown source as a line.
+    """Prints a text of unknown origin as a line, without harmful characters.
 
-    The text is sanitized, and Rich's markup in it is not interpreted.
+    Control characters are made visible, and Rich's markup in the text is not interpreted.
 
     Args:
         text: The line.
@@ -94,6 +94,8 @@ def print_note(text: object) -> None:
 def print_error(text: object) -> None:
     """Prints an error message to standard error, so that it does not disturb results.
 
+    Another program can then read the results from standard output.
+
     Args:
         text: The message.
     """
@@ -111,7 +113,9 @@ def print_marked(mark: str, text: object) -> None:
 
 
 def print_texts(texts: Iterable[object]) -> None:
-    """Prints several texts from an unknown source, a line each, as `print_text` does.
+    """Prints several texts of unknown origin, one per line, without harmful characters.
+
+    Control characters are shown by names, see `print_text`.
 
     Args:
         texts: The texts.
@@ -121,7 +125,7 @@ def print_texts(texts: Iterable[object]) -> None:
 
 
 def print_paths(paths: Iterable[Path]) -> None:
-    """Prints the paths of files that a command has written, a line each.
+    """Prints the paths of files that a command has written, one path per line.
 
     Args:
         paths: The paths.
@@ -130,7 +134,7 @@ def print_paths(paths: Iterable[Path]) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Prints a value as JSON to standard output, for other programs.
+    """Prints a value as JSON to standard output, for other programs to read.
 
     Args:
         value: Plain values, also in lists and dictionaries.
@@ -143,7 +147,7 @@ def print_json(value: Any) -> None:
 
 
 def print_line(text: str) -> None:
-    """Prints a line at once, so that a program that reads the output need not wait for it.
+    """Prints a line without buffering, so that a program that reads it need not wait.
 
     Args:
         text: The line.
@@ -153,7 +157,7 @@ def print_line(text: str) -> None:
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table, as wide as the terminal permits.
+    """Prints a table that is as wide as the terminal permits.
 
     If the output is not a terminal, it is at least `_PIPE_WIDTH` wide.
 
@@ -224,12 +228,12 @@ def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
     percent = ""
 
     def show(done: int, total: int) -> None:
-        """Stores the progress for the next line."""
+        """Stores the progress of a command, which the next printed line states."""
         nonlocal percent
         percent = f"{100 * done // total} %, " if total > 0 else ""
 
     def print_lines() -> None:
-        """Prints the lines until the work ends."""
+        """Prints lines with the progress at intervals, until the work ends."""
         if has_ended.wait(LINES_AFTER_S):
             return
         err.print(f"{label} ...", markup=False, soft_wrap=True)
@@ -310,7 +314,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
-    """Opens a log from its files with a progress bar, and warns of damage.
+    """Opens a log with a progress bar in the terminal, and warns of damaged parts.
 
     Args:
         first: File of the log, or its first part.
@@ -329,7 +333,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Tells the user which parts of a log are damaged, and which command recovers the rest.
+    """Tells the user which parts of a log are damaged, and which command saves the rest.
 
     Nothing is printed for an intact log.
 
@@ -367,7 +371,7 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Tells the user if a log file has no proper end, and which command recovers it.
+    """Tells the user if a log file was cut off, and which command recovers its contents.
 
     Nothing is printed for a complete file.
 

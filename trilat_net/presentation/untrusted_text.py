@@ -24,7 +24,7 @@ MAX_LETTERS = 4000
 def escape_controls(text: str) -> str:
     """Replaces control characters of a text by their names, as in <U+001B>.
 
-    Otherwise a text from another program could control the terminal.
+    Otherwise a text from another program could control the terminal, for example clear it.
 
     Args:
         text: The text.
@@ -33,10 +33,9 @@ def escape_controls(text: str) -> str:
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Makes a text from an unknown source fit for a terminal.
+    """Replaces the harmful characters of a text of unknown origin, and cuts a long text off.
 
-    Characters that cannot be printed become a replacement character. A text that is longer than
-    `most` characters is cut off.
+    Control characters could otherwise control the terminal.
 
     Args:
         text: The text, or an object that is converted to a string.

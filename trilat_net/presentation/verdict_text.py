@@ -56,12 +56,14 @@ REQUIREMENTS = {
 
 
 def name_theorem() -> str:
-    """Returns the phrase by which a judgement says that it rests on the stability theorem."""
+    """Returns the phrase by which judgements of runs refer to the paper's stability theorem."""
     return THEOREM
 
 
 def describe_verdict(verdict: facts.StabilityVerdict) -> str:
-    """Returns a sentence on what the energy function V shows about a run.
+    """Returns a sentence on whether the energy function V of a run rose.
+
+    V is the energy of the stability proof, which must not rise.
 
     Args:
         verdict: The finding with its facts.
@@ -107,7 +109,7 @@ def _describe_coarse_energies(energies: facts.CoarseEnergies) -> str:
 
 
 def _describe_course(course: facts.FunctionalCourse) -> str:
-    """Returns whether V, the energy function of the stability proof, rose during a run.
+    """Returns a sentence on whether the energy V of the stability proof rose during a run.
 
     The sentence also says whether the premises (conditions) of the theorem hold, under which V
     must not rise.
@@ -164,7 +166,8 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
 def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
     """Returns a sentence on a growth of the energy V that no operator or wall explains.
 
-    Such a growth is doubtful, even if the run looks stable.
+    V is the energy of the stability proof. Such a growth is doubtful, even if the run looks
+    stable.
 
     Args:
         growth: The growth at the end of the run.
@@ -178,7 +181,7 @@ def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
 
 
 def describe_evidence(evidence: facts.Evidence) -> str:
-    """Returns how many records of a run exist, and whether its log is unchanged.
+    """Returns a sentence on how many records a run has, and whether its log is unchanged.
 
     Args:
         evidence: The records on which a certificate is based.

@@ -99,7 +99,9 @@ def _is_log(channels: dict[str, Ros2Channel]) -> bool:
 
 
 def _list_session_topics(log: Path) -> dict[str, Ros2Channel]:
-    """Lists the topics under which the live bridge would publish the session of a log.
+    """Lists the ROS 2 topics under which a bridge would publish the session of a log live.
+
+    Layouts of viewers then work for the log and for the live session.
 
     Args:
         log: File of the log.

@@ -40,7 +40,7 @@ _PACKAGES = ("numpy", "numba", "scipy")
 
 
 def _import_distributed() -> Any:
-    """Imports the package `distributed`, which contains the client of Dask.
+    """Imports `distributed`, the package of Dask that runs work on a cluster of machines.
 
     Raises:
         UsageError: The package is not installed.
@@ -87,7 +87,10 @@ def _find_sources() -> list[Path]:
 
 
 class WorkerRequirements(NamedTuple):
-    """Program, arithmetic and files that a worker of a cluster must have for equal results.
+    """What a worker of a cluster must have to compute the same results as this machine.
+
+    The requirements are the version of the program, equal arithmetic, and equal files of users'
+    control laws.
 
     Attributes:
         identity: Properties that the worker must have.
@@ -145,10 +148,9 @@ def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
 
 
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns the laws whose file this process does not have, or has with other contents.
+    """Finds the users' control laws whose file this process lacks, or has in another version.
 
-    A worker without the file of a user's law could not run the study, or would compute other
-    results.
+    A worker without the right file could not run the study, or would compute other results.
 
     Args:
         laws: Name of each law, with the SHA-256 of its file.
@@ -165,7 +167,7 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks in a worker of a cluster that it would compute the same results as this study.
+    """Checks in a worker of a cluster that it would compute the same results as the study.
 
     A worker that joins during the study has not been checked before. Results from different
     program versions must not be mixed.
@@ -193,7 +195,7 @@ def _make_probe() -> Callable[
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
-        """Describes the worker process in which it is called, and checks its control laws.
+        """Describes the worker process in which it runs, and checks its files of control laws.
 
         Args:
             laws: Name of each imported control law, with the SHA-256 of its file.
@@ -249,7 +251,7 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`.
+        """Runs functions on the workers of a Dask cluster, as a `concurrent.futures.Executor`.
 
         A function is executed again for each call, even if the arguments are the same.
         """
@@ -258,7 +260,7 @@ class DaskCluster:
 
     @property
     def workers(self) -> int:
-        """Number of items that all workers together run at the same time, one per thread.
+        """Number of items of a study that the cluster runs at the same time, one per thread.
 
         The number may change, because workers may join and leave.
         """
@@ -266,10 +268,10 @@ class DaskCluster:
         return sum(worker["nthreads"] for worker in workers.values())
 
     def require(self, laws: Sequence[NamedCode]) -> WorkerRequirements:
-        """Determines what workers need for a study, and checks the workers that are present.
+        """Determines what workers of the cluster need for a study, and checks all present ones.
 
         A worker must have the same program, arithmetic and versions of packages as this
-        process, and the files of all imported control laws.
+        process, and the files of all imported control laws. Otherwise, results would differ.
 
         Args:
             laws: Imported control laws that the items of the study need.
@@ -313,10 +315,10 @@ class DaskCluster:
         return required
 
     def check_alive(self) -> None:
-        """Checks that the cluster can still run items.
+        """Checks that the cluster still has workers, and raises an error if it does not.
 
-        A study calls this regularly while it waits for results, so that it ends with an error
-        instead of waiting forever.
+        A parameter study calls this regularly while it waits for results, because otherwise it
+        could wait forever.
 
         Raises:
             RunFailed: The scheduler is gone, or had no worker for `NO_WORKER_S`.

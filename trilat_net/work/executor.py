@@ -68,11 +68,11 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Does nothing with a report of progress, for callers that do not display any."""
+    """Ignores a report of progress. It is the default for callers that do not display any."""
 
 
 class _BatchResult(NamedTuple):
-    """Results of a batch of items, which a worker process sends back to the study.
+    """Results of a group of items, which a worker process returns to the main process.
 
     Attributes:
         results: Results of the items, up to the first error.
@@ -131,9 +131,9 @@ def run_batch(
 
 
 class _Batch(NamedTuple):
-    """A group of items that a worker process is working on.
+    """A group of items that one worker process is working on.
 
-    If the worker dies, the items are known from here and return to the queue.
+    If the worker dies, its items are known from here and return to the queue.
 
     Attributes:
         numbers: Numbers of the items in the study, counted from 0.
@@ -367,7 +367,9 @@ class WorkerPool:
         together: Together[T, R] | None = None,
         together_count: int = 1,
     ) -> list[R]:
-        """Runs a function on each item with all workers, and returns all results.
+        """Runs a function on each item of a list in parallel, and returns all results.
+
+        Items are distributed to worker processes of this machine or of a cluster.
 
         Args:
             function: Function at module level, so that another process can import it.
@@ -402,7 +404,7 @@ class WorkerPool:
         pending: dict[Future[_BatchResult], _Batch],
         together: Together[T, R] | None,
     ) -> None:
-        """Submits batches until every worker has one batch that runs and one that waits.
+        """Sends groups of items (batches) to the workers, so that each has one waiting.
 
         A batch that waits keeps the worker busy until the results of the previous batch have
         been processed.
@@ -436,7 +438,11 @@ class WorkerPool:
         feed: _Feed[T],
         lost: Callable[[T], R] | None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the results of a batch that ended, or returns its items to the queue.
+        """Yields the results of a finished batch.
+
+        If its worker died, the items are queued again.
+
+        A batch is a group of items that one worker process receives together.
 
         Args:
             future: Future of the batch.
@@ -478,10 +484,10 @@ class WorkerPool:
             yield number, lost(item)
 
     def _replace_executor(self, broken: Executor) -> None:
-        """Starts a new executor in place of a broken one.
+        """Starts a new pool of worker processes in place of a broken one.
 
-        Several batches of the broken executor fail one after another. Only the first failure
-        starts a new executor.
+        Several batches of the broken pool fail one after another. Only the first failure starts
+        a new pool.
 
         Args:
             broken: The broken executor.
@@ -570,7 +576,7 @@ def check_workers(jobs: int | None, on: Workers) -> None:
 
 
 def count_workers(jobs: int | None, on: Workers = None) -> int:
-    """Returns the number of items that will run at the same time.
+    """Returns how many items of a study will run at the same time.
 
     For a cluster, this connects to its scheduler and checks its workers.
 

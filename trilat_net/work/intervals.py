@@ -42,7 +42,10 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
 
 class MeanInterval(NamedTuple):
-    """Mean of the numbers of several runs, with its 95 % interval by Student's t distribution.
+    """Mean of a number over several runs, with its 95 % confidence interval.
+
+    The interval follows from Student's t distribution. It shows how much the mean may change
+    with other random seeds.
 
     Attributes:
         mean: The mean.

@@ -53,7 +53,7 @@ def extend_file(path: Path) -> BinaryIO:
 
 
 def build_resume_hint(*arguments: str) -> str:
-    """Returns advice on how to continue a study that was interrupted by a full disk.
+    """Returns a sentence that tells the user how to continue a study after the disk was full.
 
     Args:
         arguments: Arguments of the command that continues the study.
@@ -63,7 +63,7 @@ def build_resume_hint(*arguments: str) -> str:
 
 
 def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Converts table rows to CSV text with a header.
+    """Converts a table to CSV text with a header line.
 
     None becomes an empty field.
 
@@ -82,9 +82,10 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
 
 
 class _JournalEntry(Protocol):
-    """Interface of an entry of a `RunJournal`: the result of a finished run.
+    """Result of a finished run, as a `RunJournal` stores it in a file.
 
-    An entry is a structure of plain values. The cell and the seed together identify its run.
+    An entry is a structure of plain values. The cell (combination of settings) and the random
+    seed together identify its run.
     """
 
     @property
@@ -106,7 +107,7 @@ E = TypeVar("E", bound=_JournalEntry)
 
 
 class _RunKey(msgspec.Struct, frozen=True):
-    """The fields of a journal entry that identify its run.
+    """Key of one run of a study: its cell (combination of settings) and its random seed.
 
     Attributes:
         cell: Identifier of the part of the study to which the run belongs.
@@ -121,7 +122,9 @@ _KEYS = msgspec.json.Decoder(_RunKey)
 
 
 def _read_key(text: bytes, kind: type[E]) -> _RunKey:
-    """Returns which run the JSON text of a journal line belongs to.
+    """Reads from a line of the journal which run of the study it describes.
+
+    The rest of the line is not decoded if possible, because a journal may have many runs.
 
     Args:
         text: The line without its checksum.
@@ -154,7 +157,9 @@ class StoredRuns(Mapping[tuple[Any, int], E]):
         self._file: BinaryIO | None = None
 
     def add_offset(self, key: _RunKey, offset: int) -> None:
-        """Notes the offset of a finished run. A known run keeps its first offset.
+        """Notes where in the file a finished run is stored.
+
+        If a run occurs twice, the first one counts.
 
         Args:
             key: Cell and seed of the run.
@@ -163,7 +168,7 @@ class StoredRuns(Mapping[tuple[Any, int], E]):
         self._offsets.setdefault(key.seed, {}).setdefault(key.cell, offset)
 
     def close(self) -> None:
-        """Closes the file. It is opened again when a run is read."""
+        """Closes the file with the stored runs. It is opened again when a run is read."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -241,7 +246,7 @@ class RunJournal(Generic[E]):
         self.done.close()
 
     def add(self, entry: E) -> None:
-        """Appends the result of a run to the file at once.
+        """Appends the result of a finished run to the journal file at once.
 
         Thus an interruption of the study cannot lose the run. A run that the journal contains
         already is ignored.
@@ -276,7 +281,9 @@ class RunJournal(Generic[E]):
         together_count: int = 1,
         note: Callable[[E], None] | None = None,
     ) -> None:
-        """Executes the unfinished runs of a study, and stores each run as soon as it ends.
+        """Executes the unfinished runs of a study in parallel, and stores each one at its end.
+
+        An interrupted study therefore loses only the runs in progress.
 
         Args:
             pool: Workers that execute the runs.
@@ -311,7 +318,10 @@ class RunJournal(Generic[E]):
             show(number, total)
 
     def _write(self, data: bytes) -> None:
-        """Appends bytes to the file.
+        """Appends bytes to the journal, the file with the finished runs of a study.
+
+        Args:
+            data: The bytes.
 
         Raises:
             LogRefused: The disk is full.
@@ -351,6 +361,8 @@ class StudyFolder(NamedTuple, Generic[P, E]):
 
     def read_done(self) -> list[tuple[Any, int]]:
         """Reads from the journal which runs of the study have finished.
+
+        An interrupted study continues with the remaining runs.
 
         Returns:
             The cell (the part of the study) and the seed of each finished run. Empty if no run

@@ -56,10 +56,11 @@ _EnergyKey = tuple[str, str]
 
 @dataclass(frozen=True)
 class SiteEnergy:
-    """Everything that changes the energy function V_i of a site, over K records.
+    """Energy V_i of one arm in the stability proof, and everything that changes it.
 
-    V_i is the part of a site i in the energy function of the stability proof. Its change over a
-    tick period must equal the energies listed here. There are K - 1 periods between K records.
+    There are K records. V_i is the part of arm i in the energy function V of the proof. Its
+    change over each of the K - 1 control periods (ticks) must equal the energies listed here.
+    Otherwise, the records contradict the model.
 
     Attributes:
         motion: Motion of the site, from which its energies are computed.
@@ -110,21 +111,24 @@ class SiteEnergy:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The change of the site's energy that remains unexplained, shape (K,), in J.
+        """Change of the arm's energy that no known energy flow explains, shape (K,), in J.
+
+        A site is the process that controls the arm. The value is 0 up to numerical errors if
+        the records obey the model of the arm. A large value means that records are wrong, or
+        that the model is.
 
         It is `residual` minus the work that arises because the continuous control law is
-        executed only once per tick. It is 0 up to numerical errors if the records obey the
-        model of the site.
+        executed only once per tick, a period of the control loop.
         """
         sampling = _accumulate(self.sampling.total, self.judged)
         return self.residual - sampling
 
     @property
     def followed(self) -> dict[str, DelayedPeer]:
-        """The peers that the site follows at some time, with their motion as it is received.
+        """The other arms that this arm follows at some time, with their motion as received.
 
-        A peer is another site. It is followed if its dominance factor, the weight with which
-        the arm follows it, is ever different from zero.
+        An arm is followed if its dominance factor, the weight with which this arm follows it,
+        is ever different from zero.
         """
         alpha = self.motion.dominance.alpha
         peers = self.motion.peers
@@ -171,14 +175,17 @@ class SiteEnergy:
 
     @cached_property
     def uncertainty(self) -> float:
-        """Estimated numerical error of the site's energies, in J.
+        """Estimated numerical error of the arm's energies, in J.
 
-        Energies are integrated from records at the ticks. Therefore motion between the ticks
-        causes errors. The error of the trapezoid rule is estimated from the curvature of the
-        total power. The error of torques that are constant between ticks is estimated from the
-        changes of these torques, times the changes of the filtered error r = qd - v. Here qd is
-        the joint velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged
-        periods, the whole energy counts as uncertain.
+        A change of energy that is smaller than this error proves nothing. Energies are
+        integrated from records at the ticks (periods of the control loop), so that motion
+        between the ticks causes errors.
+
+        The error of the trapezoid rule is estimated from the curvature of the total power. The
+        error of torques that are constant between ticks is estimated from the changes of these
+        torques, times the changes of the filtered error r = qd - v. Here qd is the joint
+        velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged periods, the
+        whole energy counts as uncertain.
         """
         outflows = [self.transfer, *self.dissipation.values()]
         inflows = list(self.work.values())
@@ -222,7 +229,7 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Returns the running sum of the amounts of K - 1 tick periods, shape (K,), from 0 on.
+    """Sums amounts, such as energies per control period, up to each time, shape (K,), from 0.
 
     Args:
         amounts: Amount in each period, shape (K - 1,).
@@ -235,9 +242,9 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Computes the energy of each site in the stability proof, from a log.
+    """Computes from a log the energy of each arm that the stability proof uses.
 
-    A site is the process that runs one arm. Every site must have an energy function.
+    An energy function must exist for the control law of every arm.
 
     Args:
         log: The log of the run.
@@ -267,9 +274,9 @@ def derive_site_energies(
     pasts: Mapping[str, PeerTrajectory],
     dominance: Callable[[str, Array], DominanceHistory],
 ) -> dict[str, SiteEnergy]:
-    """Computes the energy of each site in the stability proof, and all that changes it.
+    """Computes the energy of each arm in the stability proof, and everything that changes it.
 
-    A site is the process that runs one arm. Every site must have an energy function.
+    An energy function must exist for the control law of every arm.
 
     Args:
         scenario: The description of the experiment.
@@ -322,9 +329,9 @@ def derive_site_energies(
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the times at which the energy functions V_i of all sites are known, in s.
+    """Returns the times at which the energies V_i of all arms are known, in s.
 
-    They are ticks of the site with the highest tick rate, shape (T,).
+    They are ticks (control periods) of the arm with the highest rate, shape (T,).
 
     Args:
         energies: Energies of the sites, by name.
@@ -394,11 +401,14 @@ class EnergyBalance:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The change of the group's energy that remains unexplained, shape (T,), in J.
+        """Change of the group's energy that no known energy flow explains, shape (T,), in J.
+
+        A group consists of arms that follow each other. A large value means that the log
+        contradicts the model of the arms, or that records are wrong.
 
         It is `residual` minus two known causes: the work that arises because control laws are
-        executed in ticks, and the energy transfers that the weights of the sites do not cancel.
-        A large value means that the log contradicts the model, or that records are wrong.
+        executed in ticks (periods of the control loop), and the energy transfers between arms
+        that the weights of the sites do not cancel.
         """
         explained = self._accumulate_judged(self.sampling - self.transfer)
         return self.residual - explained
@@ -417,9 +427,9 @@ class EnergyBalance:
 
     @property
     def _work_from_outside(self) -> dict[str, Array]:
-        """Work of operators, environments and stops, by source, shape (T,) each, in J.
+        """Work of operators, environments and end stops on the arms, by source, in J.
 
-        Other work, such as that of gravity, is internal to the arms.
+        Each has the shape (T,). Other work, such as that of gravity, is internal to the arms.
         """
         sources = {}
         for name in EXTERNAL_SOURCES:
@@ -429,10 +439,10 @@ class EnergyBalance:
 
     @property
     def external_work(self) -> Array:
-        """Work of operators, environments and stops on all arms since the first tick, in J.
+        """Work of operators, walls and end stops on all arms since the first tick, in J.
 
-        The stability proof permits V to rise by this amount. The shape is (T,), with one entry
-        per tick.
+        The stability proof permits the energy V to rise by this amount. The shape is (T,), with
+        one entry per tick (control period).
         """
         return _sum(self._work_from_outside)
 
@@ -518,7 +528,7 @@ def compute_energy_balance(
     all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
-        """Returns the energies of a kind over time, each accumulated over the judged periods.
+        """Returns the energies of one kind, such as dissipation, summed over judged periods.
 
         Args:
             kind: The kind, such as "dissipation" or "work".
@@ -601,7 +611,9 @@ def _weigh_site(
 
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
-    """Interpolates a curve linearly at other times. At the same times it stays unchanged.
+    """Interpolates a curve linearly at other times, to add curves of arms with different rates.
+
+    At times that the curve has, its values stay unchanged.
 
     Args:
         times: Times of the result, shape (T,), in s.
@@ -620,9 +632,10 @@ def _trace_weights(
     *,
     paper_weights: bool,
 ) -> tuple[Array, Array]:
-    """Returns the weights beta of all N sites in the total energy V, at the ticks of one site.
+    """Returns the weight of each of N arms in the total energy V, at the ticks of one arm.
 
-    The weights follow from the dominance factors, which may change during the run.
+    V is the energy function of the stability proof. The weights beta follow from the dominance
+    factors, which may change during the run.
 
     Args:
         energies: Energies of the N sites.
@@ -639,7 +652,7 @@ def _trace_weights(
     beta_by_matrix: dict[bytes, Array] = {}
 
     def compute_beta(t_s: Array, ahead_s: float) -> Array:
-        """Computes the weights beta of the sites in V from the dominance factors.
+        """Computes the weights beta of the arms in the energy V from the dominance factors.
 
         Dominance factors seldom change. Therefore the weights of a matrix of factors are
         computed once and kept in `beta_by_matrix`.
@@ -684,7 +697,9 @@ def _interpolate_dominance(
     t_s: Array,
     ahead_s: float = 0.0,
 ) -> Array:
-    """Returns the matrix of dominance factors of a group of sites over time, shape (T, N, N).
+    """Returns the matrix of dominance factors of a group of arms over time, shape (T, N, N).
+
+    A dominance factor is the weight, from 0 to 1, with which one arm follows another.
 
     Args:
         energies: Energies of the N sites. Peers outside the group are left out.

@@ -110,9 +110,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def theta(self) -> Array:
-        """The arm's true parameters, which combine masses, inertias and lengths, shape (P,).
+        """True dynamic parameters of the arm, shape (P,), which the control law tries to learn.
 
-        V measures how far the estimates are from them.
+        They combine masses, inertias and lengths of the links. The stability proof measures how
+        far the learnt parameters are from the true ones.
         """
         return self.arm.theta
 
@@ -129,12 +130,14 @@ class SiteConstants(NamedTuple):
         return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the robust torque, which the law subtracts in addition to Kp r.
+        """Returns the robust torque, an extra term of the control law besides its damping Kp r.
 
-        It limits the effect of disturbances that the adaptation cannot learn.
+        It limits the effect of disturbances that the law's adaptation cannot learn, such as
+        noise.
 
         Args:
-            r: Filtered errors of the site, shape (K, n), in rad/s.
+            r: Filtered errors, velocity errors plus a multiple of the position errors, shape
+                (K, n), in rad/s.
 
         Returns:
             Torque with the sign of r, shape (K, n), in N m.
@@ -158,7 +161,7 @@ class SiteConstants(NamedTuple):
 
     @property
     def adapts(self) -> Bools:
-        """Marks the parameters of the arm that the law estimates while it runs, shape (P,).
+        """Marks the parameters of the arm that the law learns while it runs, shape (P,).
 
         These are the parameters with a positive adaptation gain Gamma. The others keep the
         value that the scenario gives them.
@@ -167,9 +170,9 @@ class SiteConstants(NamedTuple):
 
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Collects the gains, limits and arm parameters of a site from the scenario.
+    """Collects the gains, limits and arm parameters of one arm from the scenario.
 
-    The site must use the adaptive control law, and the parameters of its arm must be known.
+    The arm must have the adaptive control law, and its parameters must be known.
 
     Args:
         scenario: The description of the experiment, which defines the gains.
@@ -263,10 +266,10 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """Functions that translate errors of the shared coordinates to the joints of the arm.
+        """Functions that convert errors between the arms to errors of this arm's joints.
 
-        Sites that follow each other with their end effectors use other functions than sites
-        that follow joint by joint.
+        Arms that follow each other with their end effectors need other functions than arms that
+        follow joint by joint.
         """
         records = self.records
         c = self.constants
@@ -513,7 +516,7 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """The energy of a site in the stability proof, split into its four parts, in J.
+    """Energy of one arm in the stability proof, split into its four parts, in J.
 
     Each part has the shape (K,) for K records. Their sum is V_i in the module's docstring.
 
@@ -532,7 +535,7 @@ class FunctionalParts(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """Energy V_i of the site in the stability proof: the sum of its parts, in J.
+        """Energy V_i of one arm in the stability proof: the sum of its parts, in J.
 
         The shape is (K,), with one entry per record.
         """
@@ -581,7 +584,8 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
 def _dot_rows(x: Array, y: Array) -> Array:
     """Returns the scalar product of two vectors in each of K rows, shape (K,).
 
-    Both arguments have the shape (K, n), or one of them (n,) if it is the same in all rows.
+    An example is the power, joint torque times joint velocity. Both arguments have the shape
+    (K, n), or one of them (n,) if it is the same in all rows.
     """
     return sum_rows(x * y)
 
@@ -651,7 +655,7 @@ def _trapezoid(
 
 
 def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) -> Increment:
-    """Integrates a power that is known at every record, shape (K,), over every tick period.
+    """Integrates a power over each control period (tick), to obtain the energy in the period.
 
     Args:
         site: Motion of the site, with K records.
@@ -664,7 +668,9 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
 
 
 def _jump_alone(amount: Array) -> Increment:
-    """Returns an energy that changes only by jumps, when a new sample comes into use.
+    """Describes an energy that is constant between ticks, and changes only by jumps.
+
+    Such a jump occurs when a new message of another arm comes into use.
 
     Args:
         amount: The jump at the end of each period, shape (K - 1,), in J.
@@ -996,7 +1002,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
-        """Returns the power at given motions, shape (rows,), in W."""
+        """Returns the power of the friction that the law does not know, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 
@@ -1054,7 +1060,9 @@ def _singular_pose_power(
 ) -> Array:
     """Returns the power of the damping near singular poses, at one end of every period, in W.
 
-    `_singular_pose_work` has the equation and integrates this power, whose shape is (K - 1,).
+    In a singular pose, such as a stretched arm, the end effector cannot move in every
+    direction. `_singular_pose_work` has the equation and integrates this power, whose shape is
+    (K - 1,).
 
     Args:
         site: Motion of the site.
@@ -1078,8 +1086,8 @@ def _singular_pose_power(
 def measure_torque_error(site: SiteMotion) -> Array:
     """Computes how much the recorded torques differ from those that the control law demands.
 
-    The law is evaluated from the recorded motion, within its limits. A large error means that
-    the site ran another law than the scenario states.
+    The law is evaluated again from the recorded motion. A large error means that the log was
+    changed, or that the arm ran another law than the scenario states.
 
     Args:
         site: Motion of the site, with K records.
@@ -1193,9 +1201,10 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
-    """Evaluates the control law at the end of every period, before the error e jumps.
+    """Evaluates the control law at the end of every control period, before its error jumps.
 
-    The records contain only the values after the jump, which the next sample of a peer causes.
+    The error e jumps when the next message of another arm comes into use. Records contain only
+    the values after the jump.
 
     Returns:
         Torque of the law, Eq. (13), within its limit, shape (K - 1, n), in N m.

@@ -71,9 +71,9 @@ class ObservedFinding(StrEnum):
 
 
 class _EnergyCurve(NamedTuple):
-    """An energy over time, of a kind that a control law declares.
+    """One kind of energy over time that a control law declares, such as a stored energy.
 
-    Some laws store energy, or keep account of the energy on the way between sites.
+    Some laws also keep account of the energy that is on its way to another arm.
 
     Attributes:
         kind: "line" for the energy on the way from a peer to the site, "known" for the part of
@@ -111,7 +111,10 @@ class _EnergyCurve(NamedTuple):
 
 
 class _LeastEnergy(NamedTuple):
-    """The minimum over time of an energy that must not be below zero.
+    """Smallest value over time of an energy that must never be negative.
+
+    An example is the level of an energy tank, from which a control law takes the energy that it
+    adds.
 
     Attributes:
         name: Name of the energy's curve.
@@ -125,10 +128,11 @@ class _LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Judgement of a run by the energies that its control laws declare.
+    """Judgement of a run by the energies that its control laws declare, such as an energy tank.
 
-    `ObservedEnergy.of_log` computes it, and compares the energies with recorded torques and
-    motion.
+    `ObservedEnergy.of_log` computes the declared energies, and compares them with recorded
+    torques and motion. A law that never gives back more energy than it took supports the
+    stability of the run.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
@@ -167,7 +171,11 @@ class ObservedEnergy(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, *, own_laws: bool = False) -> "ObservedEnergy | None":
-        """Checks the energies that the control laws of a log declare against the motion.
+        """Checks the energies that control laws declare against recorded torques and motion.
+
+        A control law may state how much energy it stores. This check shows whether the
+        statement is true, and whether the law produced energy, which can make the arms
+        unstable.
 
         Args:
             log: The log of the run.
@@ -206,9 +214,9 @@ class ObservedEnergy(NamedTuple):
 
 
 class _SiteBooks(NamedTuple):
-    """The energies that a law declares at its ticks, and those that the records show.
+    """Energies that a control law declares, next to those that follow from the records.
 
-    Arrays have the shape (K,) and are in J. They start at the first tick of the site.
+    Arrays have the shape (K,) and are in J. They start at the first tick (control period).
 
     Attributes:
         t_s: Times of the ticks, in s.
@@ -228,7 +236,10 @@ class _SiteBooks(NamedTuple):
 
 
 def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that declare energies, such as the level of a tank, by site.
+    """Returns the control laws that state their stored and dissipated energy, by site.
+
+    An example is a law with an energy tank that declares the level of the tank. A site is a
+    process that controls one arm.
 
     Args:
         scenario: Scenario of the run.
@@ -250,7 +261,7 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
-    """Computes the energies that a site's law declares, and the same energies from the records.
+    """Computes the energies that a control law declares, and the same energies from records.
 
     A law that is wrong may declare energies that did not flow. The comparison reveals this.
 
@@ -313,9 +324,9 @@ def _read_law_records(
     law: Any,
     count: int,
 ) -> LawRecords:
-    """Collects the records of a site in the form in which its law reads them.
+    """Collects the recorded data of one arm in the form that its control law requires.
 
-    A law computes the energies that it declares from these records.
+    The law computes from these data the energies that it declares, such as its stored energy.
 
     Args:
         log: The log of the run.
@@ -343,13 +354,18 @@ def _read_law_memory(
     law: Any,
     count: int,
 ) -> dict[str, Array]:
-    """Returns the values that a law stores from tick to tick, by the attribute of the law.
+    """Returns the recorded values that a control law keeps from one tick to the next.
+
+    An integral of the error is such a value. A tick is a period of the control loop.
 
     Args:
         log: The log of the run.
-        site: Name of the site.
-        law: The law, which lists these attributes in `remembers`.
-        count: Number of records, from the first one on.
+        site: Name of the site, the process that controls the arm.
+        law: The law. Its attribute `remembers` lists the names of these values.
+        count: Number of records to read, from the first one on.
+
+    Returns:
+        For each name, the values in these records.
     """
     site_log = log[site]
     rule = log.scenario.sites[site].on_stale.rule
@@ -375,9 +391,10 @@ def _read_peer_records(
     sent: Mapping[str, Array],
     count: int,
 ) -> PeerRecords:
-    """Returns the values that a law received from a peer, and those sent to this peer alone.
+    """Returns the recorded values that a control law exchanged with one other arm.
 
-    A key such as `wave[s]` is a value for site s alone.
+    They are the values that the law received from this arm, and those that it sent to this arm
+    alone. A key such as `wave[s]` is a value for arm s alone.
 
     Args:
         log: The log of the run.
@@ -407,7 +424,7 @@ def _read_peer_records(
 
 
 def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
-    """Yields the energies over time that a passive law never lets fall below zero.
+    """Yields the energies over time that a passive control law never lets fall below zero.
 
     They are the energy on the way between two arms (line), the part of it that the receiver
     knows, stored energy, and the energy that a law dissipated.
@@ -453,7 +470,10 @@ def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_Ener
 
 
 def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Judges the declared energies of all sites: contradictory, below zero, or passive.
+    """Judges the energies that control laws declare: contradictory, below zero, or passive.
+
+    A control law may state how much energy it stores and dissipates. It is passive if it never
+    gives back more energy than it received, which is a sign of stability.
 
     Args:
         log: The log of the run.
@@ -515,10 +535,9 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
 
 
 def _largest_residual_j(account: _SiteBooks) -> float:
-    """Returns the largest error over time in the energies that a law declares, in J.
+    """Returns the largest error in the energies that a control law declares, in J.
 
-    The error is the difference between the energy that the law dissipated and the sum of its
-    other energies.
+    The energies must add up: the dissipated energy equals the sum of the others.
     """
     return float(np.abs(account.residual).max())
 

@@ -37,14 +37,14 @@ class FunctionalObstacle(Enum):
 
 
 class MissingFunctional(NamedTuple):
-    """Sites whose arms have no energy function V, all of them for the same reason.
+    """Arms for which no energy function V exists, all for one reason.
 
-    A site is the process that runs one arm.
+    The stability proof needs V, an energy that never rises. Some control laws have none.
 
     Attributes:
         obstacle: The reason.
         law: Tag of the control law, if the law is the reason. Otherwise empty.
-        sites: Names of the sites.
+        sites: Names of the sites, the processes that each control one arm.
     """
 
     obstacle: FunctionalObstacle
@@ -53,9 +53,9 @@ class MissingFunctional(NamedTuple):
 
 
 class LawQuantities(NamedTuple):
-    """Evidence for the condition that every control law is one for which V exists.
+    """Evidence on whether the energy function V exists for the control law of every arm.
 
-    V, the energy function of the stability proof, exists for adaptive laws only.
+    V, the energy of the stability proof, exists for adaptive laws only.
 
     Attributes:
         missing: Sites without V, grouped by the reason. The premise holds if there are none.
@@ -80,11 +80,12 @@ class ParameterFault(Enum):
 
 
 class ParameterQuantities(NamedTuple):
-    """Evidence for the premise that the adaptive laws can learn the parameters of their arms.
+    """Evidence on whether adaptive control laws can learn the parameters of their arms.
+
+    The stability theorem requires that the model of the law contains every load of the arm.
 
     Attributes:
-        faults: Name of the site and reason, for each fault. The premise holds if there are
-            none.
+        faults: Name of the site and reason, for each fault. Empty if the condition holds.
     """
 
     faults: tuple[tuple[str, ParameterFault], ...]
@@ -108,10 +109,10 @@ class GainQuantities(NamedTuple):
 
 
 class WallQuantities(NamedTuple):
-    """Evidence for the premise that simulated walls generate no energy.
+    """Evidence on whether simulated walls generate no energy, as the theorem requires.
 
-    A wall whose force is computed once per tick generates energy. The damping of the arm may
-    remove more than that.
+    A wall whose force is computed once per tick (control period) generates energy. The damping
+    of the arm may remove more than that.
 
     Attributes:
         walls: The walls that were touched, with their energies and dampings.
@@ -132,9 +133,10 @@ class WallQuantities(NamedTuple):
 
 
 class DominanceQuantities(NamedTuple):
-    """Evidence for the premise that the dominance factors are constant and give weights for V.
+    """Evidence on whether the dominance factors are constant and determine weights for V.
 
-    A dominance factor is the weight with which a site follows a peer.
+    A dominance factor is the weight with which an arm follows another one. The stability
+    theorem requires both. V is its energy function.
 
     Attributes:
         changing: Sites whose dominance factors change.
@@ -153,7 +155,7 @@ class DominanceQuantities(NamedTuple):
 
 
 class AgeRange(NamedTuple):
-    """Range of the ages of the states that one site uses of another one.
+    """Smallest and largest age of the states of another arm that a control loop used.
 
     The age is the time since the state was sent: the delay that the control law experiences.
 
@@ -171,10 +173,12 @@ class AgeRange(NamedTuple):
 
 
 class DelayQuantities(NamedTuple):
-    """Evidence for the condition that the delay of every network link is constant.
+    """Evidence on whether the delay of every network link was constant.
+
+    The stability theorem requires this, because a varying delay can add energy to the arms.
 
     Attributes:
-        varying: Ages on the links whose delay varies. The premise holds if there are none.
+        varying: Ages on the links whose delay varies. Empty if the condition holds.
         constant_s: Delay of each of the other links that delivered a sample, in s.
     """
 
@@ -183,10 +187,13 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """Interval of time in which a site did not follow its peers, as the theorem requires it to.
+    """Interval of time in which an arm did not follow the other arms.
+
+    The stability theorem requires that all arms follow during the whole run. An arm stops
+    following, for example, when no messages arrive and it holds its position.
 
     Attributes:
-        site: Name of the site.
+        site: Name of the site, the process that controls the arm.
         from_s: Start, in s.
         to_s: End, in s.
     """
@@ -197,7 +204,9 @@ class Interruption(NamedTuple):
 
 
 class FollowingQuantities(NamedTuple):
-    """Evidence for the premise that every site follows its peers during the whole run.
+    """Evidence on whether every arm followed the other arms during the whole run.
+
+    The stability theorem requires this. It does not cover an arm that was held or stopped.
 
     Attributes:
         interruptions: Times at which sites held, braked, returned or had stopped.
@@ -212,10 +221,12 @@ class FollowingQuantities(NamedTuple):
 
 
 class CutTorque(NamedTuple):
-    """A site whose motors could not deliver the torque that its control law demanded.
+    """Finding that motors could not deliver the torque that the control law demanded.
+
+    The stability theorem then does not apply, because it assumes motors without a limit.
 
     Attributes:
-        site: Name of the site.
+        site: Name of the site, the process that controls the arm.
         joints: Names of the joints concerned. Empty if the joints have no names.
         ticks: Number of ticks in which a torque was cut off at its limit.
     """
@@ -226,10 +237,9 @@ class CutTorque(NamedTuple):
 
 
 class TorqueQuantities(NamedTuple):
-    """Evidence for the premise that every arm received the whole torque of its control law.
+    """Evidence on whether every motor delivered the torque that its control law demanded.
 
-    An actuator cuts off a torque above its limit. The arm then receives another torque than the
-    proof assumes.
+    A motor cuts off a torque above its limit. The stability theorem assumes that it does not.
 
     Attributes:
         cut: Sites whose torque was cut off. The premise holds if there are none.
@@ -239,10 +249,12 @@ class TorqueQuantities(NamedTuple):
 
 
 class TouchedStop(NamedTuple):
-    """A site whose arm reached the mechanical end stops of its joints.
+    """Finding that an arm reached the mechanical end stops of its joints.
+
+    The stability theorem then does not apply, because its model of the arm has no end stops.
 
     Attributes:
-        site: Name of the site.
+        site: Name of the site, the process that controls the arm.
         joints: Names of the joints that touched. Empty if the joints have no names.
         from_s: Time of the first contact, in s.
     """
@@ -253,10 +265,12 @@ class TouchedStop(NamedTuple):
 
 
 class StopQuantities(NamedTuple):
-    """Evidence for the condition that no joint touched its mechanical end stops.
+    """Evidence on whether any joint touched its mechanical end stops.
+
+    The stability theorem requires that none did, because its model has no end stops.
 
     Attributes:
-        touched: Sites whose arms touched their stops. The premise holds if there are none.
+        touched: Sites whose arms touched their stops. Empty if the condition holds.
     """
 
     touched: tuple[TouchedStop, ...]
@@ -277,10 +291,10 @@ class AxisQuantities(NamedTuple):
 
 
 class SingularPoseQuantities(NamedTuple):
-    """Evidence for the premise that no arm came near a singular pose.
+    """Evidence on whether any arm came near a singular pose, such as a stretched arm.
 
-    In such a pose the end effector cannot move in every direction, however fast the joints
-    turn.
+    The end effector cannot move in every direction there, however fast the joints turn. The
+    stability theorem does not cover such poses.
 
     Attributes:
         near_s: Time from which the arm of a site was near a singular pose, in s, by site.
@@ -293,7 +307,9 @@ class SingularPoseQuantities(NamedTuple):
 
 
 class Supply(NamedTuple):
-    """Energy that operators and environments supplied, and how long nobody pushed at the end.
+    """Energy that users and walls supplied to the arms, and how long nobody pushed at the end.
+
+    The stability theorem assumes that they do not supply energy without limit.
 
     Attributes:
         sources: Names of the sources.
@@ -332,9 +348,9 @@ class OperatorQuantities(NamedTuple):
 
 
 class RecordQuantities(NamedTuple):
-    """Evidence for the premise that no records are missing.
+    """Evidence on whether the log has a record of every control period of every arm.
 
-    V cannot be computed where records are missing.
+    The energy function V of the stability proof cannot be computed where records are missing.
 
     Attributes:
         unjudged_s: Spans (start, end) in which records are missing although all sites were
@@ -363,10 +379,7 @@ class AbsentSpan(NamedTuple):
 
 
 class PresentStretch(NamedTuple):
-    """Interval of time between two absences, in which all sites were present.
-
-    The stability theorem can apply only from the time in the interval at which all sites follow
-    again.
+    """Interval of time between two absences, in which the processes of all arms were present.
 
     Attributes:
         from_s: Start, in s.
@@ -383,9 +396,10 @@ class PresentStretch(NamedTuple):
 
 
 class PresenceQuantities(NamedTuple):
-    """Evidence for the premise that all sites are present during the whole run.
+    """Evidence on whether the processes of all arms are present during the whole run.
 
-    A site may leave a session and return. The theorem then applies to each stretch between.
+    A process may leave a session and return. The stability theorem then applies to each
+    interval between.
 
     Attributes:
         absent: Spans of time during which sites were absent.
@@ -397,10 +411,10 @@ class PresenceQuantities(NamedTuple):
 
 
 class BooksQuantities(NamedTuple):
-    """Evidence for the condition that the energies which control laws declare are right.
+    """Evidence on whether the energies that control laws declare are correct.
 
-    The declared energies are compared with those that follow from recorded torques and
-    velocities.
+    A control law may state how much energy it stores. The statement is compared with the energy
+    that follows from recorded torques and velocities.
 
     Attributes:
         site: Site whose law has the largest error.
@@ -466,7 +480,10 @@ PremiseQuantities = (
 
 
 class Premise(NamedTuple):
-    """A condition of the stability theorem, and whether a run meets it.
+    """A condition of the stability theorem, with the result of checking it for one run.
+
+    An example is that all network delays are constant. If a condition is not met, the theorem
+    says nothing about the run.
 
     Attributes:
         name: Key of the premise, as in "delays".
@@ -481,9 +498,10 @@ class Premise(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What the log shows about the premise, as a sentence for people.
+        """A sentence that says what the log shows about the condition, for the user.
 
-        The package `presentation` composes it from the quantities.
+        For constant delays, it names for example the links whose delays varied. The package
+        `presentation` composes it from the numbers in `quantities`.
         """
         return str(find_hook("describe a premise")(self.quantities))
 

@@ -138,9 +138,10 @@ def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
 
 
 class FunctionalFacts(NamedTuple):
-    """What a log shows about the energy function V of its run.
+    """Quantities of a run that the checks of the stability theorem's conditions read.
 
-    `gather_facts` computes this object, and the checks of the premises read it.
+    They include V, the energy function of the stability proof, and the gaps in the log.
+    `gather_facts` computes this object once for all checks.
 
     Attributes:
         log: The log of the run.
@@ -165,7 +166,7 @@ class FunctionalFacts(NamedTuple):
 
 
 class _RunFacts(NamedTuple):
-    """Everything from a log that is needed to check the conditions of the stability theorem.
+    """Quantities of a run that are needed to check the conditions of the stability theorem.
 
     The theorem says that an energy function V of all arms does not rise by itself.
 
@@ -432,7 +433,7 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
 
 
 def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
-    """Returns the names of affected joints.
+    """Returns the names of the joints that an effect, such as a torque limit, concerned.
 
     Args:
         run: Facts of the run.
@@ -583,9 +584,10 @@ def _check_operators(run: FunctionalFacts) -> Premise:
 
 
 def _check_records(run: FunctionalFacts) -> Premise:
-    """Checks that no records are missing while all sites were present.
+    """Checks that the log has all records of all arms while their processes were present.
 
-    Missing records leave the premise undecided, because V is unknown there.
+    Missing records leave the condition undecided, because the energy function V of the
+    stability proof is unknown there.
     """
     quantities = RecordQuantities(
         unjudged_s=tuple(run.unjudged),
@@ -668,10 +670,10 @@ FUNCTIONAL_CHECKS = (
 def _examine_stretch(
     energies: Mapping[str, SiteEnergy], from_s: float, to_s: float
 ) -> PresentStretch:
-    """Finds from when on all sites follow in a span without absences, and which delays vary.
+    """Finds from when on all arms followed each other in an interval, and which delays varied.
 
-    The stability theorem applies to such a span if all sites follow their peers with constant
-    delays.
+    The stability theorem applies if all arms follow with constant delays. During the interval,
+    no process was absent.
 
     Args:
         energies: Energies of every site.
@@ -724,7 +726,7 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
 
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
-    """Collects how complete the records of a run are, and whether its log is unchanged.
+    """Collects how complete the records of a run are, and whether its log was changed.
 
     A run of which too little is known is not called stable, see `Evidence.reasons`.
 

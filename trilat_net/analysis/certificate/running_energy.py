@@ -65,10 +65,10 @@ _RAMP_MARGIN_S = 1.0
 
 
 class RecordWindow:
-    """The newest records of one site during a session, in arrays of fixed size.
+    """The newest records of one arm during a session, in arrays of fixed size.
 
-    When a record arrives, the oldest one is overwritten. The energy function of a running
-    session is computed from these records.
+    When a record arrives, the oldest one is overwritten, so that a long session needs bounded
+    memory. The energy function of the session is computed from these records.
 
     Args:
         scenario: The description of the experiment.
@@ -121,7 +121,9 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores a record at the row of its tick. Records may arrive in any order.
+        """Stores the record of one control period at the row of its number.
+
+        Records come over the network, and may therefore arrive in any order.
 
         Args:
             record: The record.
@@ -174,7 +176,7 @@ class RecordWindow:
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """Returns True if the record of a tick has arrived, and is still in the window.
+        """Returns True if the record of a control period (tick) has arrived and is stored.
 
         Args:
             tick: Number of the tick, a period of the control loop.
@@ -184,7 +186,7 @@ class RecordWindow:
         return bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of a span of ticks as arrays, as the energy terms need them.
+        """Returns the records of a range of ticks (control periods) as arrays.
 
         Missing records are interpolated, and marked.
 
@@ -256,10 +258,10 @@ class EnergyCourse(NamedTuple):
 
 
 class RunningEnergy:
-    """Computes the energy function V of the stability proof while a session runs.
+    """Computes the energy function V of the stability proof while a session is running.
 
-    V is computed for one span of time after the other, as soon as all records of a span have
-    arrived.
+    A rise of V warns the user early of instability. V is computed for one span of time after
+    the other, as soon as all records of a span have arrived.
 
     Args:
         scenario: The description of the experiment.
@@ -305,8 +307,8 @@ class RunningEnergy:
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Computes the energy V of all arms since the last call, if all records have arrived.
 
-        A site is the process that runs one arm. V is the energy function of the stability
-        proof.
+        V is the energy function of the stability proof. The result shows during a session
+        whether V rises.
 
         Args:
             complete: For every site, the number of the last tick for which nothing is missing
@@ -338,10 +340,10 @@ class RunningEnergy:
         return self._compute_span(begin_s, end_s)
 
     def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns V over a span of time, or None if V is not known there.
+        """Returns the energy function V over a span of time. None if V is not known there.
 
-        It also forgets changes of the dominance factors that ended long before the span, so
-        that a long session needs bounded memory.
+        Changes of the dominance factors that ended long before the span are removed, so that a
+        long session needs bounded memory.
 
         Args:
             begin_s: Start of the span, in s.

@@ -88,7 +88,10 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 @dataclass(frozen=True, repr=False)
 class Certificate(Result):
-    """Stability certificate of a recorded run, created by `certify`.
+    """Judgement whether a recorded run was stable, with every reason. `certify` creates it.
+
+    It combines several kinds of evidence: the energy function V of the stability proof, the end
+    of the motion, the roots of the linearised loop, and repeated runs with a small push.
 
     Attributes:
         premises: The conditions of the stability theorem, each checked.
@@ -186,8 +189,8 @@ class Certificate(Result):
     def _doubts(self) -> tuple[str, ...]:
         """Sentences on findings that contradict a stable run. Empty if there are none.
 
-        Such findings are a rise of V, declared energies that are wrong or negative, and a
-        damaged or incomplete log.
+        Such findings are a rise of the energy function V, declared energies that are wrong or
+        negative, and a damaged or incomplete log.
         """
         doubts = []
         if self.verdict.finding is StabilityFinding.BROKEN:
@@ -201,7 +204,7 @@ class Certificate(Result):
 
     @cached_property
     def decision(self) -> StabilityDecision:
-        """The decision whether the run is stable, what it rests on, and the reasons against it.
+        """The decision whether the run is stable, with its evidence and the reasons against it.
 
         It combines the motion at the end, the repetitions with small pushes, the characteristic
         roots, the proofs and the doubts, by the rules of `stability_decision`. It is computed
@@ -219,19 +222,18 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on everything that prevents a stable judgement or refutes it.
+        """Sentences on everything that speaks against calling the run stable.
 
-        They concern the end of the run, V, the roots at the end pose, the energies that control
-        laws declare, and the completeness of the log. Empty for a stable run.
+        They concern the end of the run, the energy V, the roots at the end pose, the energies
+        that control laws declare, and the completeness of the log. Empty for a stable run.
         """
         return self.decision.reasons
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run as a whole: stable, settled, not stable, or open.
+        """The judgement of the run in one word: stable, settled, not stable, or open.
 
-        `stability_decision` explains how the findings of the certificate lead to this
-        judgement.
+        `stability_decision` explains how the findings lead to this judgement.
         """
         return self.decision.stability
 
@@ -239,7 +241,8 @@ class Certificate(Result):
     def passed(self) -> bool:
         """True if the run is judged stable, in the strict sense.
 
-        A run that merely settled has not passed. `accepts` is less strict.
+        A run that merely settled, so that its motion became slow, has not passed. `accepts` is
+        less strict.
         """
         return self.accepts(())
 
@@ -252,10 +255,10 @@ class Certificate(Result):
         return str(find_hook("head a certificate")(self))
 
     def to_dict(self) -> JsonObject:
-        """Returns the certificate as plain values, with the keys of `trilat certify --json`.
+        """Converts the certificate to plain values, as `trilat certify --json` prints them.
 
         docs/reference/json.md explains the most important keys. The entry "functional" is None
-        if V cannot be computed.
+        if the energy function V cannot be computed.
         """
         verdict = self.verdict
         end = self.end
@@ -291,7 +294,7 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the premises of the stability theorem as a table, with a row for each.
+        """Returns the conditions (premises) of the stability theorem as rows of a table.
 
         A row has the keys "name", "holds" and "text", from which `to_frame` makes a data frame.
         """
@@ -300,7 +303,8 @@ class Certificate(Result):
     def accepts(self, accepted: Collection[str]) -> bool:
         """Returns True if the run is stable, or has another judgement that the user accepts.
 
-        A run with a broken energy balance or a changed log is never accepted.
+        For example, a user may accept "settled". A run with a broken energy balance or a
+        changed log is never accepted.
 
         Args:
             accepted: Further judgements to accept: "settled" for a run that slowed down and
@@ -327,7 +331,7 @@ def certify(
     min_coverage: float = MIN_COVERAGE,
     own_laws: bool = False,
 ) -> Certificate:
-    """Issues the stability certificate of a recorded run.
+    """Judges from a log whether a run was stable, and collects every reason.
 
     The log may be incomplete or empty. The run is not repeated with small disturbances, and the
     characteristic roots of its linearised loop are not computed. These checks can be added
@@ -463,10 +467,10 @@ def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> Stability
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns the verdict of a run whose V can be judged.
+    """Judges a run by its energy function V: whether V rose, and whether the theorem applies.
 
-    The verdict depends on whether V rose beyond the supplied energy, and on whether the
-    premises of the theorem hold.
+    V must not rise beyond the supplied energy. The stability theorem applies if its premises
+    (conditions) hold.
     """
     balance = run.balance
     # Energies that are rounding errors are written as zero.
@@ -507,9 +511,10 @@ They decide whether the records are false, whether V can be judged, and whether 
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
-    """Finds the largest rise of V above an earlier minimum, and the sources of its energy.
+    """Finds the largest rise of the energy function V above an earlier minimum.
 
-    The work of operators and environments is subtracted from V before.
+    The work of operators and environments is subtracted before, because V may rise by it. The
+    sources of the remaining energy are also found.
 
     Args:
         balance: Energy balance of all sites.
@@ -585,7 +590,7 @@ def find_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[Uns
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
-    """Returns the part of the JSON output about V, as plain values.
+    """Converts the results about the energy function V to plain values for JSON output.
 
     Args:
         certificate: The certificate.

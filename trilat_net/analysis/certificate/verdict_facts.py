@@ -22,7 +22,7 @@ from .premise_quantities import MissingFunctional, PremiseQuantities
 class StabilityFinding(Enum):
     """Possible results of examining V, the energy function of the stability proof, over a run.
 
-    The names of the members, in small letters, are the values of `verdict` in the JSON output.
+    JSON output has the names of the members, in small letters, as values of `verdict`.
     """
 
     COVERED = auto()
@@ -38,10 +38,10 @@ class StabilityFinding(Enum):
 
 
 class FunctionalRise(NamedTuple):
-    """Largest rise of the energy function V that nobody supplied from outside.
+    """Largest rise of the energy function V by energy that nobody supplied from outside.
 
-    The work of operators and environments is subtracted from V, the total energy of the arms in
-    the stability proof. What remains must not rise by itself.
+    V is the total energy of the arms in the stability proof. The work of operators and walls is
+    subtracted from it. What remains must not rise.
 
     Attributes:
         from_s: Time of the minimum of V before the rise, in s.
@@ -58,9 +58,9 @@ class FunctionalRise(NamedTuple):
 
 
 class UnsuppliedGrowth(NamedTuple):
-    """Finding that V grew at the end of a run by energy that nobody supplied from outside.
+    """Finding that the energy function V grew at the end of a run without supplied energy.
 
-    V is the energy function of the stability proof, which must not rise by itself.
+    V belongs to the stability proof, and must not rise unless an operator or wall does work.
 
     Attributes:
         energy_j: Size of the growth, in J.
@@ -84,9 +84,9 @@ class NoFunctional(NamedTuple):
 
 
 class RecordGap(Enum):
-    """Reason why the energy function V cannot be computed although it exists.
+    """Finding that the energy function V of a run cannot be computed, as records are missing.
 
-    Each reason is that records of the run are missing.
+    V, the energy of the stability proof, exists for the control laws of this run.
     """
 
     NO_COMMON_TIME = auto()
@@ -120,10 +120,12 @@ class UnclosedBalance(NamedTuple):
 
 
 class WrongTorque(NamedTuple):
-    """Finding that the recorded torques of an arm are not those of its control law, Eq. (13).
+    """Finding that recorded torques of an arm do not follow from its control law, Eq. (13).
+
+    The log is then not consistent, for example because it was changed or the law is another.
 
     Attributes:
-        site: Name of the site.
+        site: Name of the site, the process that controls the arm.
         from_s: Time from which they differ, in s.
         error_nm: Largest difference, in N m.
     """
@@ -147,7 +149,9 @@ class AmbiguousWeights(NamedTuple):
 
 
 class CoarseEnergies(NamedTuple):
-    """Finding that the energies are not known precisely enough to decide whether V rose.
+    """Finding that numerical errors of the energies are too large to decide whether V rose.
+
+    V is the energy function of the stability proof, which must never rise.
 
     Attributes:
         tolerance_j: Size that a rise must exceed to count, in J.
@@ -159,7 +163,9 @@ class CoarseEnergies(NamedTuple):
 
 
 class FunctionalCourse(NamedTuple):
-    """The energy function V over a run in which it can be judged: its values and largest rise.
+    """The energy function V during a run: first, last and largest value, and largest rise.
+
+    V is the energy of the stability proof. It must never rise by energy that nobody supplied.
 
     Attributes:
         failed: Names of the premises that fail. The theorem does not apply if there are any.
@@ -197,7 +203,10 @@ VerdictFacts = (
 
 
 class StabilityVerdict(NamedTuple):
-    """What V, the energy function of the stability proof, shows about a run, and the numbers.
+    """Result of the energy test of a run: whether the energy function V rose, and by how much.
+
+    V belongs to the stability proof. If it rises by energy that nobody supplied, the proof does
+    not hold for the run.
 
     Attributes:
         finding: The finding, such as that V never rose.
@@ -213,15 +222,17 @@ class StabilityVerdict(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The finding as a sentence for people, which the package `presentation` writes."""
+        """The finding as a sentence for the user, such as that V never rose.
+
+        The package `presentation` writes it. V is the energy function of the stability proof.
+        """
         return str(find_hook("describe a verdict")(self))
 
 
 class Evidence(NamedTuple):
     """The records on which a stability certificate is based, and whether they suffice.
 
-    A site is the process that runs one arm, and stores a record in every tick of its control
-    loop.
+    A site, the process that runs one arm, stores a record in every tick (control period).
 
     Attributes:
         coverage: Recorded ticks and expected ticks of every site.
@@ -242,10 +253,10 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Sentences that say why the records do not suffice to judge the run.
+        """Sentences that say why the log does not suffice to call the run stable.
 
-        Examples are a log that was changed after the run, or too many missing records. A run
-        with such a reason is not called stable. Empty if the records suffice.
+        Examples are a log that was changed after the run, or too many missing records. Empty if
+        the records suffice.
         """
         return list(find_hook("doubt evidence")(self))
 

@@ -57,7 +57,9 @@ METRICS_JSON_VERSION = 1
 
 @dataclass(frozen=True, repr=False)
 class LogMetrics(Result):
-    """All metrics of a log, computed by `compute_log_metrics`.
+    """All metrics of a run, such as the largest error of each arm and the delay of each link.
+
+    A metric is a number with a name and a unit. `compute_log_metrics` computes all metrics.
 
     Attributes:
         log: Name of the file of the log.
@@ -178,9 +180,9 @@ class LogMetrics(Result):
         }
 
     def _list_reasons(self) -> dict[str, str]:
-        """Returns the reason for each missing number, by the path of the number in the JSON.
+        """Returns the reason why each missing number is missing, by its path in the JSON.
 
-        A missing number is null in the JSON, which does not tell why it is missing.
+        The number itself is null in the JSON.
         """
         metrics_by_path = {"run.": self.run}
         for kind, metrics_by_name in self._subjects.items():
@@ -222,9 +224,9 @@ class LogMetrics(Result):
                 yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns the metrics of one quantity for every subject that has it, by name.
+        """Returns the values of one metric for every subject that has it, by the subject.
 
-        A subject is a site, a link or a wall, or the whole run, whose name is empty.
+        A subject is an arm, a network link or a wall, or the whole run, whose name is empty.
 
         Args:
             quantity: The quantity.
@@ -236,9 +238,9 @@ class LogMetrics(Result):
         return {name: metrics[key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
-        """Returns one number of a quantity for the whole run.
+        """Returns one number of a metric for the whole run, such as the largest of all errors.
 
-        The numbers of sites, links or walls are reduced to their maximum or sum, see
+        Numbers of arms, network links or walls are reduced to their maximum or sum, see
         `_reduce_to_run`.
 
         Args:
@@ -285,10 +287,10 @@ def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) 
 # overflow and NaN do not warn: a metric that is not finite becomes a reason
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def compute_log_metrics(log: Log) -> LogMetrics:
-    """Computes all metrics of a recorded run.
+    """Computes all metrics of a recorded run, such as the largest error of each arm.
 
-    The log may be torn, short or empty. A number that it does not determine is replaced by the
-    reason.
+    The log may be torn, short or empty. A number that the log does not determine is replaced by
+    the reason.
 
     Args:
         log: The log of the run.
@@ -340,7 +342,9 @@ def _find_common_joint_names(scenario: Scenario) -> tuple[str, ...]:
 def _measure_subjects(
     view: RunView, selected_measures: Iterable[Measure]
 ) -> dict[str, _SubjectValues]:
-    """Computes metrics for the run and for all of its sites, links and walls.
+    """Computes the selected metrics for the run and for each of its arms, links and walls.
+
+    A metric is a number with a name and a unit, such as the largest error in rad.
 
     Args:
         view: The run.
@@ -362,10 +366,13 @@ def _measure_subjects(
 
 
 def find_quantity(key: str) -> Quantity:
-    """Returns the definition of the quantity with a key such as "rms_error_rad".
+    """Returns name, unit and meaning of the metric with a key such as "rms_error_rad".
+
+    Args:
+        key: Key of the metric, under which JSON output and tables contain it.
 
     Raises:
-        KeyError: No quantity has this key. The message names the most similar key.
+        KeyError: No metric has this key. The message names the most similar key.
     """
     known = {quantity.key: quantity for quantity in quantities()}
     if key not in known:

@@ -60,9 +60,10 @@ NO_SCRIPT_TEXT = "the scenario does not contain the hand's intention: the drive 
 
 
 class FrequencyResponse(NamedTuple):
-    """Ratio of an output to an input at one frequency, estimated from a recorded run.
+    """Ratio of two recorded signals at one frequency, such as torque over velocity.
 
-    Both signals are caused by a known drive. Values that the log does not determine are None.
+    Both signals are caused by a known drive, the motion of an operator. Values that the log
+    does not determine are None.
 
     Attributes:
         frequency_hz: Frequency of the spectral line, in Hz.
@@ -146,7 +147,10 @@ def estimate_responses(
 
 
 def _find_segments(usable: Bools, length: int) -> list[int]:
-    """Returns the first rows of all segments without an unusable row. They overlap by half.
+    """Divides records into segments for a spectrum, and returns their first rows.
+
+    Welch's method averages over segments that overlap by half. A segment with an unusable row
+    is left out.
 
     Args:
         usable: True for usable rows, shape (K,).
@@ -168,7 +172,9 @@ def _estimate_at_line(
     X: Complex,
     Y: Complex,
 ) -> FrequencyResponse:
-    """Returns the ratio of Y to X at one frequency, from the spectra of the segments.
+    """Estimates the ratio of two signals at one frequency, for example torque to velocity.
+
+    The spectra of several segments are averaged, which reduces the effect of noise.
 
     Args:
         frequency_hz: The frequency.
@@ -222,9 +228,10 @@ def _estimate_at_line(
 
 
 def _compute_coherence(D: Complex, X: Complex) -> float:
-    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals.
+    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals, from 0 to 1.
 
-    It is 0 if one of the signals vanishes.
+    A value near 1 means that one signal explains the other. Measurements with a low coherence
+    are not reliable. The coherence is 0 if one of the signals vanishes.
     """
     S_dd = np.vdot(D, D).real
     S_xx = np.vdot(X, X).real
@@ -259,7 +266,10 @@ def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
 
 
 class ImpedanceEstimate(NamedTuple):
-    """What an operator feels at one joint of an arm, as a function of frequency.
+    """Measured impedance or force reflection at one joint of an arm, over frequency.
+
+    The impedance describes how heavy, damped and stiff the arm feels to its operator. The
+    reflection describes how much of a distant force the operator feels.
 
     Attributes:
         kind: "impedance" or "reflection". An impedance is the operator's torque divided by the
@@ -282,7 +292,7 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the ratio at a joint: "N m s/rad" for an impedance (torque per velocity).
+        """Unit of the ratio: "N m s/rad" for an impedance, which is torque per velocity.
 
         Empty for a reflection, which is a ratio of two torques.
         """
@@ -290,10 +300,10 @@ class ImpedanceEstimate(NamedTuple):
 
 
 def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Estimates what each operator feels, as frequency responses of a recorded run.
+    """Estimates what each operator feels over frequency, from a recorded run.
 
     For each operator the impedance is estimated, the operator's torque over the velocity of the
-    joint. For each environment at another site the reflection is estimated, the torque that the
+    joint. For each environment at another arm the reflection is estimated, the torque that the
     operator feels over the torque of the environment.
 
     Args:
@@ -317,7 +327,9 @@ def _estimate_joints(
     site: str,
     environment: str,
 ) -> Iterator[ImpedanceEstimate]:
-    """Yields the impedance of every joint of a site, or its reflection of an environment.
+    """Yields what an operator feels at each joint of an arm, as a function of frequency.
+
+    This is the impedance of the arm, or the reflection of the environment at another arm.
 
     Args:
         runs: All sites with records.
@@ -372,7 +384,9 @@ def _find_still_rows(
     *,
     alone: bool,
 ) -> Bools | None:
-    """Finds the ticks of a site at which no operator moves, so that nothing else drives.
+    """Finds the ticks (control periods) at which no operator moves an arm by a planned signal.
+
+    Impedance is measured only there, because other operators would disturb the measurement.
 
     Args:
         runs: All sites with records.

@@ -24,7 +24,7 @@ from ..run_view import RunView
 
 
 class Metric(NamedTuple):
-    """The value of a metric for one arm, link, wall or run: a number, or why there is none.
+    """Value of one metric, such as the largest error of an arm, or the reason for having none.
 
     Attributes:
         value: The number, which is finite. None if there is none.
@@ -133,9 +133,9 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square over time of the column for which it is largest.
+    """Returns the root mean square over time of the worst column, such as the worst joint.
 
-    With a column per joint, this is the RMS value of the worst joint.
+    Each column has the values of one joint. The largest of the columns' values is returned.
 
     Args:
         values: Values of n quantities over time, shape (K, n).
@@ -152,7 +152,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of some numbers, for example the peak torque.
+    """Returns the largest absolute value of numbers, such as the peak torque: 3 for [1, -3].
 
     Args:
         values: The numbers, of any shape.
@@ -213,9 +213,9 @@ _DeclaredMeasuring = TypeVar("_DeclaredMeasuring", bound=Measuring)
 
 
 class Measure(NamedTuple):
-    """A function that measures some quantities, and how these are shown.
+    """A function that computes some metrics of a run, with the heading that tables show above.
 
-    Measures are registered with the decorator `measures`.
+    Modules of this folder register such functions with the decorator `measures`.
 
     Attributes:
         of: Kind of subject that is measured: "run", "site", "link" or "wall".
@@ -278,7 +278,7 @@ def measures(
     """
 
     def declare(measure: _DeclaredMeasuring) -> _DeclaredMeasuring:
-        """Registers a function, unless one of its quantities is registered already."""
+        """Registers a function that computes metrics. A metric may be registered only once."""
         definitions = {
             quantity.key: declared for declared in _MEASURES for quantity in declared.quantities
         }
@@ -306,7 +306,7 @@ def list_measures() -> list[Measure]:
 
 
 def quantities() -> list[Quantity]:
-    """Returns the definitions of all quantities that any function of this folder measures.
+    """Returns name, unit and meaning of all metrics of a run, such as the largest error.
 
     Tables and docs/reference/metrics.md list them in this order.
     """

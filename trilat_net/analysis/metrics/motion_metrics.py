@@ -88,10 +88,9 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     *list_shared_quantities(_ERRORS),
 )
 def _measure_tracking(view: RunView, site: str) -> MetricValues:
-    """Measures how well a site tracks its reference: settling time, RMS and peak of the error.
+    """Measures how well an arm tracks its reference: settling time, RMS and peak of the error.
 
-    The error e is the difference between the coordinates of the site and their reference, the
-    weighted mean of what its peers sent.
+    The reference is the weighted mean of the positions that the other arms sent.
 
     Args:
         view: The run.
@@ -165,7 +164,10 @@ def measure_undelayed_error(
 def _compute_undelayed_error(
     view: RunView, site: str, followed: Mapping[str, Array]
 ) -> tuple[Array, Bools]:
-    """Returns a site's distance from the weighted mean of its peers at the same time.
+    """Returns the distance of an arm from the weighted mean of the other arms at one time.
+
+    The error of the control law differs: it compares the arm with delayed poses. This distance
+    shows how far apart the arms really were.
 
     Args:
         view: The run, which has records of the site and of the followed peers.
@@ -198,9 +200,9 @@ def _compute_undelayed_error(
 
 
 def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
-    """Returns the peers that a site follows at some time, with their dominance factors.
+    """Returns the other arms that an arm follows at some time, with their dominance factors.
 
-    The factors, which are the weights of the peers, have the shape (K,) for K ticks.
+    The factors, which are the weights of these arms, have the shape (K,) for K ticks.
     """
     if site not in view.sites:
         return {}
@@ -315,7 +317,7 @@ def _measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
 )
 def _measure_effort(view: RunView, site: str) -> MetricValues:
-    """Measures how much torque a site's controller applies, and how often it is at the limit.
+    """Measures the torque that a controller applies, and how often it is at its limit.
 
     Args:
         view: The recorded run.
@@ -428,7 +430,9 @@ class _BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of the arm's dynamic parameters theta during a run, shape (P,) each.
+    """What an adaptive control law learnt about the dynamic parameters theta of an arm.
+
+    The parameters combine masses, inertias and lengths of the links. Each array has shape (P,).
 
     Attributes:
         learnt: True for each parameter that the law adapts.
@@ -448,9 +452,9 @@ class ParameterEstimates(NamedTuple):
     base: _BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
-        """Returns the parameter estimates of the arm as plain values, ready for JSON.
+        """Converts what the control law learnt about the arm to plain values for JSON.
 
-        The key "base" is left out if these values do not exist.
+        The key "base" is left out if there are no base parameters.
         """
         content = self._asdict()
         del content["base"]
@@ -462,7 +466,9 @@ class ParameterEstimates(NamedTuple):
 def _read_parameter_estimates(
     scenario: Scenario, records: AlignedRecords
 ) -> ParameterEstimates:
-    """Reads from the records what a site learnt about the dynamic parameters of its arm.
+    """Reads from the records what an adaptive control law learnt about the arm's masses.
+
+    The law estimates dynamic parameters, combinations of masses, inertias and lengths.
 
     Args:
         scenario: The description of the experiment.
@@ -505,9 +511,9 @@ def _read_parameter_estimates(
 
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Reads the parameter estimates of all sites at the start and at the end of a run.
+    """Reads what adaptive control laws learnt about their arms during a run.
 
-    They show what the adaptive laws learnt about their arms.
+    The result compares first and last estimates of masses and inertias with the true ones.
 
     Args:
         view: The run.
@@ -527,7 +533,10 @@ def _estimate_base_parameters(
     theta: list[float] | None,
     theta_hat: Array,
 ) -> _BaseEstimates:
-    """Returns the estimates of a chain in base parameters, see `_BaseEstimates`.
+    """Returns what the law of a chain of joints learnt, in base parameters of the chain.
+
+    Base parameters are the combinations of masses and inertias that the motion determines.
+    Single masses cannot be learnt from motion alone, see `_BaseEstimates`.
 
     Args:
         arm: The chain.
@@ -666,9 +675,9 @@ def _compute_parameter_energy(
     Quantity("late_samples", "late samples", "", "sum"),
 )
 def _measure_network(view: RunView, name: str) -> MetricValues:
-    """Measures a link: the effective delay, lost samples and bursts of losses.
+    """Measures a network link: the effective delay, lost messages and bursts of losses.
 
-    The effective delay is the age of the sample that the receiver uses.
+    The effective delay is the age of the other arm's state that the receiver uses.
 
     Args:
         view: The run.
@@ -704,7 +713,7 @@ def _measure_network(view: RunView, name: str) -> MetricValues:
     Quantity("missing", "missing records", "", "sum"),
 )
 def _measure_loop(view: RunView, site: str) -> MetricValues:
-    """Measures the timing of a site's control loop, and counts its missing records.
+    """Measures how punctual the control loop of an arm was, and counts its missing records.
 
     Args:
         view: The recorded run.

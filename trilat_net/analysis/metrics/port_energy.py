@@ -38,7 +38,7 @@ _NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that is constant within each tick period, in J.
+    """Returns the work of a torque that is constant within each control period, in J.
 
     The work in period k is exactly tau_k' (q_{k+1} - q_k), whatever the motion within the
     period.
@@ -57,9 +57,9 @@ def held_work(torque: Array, q: Array) -> Array:
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work in each tick period of a torque that follows the motion.
+    """Returns the work of a torque in each control period (tick), by the trapezoid rule.
 
-    The trapezoid rule is used.
+    The torque is assumed to change linearly with the joint angle between two ticks.
 
     Args:
         torque: Torque at the ticks, shape (K, n), in N m.
@@ -290,9 +290,10 @@ def _compute_delay_torque(
     alpha: Array,
     alpha_rate: Array,
 ) -> Array:
-    """Returns the torque by which a law's torque differs from its torque without delay.
+    """Returns the change of a control law's torque that is due to the network delay.
 
-    The effect of the delay on the Coulomb friction that a law compensates is left out.
+    It is the torque less the torque without delay. The effect of the delay on the Coulomb
+    friction that a law compensates is left out.
 
     Args:
         gains: Gains of the law.
@@ -340,7 +341,10 @@ def _compute_delay_torque(
 
 
 def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords) -> Array:
-    """Returns the torque that the peer reflected with delay, less its present torque.
+    """Returns the error of a fed-back torque that is due to the network delay.
+
+    A control law can feed back the external torque of another arm. This torque arrives late.
+    The error is the delayed torque minus the present one.
 
     Args:
         records: Records of a site whose law feeds back the external torque of its peer.

@@ -56,7 +56,9 @@ MIN_LOAD_SHARE = 0.02
 
 
 class _StaticWindow(NamedTuple):
-    """A window of time in which all arms rest, with means over the window for each site.
+    """Interval of time in which all arms rest, with mean torques and angles of each arm.
+
+    Stiffness and force sharing are measured in such intervals, because no inertia acts there.
 
     Attributes:
         from_s: Time of the first tick, in s.
@@ -79,10 +81,10 @@ class _StaticWindow(NamedTuple):
 
 
 def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
-    """Finds the static windows of a run, in order.
+    """Finds the windows of time in which all arms rest, in order.
 
-    A window is the last `WINDOW_S` of an interval in which all sites rest. Each interval has
-    one window at most.
+    A window is the last `WINDOW_S` of an interval in which all arms rest. Each interval has one
+    window at most.
 
     Args:
         run_view: The run.
@@ -130,7 +132,9 @@ def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
 
 
 def _find_resting_rows(run: SiteRun) -> Bools:
-    """Finds the ticks in which a site rests, while its weights and its operator do not change.
+    """Finds the ticks (control periods) at which an arm rests under constant conditions.
+
+    Neither the operator nor the weights with which the arm follows other arms may change.
 
     Args:
         run: Records and torques of the site.
@@ -159,7 +163,7 @@ def _average_window(
     rows: Mapping[str, Ints],
     t_s: Array,
 ) -> _StaticWindow:
-    """Returns the means of torques and angles over the ticks of a static window.
+    """Returns mean torques and joint angles of all arms over an interval in which they rest.
 
     Args:
         runs: All sites.
@@ -278,10 +282,9 @@ def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
 
 
 class SharingRatio(NamedTuple):
-    """Force sharing at a joint: what one operator feels of a torque at another site.
+    """Measured force sharing at a joint: how much one operator feels of a torque elsewhere.
 
-    It is measured in a static window, a time in which all arms rest, at a joint at which
-    exactly two sites are loaded.
+    It is measured while all arms rest, at a joint at which exactly two arms are loaded.
 
     Attributes:
         from_s: Time of the window's first tick, in s.
@@ -322,7 +325,7 @@ class SharingRatio(NamedTuple):
 
 
 class JointLoad(NamedTuple):
-    """The torques of all loaded sites at a joint, while all arms rest.
+    """External torques on all arms at one joint, while all arms rest.
 
     At rest the weighted sum of these torques should be zero, by the equation of the module's
     docstring.
@@ -347,10 +350,10 @@ class JointLoad(NamedTuple):
 
 
 def find_joint_loads(view: RunView) -> list[JointLoad]:
-    """Finds the joints that carry a torque while all arms rest, with these torques.
+    """Finds the joints that carry an external torque while all arms rest, with these torques.
 
-    A time of rest is called a static window. At a joint, an arm counts as loaded if the
-    external torque on it is neither small nor much smaller than the torque on another arm.
+    At a joint, an arm counts as loaded if the external torque on it is neither small nor much
+    smaller than the torque on another arm.
 
     Args:
         view: The recorded run.
@@ -376,9 +379,9 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Counts the times of a run in which all arms rest under constant torques.
+    """Counts the intervals of a run in which all arms rest under constant torques.
 
-    Without such times, stiffness and force sharing cannot be measured.
+    Without such an interval, stiffness and force sharing cannot be measured.
 
     Args:
         view: The recorded run.
@@ -399,10 +402,10 @@ def count_static_windows(view: RunView) -> Metric:
     Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
 )
 def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
-    """Measures how well operators feel the torque that the sharing of forces predicts.
+    """Measures how well the torques that operators feel agree with the predicted sharing.
 
-    Operators feel the torques on other arms according to the dominance factors, which are the
-    weights with which the arms follow each other.
+    Operators feel torques on other arms according to the dominance factors, the weights with
+    which the arms follow each other.
 
     Args:
         view: The recorded run.
@@ -432,9 +435,9 @@ def _weigh_load(
     torque: dict[str, float],
     weights: Array | str,
 ) -> JointLoad:
-    """Computes how well the torques on the arms at a joint balance, weighted with pi_i / K_i.
+    """Computes how well the torques on all arms balance at one joint while the arms rest.
 
-    The module's docstring has the equation that the torques satisfy at rest.
+    The torques are weighted with pi_i / K_i, see the equation in the module's docstring.
 
     Args:
         window: The static window.
@@ -544,7 +547,10 @@ def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bo
 
 
 def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns the weights pi_i / K_i of the torques of all sites and joints.
+    """Returns the weights pi_i / K_i with which the torques on all arms balance at rest.
+
+    Here pi is the left eigenvector of the matrix alpha of dominance factors, and K_i the
+    stiffness of the control law of arm i.
 
     Args:
         scenario: Scenario of the run.
@@ -566,7 +572,11 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 
 def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
-    """Returns the stiffness with which a site's law pulls the arm to its reference at rest.
+    """Returns the stiffness with which a control law holds a resting arm at its reference.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site, the process that controls the arm.
 
     Returns:
         The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow.

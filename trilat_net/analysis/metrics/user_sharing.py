@@ -289,7 +289,9 @@ def _measure_takeover_s(
     h_s: float,
     ramp_spans_s: list[tuple[float, float]],
 ) -> float:
-    """Returns the time from the start of a planned change of weights to a change of the leader.
+    """Returns how long it takes after a planned change of weights until another user leads.
+
+    The leader is the user whose arm the slave arm follows with the largest weight.
 
     Args:
         change_s: Time at which the leader changed, in s.
@@ -312,10 +314,9 @@ def _measure_takeover_s(
 
 
 def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, float]]) -> Metric:
-    """Compares the steps of the slave's reference while weights change with its other steps.
+    """Compares steps of the slave's reference during a change of weights with other steps.
 
-    A change of the dominance factors, the weights of the users, should not make the reference
-    jump.
+    Changing the weights of the users should not make the reference of the slave arm jump.
 
     Args:
         records: Records of the slave.

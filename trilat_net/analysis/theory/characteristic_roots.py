@@ -97,19 +97,20 @@ class Pencil(NamedTuple):
 
     @property
     def rate_matrix(self) -> Array:
-        """The matrix E of the loop E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
+        """Matrix E of the loop equation E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
 
-        x is the state, with n entries, and T_k are the delays. E is diagonal. An entry is 1 if
-        the state has a rate of change, and 0 if an algebraic equation determines the state.
+        x is the state of all arms, with n entries, and T_k are the network delays. E is
+        diagonal. An entry is 1 if the state has a rate of change, and 0 if an algebraic
+        equation determines the state.
         """
         if self.E is None:
             return np.eye(len(self.A))
         return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Evaluates the characteristic matrix Delta(s) of the loop and its derivative.
+        """Evaluates the characteristic matrix Delta(s) of the control loop and its derivative.
 
-        Newton's method needs both to refine a root, at which Delta(s) is singular.
+        Delta(s) is singular at a root of the loop. Newton's method needs both to refine a root.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -128,9 +129,10 @@ class Pencil(NamedTuple):
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def sum_term_norms(self, s: complex) -> float:
-        """Returns the sum of the norms of the terms of the characteristic matrix Delta(s).
+        """Returns the size of the terms of the characteristic matrix Delta(s).
 
-        A residual of Delta(s) counts as zero if it is small compared with this sum.
+        It is the sum of their norms. A residual of Delta(s) counts as zero if it is small
+        compared with this sum.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -166,7 +168,7 @@ class Pencil(NamedTuple):
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
-        """Indices of the states whose delayed values act on the loop.
+        """Indices of the states whose delayed values act on the arms.
 
         An arm, for example, follows the angles that another arm had some time ago. Few states
         do so, and only these are discretised over the delay, which keeps the matrices small.
@@ -227,9 +229,10 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 
 
 class CharacteristicRoot(NamedTuple):
-    """A characteristic root s of a loop: small motions may be proportional to exp(s t).
+    """A characteristic root s of the control loop: small motions may change like exp(s t).
 
-    A complex root comes with its conjugate, which is not listed.
+    They grow if the real part of s is positive. A complex root comes with its conjugate, which
+    is not listed.
 
     Attributes:
         s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
@@ -244,10 +247,10 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio of the mode, -re(s) / abs(s), from -1 to 1.
+        """Damping ratio of the motion exp(s t) that belongs to the root, from -1 to 1.
 
-        It is 1 for a decay without oscillation, 0 for a lasting oscillation, and negative if
-        the mode grows.
+        It is -re(s) / abs(s): 1 for a decay without oscillation, 0 for a lasting oscillation,
+        and negative if the motion grows.
         """
         return -self.s.real / abs(self.s)
 
@@ -320,9 +323,9 @@ class Spectrum(NamedTuple):
     def rightmost(self) -> CharacteristicRoot | None:
         """The characteristic root with the largest real part, which determines stability.
 
-        Roots that are zero because of the structure of the loop are not considered: they exist,
-        for example, because all arms can rest in other poses too. None if there are no other
-        roots.
+        The real part is the growth rate of a small motion. Roots that are zero because of the
+        structure of the loop are not considered: they exist, for example, because all arms can
+        rest in other poses too. None if there are no other roots.
         """
         return self.roots[0] if self.roots else None
 
@@ -351,7 +354,9 @@ def _solve_for_root(
     guess: complex,
     names: Sequence[str],
 ) -> CharacteristicRoot | None:
-    """Returns the root to which Newton's method converges from a guess.
+    """Refines an approximate root of the control loop by Newton's method.
+
+    A root is a complex growth rate of small motions. A negative real part means decay.
 
     Args:
         pencil: Matrices of the loop.
@@ -551,8 +556,8 @@ def refine_roots(
 def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Reduces a linear loop to the states that can influence its stability.
 
-    States that are constant, and states that act on no other state, are left out. Each of them
-    only adds a characteristic root at zero.
+    Constant states, and states that act on no other state, are left out. Each of them only adds
+    a characteristic root at zero.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -614,9 +619,9 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 
 
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
-    """Returns guesses of the nonzero roots, by falling real part.
+    """Returns approximations of the roots of the control loop, by falling real part.
 
-    They are eigenvalues of the discretised loop, of which the smallest are left out: these
+    They are eigenvalues of the discretised loop. The smallest are left out, as these
     approximate the roots that are zero by structure.
 
     Args:
@@ -637,7 +642,7 @@ def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
-    """Eliminates the states that algebraic equations determine from a matrix.
+    """Eliminates the states that algebraic equations determine from a matrix of the loop.
 
     From 0 = M_aa x_a + M_ar x_r follows the Schur complement M_rr - M_ra M_aa^-1 M_ar, where a
     stands for the algebraic states and r for those with a rate.
@@ -657,9 +662,9 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
 
 
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
-    """Returns True if every root is close to a root of the previous order.
+    """Returns True if two successive approximations of the roots agree.
 
-    The order of the discretisation is doubled until two successive results agree.
+    The order of the approximation is doubled until this is so.
 
     Args:
         previous: Roots from the previous order.
@@ -717,9 +722,9 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
 
 
 def chebyshev_nodes(order: int) -> Array:
-    """Returns the points of [-1, 1] at which the discretisation evaluates delayed states.
+    """Returns the points in [-1, 1] at which delayed states are evaluated.
 
-    These are the extremal nodes cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
+    These Chebyshev nodes are cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
 
     Args:
         order: Degree of the polynomial through the points.
@@ -732,9 +737,9 @@ def chebyshev_nodes(order: int) -> Array:
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix that interpolates values at the Chebyshev nodes at other points.
+    """Returns the matrix that interpolates a polynomial between the Chebyshev nodes.
 
-    Its product with the values at the nodes is the value of the polynomial at the points.
+    Multiplied by the values at the nodes, it gives the values at the points x.
 
     Args:
         order: Degree of the polynomial.
@@ -753,7 +758,8 @@ def chebyshev_interpolation(order: int, x: Array) -> Array:
 def chebyshev_differentiation(order: int) -> Array:
     """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes.
 
-    It turns the values at the nodes into the derivatives at the nodes.
+    Multiplied by the values at the nodes, it gives the derivatives there. Delayed motion is
+    approximated by such a polynomial.
 
     Args:
         order: Degree of the polynomial.

@@ -58,7 +58,9 @@ frequency.
 
 
 class _AxisCrossing(NamedTuple):
-    """A crossing of the imaginary axis by one or more pairs of roots, as the delay increases.
+    """Network delay at which roots of the loop cross the imaginary axis, as the delay grows.
+
+    The loop becomes stable or unstable there.
 
     Attributes:
         delay_s: The common delay, in s.
@@ -72,7 +74,9 @@ class _AxisCrossing(NamedTuple):
 
 
 class _DelayInterval(NamedTuple):
-    """An interval of common delays for which a loop is stable.
+    """Interval of network delays, the same on all links, for which a control loop is stable.
+
+    A crossing is a delay at which a root of the loop reaches the imaginary axis.
 
     Attributes:
         low_s: Lower end, in s. 0 if the loop is stable without delay.
@@ -107,10 +111,10 @@ class _DelayInterval(NamedTuple):
 
 
 class DelayMargin(NamedTuple):
-    """The delays for which a control loop is stable if all its links have the same delay.
+    """Network delays, equal on all links, for which the coupled arms are stable.
 
-    As the delay grows, characteristic roots of the loop may cross the imaginary axis. The loop
-    becomes unstable if roots cross to the right, and may become stable if they return.
+    As the delay grows, characteristic roots of the loop may cross the imaginary axis. The arms
+    become unstable if roots cross to the right, and may become stable if they return.
 
     Attributes:
         intervals: Intervals of stable delays, by rising delay. Empty if the loop is unstable
@@ -127,9 +131,9 @@ class DelayMargin(NamedTuple):
 
     @property
     def description(self) -> str:
-        """A phrase for the user that states for which common delays the control loop is stable.
+        """A phrase for the user that states for which network delays the arms are stable.
 
-        Common means that all links between the arms have this same delay.
+        The delay is assumed to be the same on all links between the arms.
         """
         if self.lossless:
             return (
@@ -151,7 +155,7 @@ class DelayMargin(NamedTuple):
 
 
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a loop with the same delay on all of its links, for example to check a margin.
+    """Returns a linear loop with one delay on all network links, for example to check a margin.
 
     Args:
         loop: The loop.
@@ -172,7 +176,7 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Finds the stable delays of a control loop whose links all have the same delay.
+    """Finds the network delays, equal on all links, for which a control loop is stable.
 
     The delays that the loop itself contains are replaced by this common delay. The unstable
     characteristic roots are counted for a small delay, below the first delay at which roots
@@ -219,7 +223,7 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
-    """Returns the number of roots with a positive real part.
+    """Returns how many roots of the loop have a positive real part, so that motions grow.
 
     More and more of the rightmost roots are computed, until one of them is stable.
     """
@@ -241,9 +245,9 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 
 def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
-    """Finds the delays, common to all links, at which roots cross the imaginary axis.
+    """Finds the network delays, equal on all links, at which stability can change.
 
-    The stability of a loop can change only at such delays.
+    At such a delay, a root of the loop crosses the imaginary axis.
 
     Args:
         loop: The loop. Its own delays are ignored.
@@ -312,7 +316,8 @@ def _is_same_crossing(last: _AxisCrossing, crossing: _AxisCrossing) -> bool:
 class _FrequencySweep:
     """Eigenvalues of the open-loop frequency response G(j w) over the frequency w.
 
-    `_find_axis_crossings` uses them to find the frequencies at which a modulus is 1.
+    `_find_axis_crossings` searches them for the frequencies at which a modulus is 1, because
+    the loop can become unstable only there.
 
     Args:
         pencil: Matrices of the loop, with a single delay.
@@ -367,6 +372,8 @@ class _FrequencySweep:
 
     def compute_eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
         """Computes the eigenvalues of the open-loop frequency response G(j w).
+
+        The loop becomes unstable at a delay where an eigenvalue, turned by the delay, is 1.
 
         Args:
             omega: Frequencies w, shape (K,), in rad/s.
@@ -439,7 +446,7 @@ class _FrequencySweep:
         return self._list_delays(omega, pairs)
 
     def _list_delays(self, omega: float, pairs: int) -> list[_AxisCrossing]:
-        """Lists the delays at which roots are on the imaginary axis at a frequency.
+        """Lists the delays at which roots of the loop lie on the imaginary axis at s = j w.
 
         For each eigenvalue of modulus 1 these are the delays T with w T = phase + 2 pi k.
 

@@ -73,7 +73,10 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     end_s = scenario.duration_s
 
     def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
-        """Leaves out what never rests, and lets springs of the original end stay for ever."""
+        """Adapts operators and walls to a longer run, in which the arms shall come to rest.
+
+        Those that never rest are left out, and springs of the original end stay for ever.
+        """
         extended = []
         for actor in actors:
             starts_later = getattr(actor, "start_s", 0.0) > end_s
@@ -139,8 +142,7 @@ def _find_nearest_equilibrium(
 ) -> Equilibrium:
     """Finds the pose nearest to a given pose in which all arms rest.
 
-    It is found by Gauss-Newton iteration. Each step is the smallest step that solves the
-    linearised equations of the equilibrium.
+    Each Gauss-Newton step is the smallest step that solves the linearised equations of rest.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
@@ -180,9 +182,10 @@ def _find_nearest_equilibrium(
 
 
 def _limit_step(step: Array) -> float:
-    """Returns the factor with which no state changes by more than `_MAX_STEP` in a step.
+    """Returns the factor by which an iteration step is reduced to change no state too much.
 
-    Long steps would leave the region in which the linearisation is useful.
+    The limit is `_MAX_STEP`. Longer steps would leave the region in which the linearisation is
+    useful.
     """
     largest = float(np.abs(step).max())
     return _MAX_STEP / max(largest, _MAX_STEP)
@@ -222,7 +225,7 @@ def _shift_equilibrium(
     rest: Equilibrium,
     step: Array,
 ) -> Equilibrium:
-    """Returns the pose and estimates of an equilibrium after a step of the loop's states.
+    """Returns the pose and estimates of a pose of rest after an iteration step of its search.
 
     Velocities in the step are ignored, because all arms rest.
     """
@@ -246,7 +249,8 @@ def _shift_equilibrium(
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
     """Returns vectors of different lengths as the rows of one array, padded with zeros.
 
-    Arms with different numbers of joints can then share an array.
+    Arms with different numbers of joints can then share an array. For example, (1, 2) and (3,)
+    give [[1, 2], [3, 0]].
 
     Args:
         rows: The vectors.
@@ -259,7 +263,10 @@ def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
 
 
 def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
-    """Raises an error if a site that follows in task space rests in a singular pose.
+    """Raises an error if an arm that follows with its end effector rests in a singular pose.
+
+    In such a pose, for example a stretched arm, the end effector cannot move in every
+    direction.
 
     Args:
         conditions: The sites and gains.
@@ -332,7 +339,7 @@ def _compute_deviation(
     start: Equilibrium,
     rest: Equilibrium,
 ) -> Array:
-    """Returns how far the start poses are from an equilibrium, as states of the loop.
+    """Returns how far the start poses of the arms are from a pose of rest, as loop states.
 
     All velocities are zero. The shape is (states,).
     """
@@ -350,10 +357,10 @@ def _compute_deviation(
 
 
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
-    """Returns the part of a constant deviation that remains for ever, shape (states,).
+    """Returns the part of an initial deviation that never decays, shape (states,).
 
-    `_predict_from_start` has the equation. The result is None if the loop has no roots at zero,
-    or too few vectors for them.
+    This part belongs to the roots at zero. `_predict_from_start` has the equation. The result
+    is None if the loop has no roots at zero, or too few vectors for them.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
     is_zero = values <= _FLAT * values[0]
@@ -378,7 +385,9 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Finds a pose in which all arms of a scenario rest, near the end of a run or as given.
+    """Finds a pose in which all arms of a scenario rest, as a base for linear analysis.
+
+    It is the pose nearest to the end of a run, or a pose that the user gives.
 
     Args:
         scenario: Description of the experiment.
@@ -403,7 +412,7 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
 
 
 def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns an equilibrium with remarks on effects that its linear loop misses.
+    """Adds remarks about effects that a linear model at the pose of rest misses.
 
     Examples are torques at their limits and walls that are just touched.
 
@@ -415,7 +424,7 @@ def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equil
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Predicts by linear analysis at which equilibrium the arms come to rest.
+    """Predicts where the arms come to rest, by linear analysis without simulating the motion.
 
     They begin in the start poses of the scenario.
 
@@ -485,7 +494,7 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
 def _complete_estimates(
     conditions: OperatingConditions, theta_hat: Array | None = None
 ) -> Array:
-    """Returns the estimates of all sites, shape (N, P), padded with zeros.
+    """Returns the parameter estimates of all control laws in one array, padded with zeros.
 
     Args:
         conditions: The numbers of the loop.
@@ -544,7 +553,9 @@ def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equi
 
 
 def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
-    """Returns the pose that the user requests, with true estimates and its residual.
+    """Returns the pose that the user requests as an equilibrium of the arms.
+
+    The control laws are assumed to know the true parameters of their arms.
 
     Raises:
         ScenarioError: An end effector does not reach the pose, or the pose is singular.
@@ -586,9 +597,10 @@ def _describe_pose(coordinates: int, *, task: bool) -> str:
 
 
 def _reach_pose(site: SiteSetup, pose: Array) -> Array:
-    """Returns joint angles at which a site's end effector has a pose, in rad, shape (n,).
+    """Returns joint angles for a desired pose of the end effector, in rad, shape (n,).
 
-    Gauss-Newton steps from the start pose find the nearest such angles.
+    This is inverse kinematics: Gauss-Newton steps from the start pose find the nearest such
+    angles.
 
     Args:
         site: Setup of a site that follows in task space.
@@ -621,9 +633,9 @@ def _reach_pose(site: SiteSetup, pose: Array) -> Array:
 
 
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
-    """Returns the mean of the start poses that the sites share, shape (m,).
+    """Returns the mean of the start poses of all arms, shape (m,).
 
-    A shared pose consists of the joint angles, or in task space of the end effector's pose.
+    A pose consists of the joint angles, or in task space of the pose of the end effector (tip).
 
     Args:
         scenario: The description of the experiment.
@@ -639,10 +651,10 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
-    """Returns the equilibrium nearest to the end of a run.
+    """Finds the pose of rest nearest to the end of a simulated run.
 
     The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If it
-    diverges, the equilibrium is predicted from the start poses.
+    diverges, the pose is predicted from the start poses.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
     affordable_extension = _MAX_RUN_TICKS / ticks
@@ -694,7 +706,9 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
 
 
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium that it receives, unless its residual is too large.
+    """Checks that the arms rest in a pose, and returns the pose.
+
+    The residual is the acceleration that remains there. At an equilibrium it is 0.
 
     Raises:
         ScenarioError: The residual is too large, so that the pose is no equilibrium.

@@ -93,10 +93,10 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
 
 
 class _SiteTickMap(NamedTuple):
-    """Linear model of one site over one tick (period of its control loop): X' = P X + Q w.
+    """Linear model of one arm over one tick (control period): X' = P X + Q w.
 
-    X contains the n states of the site at a tick, and X' the states at the next tick. w
-    contains what the site receives from the other sites.
+    X contains the n states of the arm at a tick, and X' the states at the next tick. w contains
+    what the arm receives from the other arms.
 
     Attributes:
         P: Effect of the states, shape (n, n). The states are the joint angles and velocities,
@@ -217,9 +217,10 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
 
 
 class CoupledTicks(NamedTuple):
-    """Linear model of all sites over one tick (period of their control loops).
+    """Linear model of all arms and their control loops over one tick, a period of the loops.
 
-    The model has n states, which belong to the sites (processes that each run one arm).
+    The eigenvalues of the model show whether small motions grow. The n states belong to sites,
+    the processes that each run one arm.
 
     Attributes:
         S: Matrix that maps the states of all sites to their next tick, without the effects of
@@ -239,10 +240,9 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Builds the linear model of all coupled sites over one tick of their control loops.
+    """Builds the linear model of all coupled arms over one tick, a period of control loops.
 
-    The model contains each site by itself, and the effects of the sites on each other. States
-    that are constant, and states without an effect, are left out.
+    States that are constant, and states without an effect, are left out.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
@@ -313,10 +313,10 @@ _SAME_ROOT = 1e-6
 
 
 class SamplesInUse(NamedTuple):
-    """Which samples of the other sites each site uses, in every tick of a span of time.
+    """Which message of each other arm every arm uses, in every tick of a span of time.
 
-    A tick is one period of a site's control loop. A sample is the state that a site sends in
-    one tick. At the beginning of the span, all sites have a tick.
+    A tick is one period of a control loop. A sample is the message with an arm's state in one
+    tick. At the beginning of the span, all arms have a tick.
 
     Attributes:
         span_s: Length of the span, in s.
@@ -389,10 +389,10 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
 
 
 class _TickRun(NamedTuple):
-    """Consecutive ticks of one site whose used samples have all been computed before the first.
+    """Consecutive ticks (control periods) of one arm that can be computed together.
 
-    The received effects of such ticks are computed in one array operation, instead of tick by
-    tick.
+    All messages that the arm uses in these ticks have been sent before the first of them. Their
+    effects are computed in one array operation, instead of tick by tick.
 
     Attributes:
         site: Index of the site.
@@ -406,7 +406,9 @@ class _TickRun(NamedTuple):
 
 
 class _SpanPart(NamedTuple):
-    """A part of a span, after which columns are scaled.
+    """A part of a span of time, after which the columns of states are scaled.
+
+    Scaling keeps fast growing motions within the range of floating-point numbers.
 
     Attributes:
         runs: Ticks in an order in which every sample is known before its use.
@@ -464,7 +466,9 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """The effect of one peer on a site, and which of its samples the site uses at each tick.
+    """Effect of one arm on another, and which of its messages the other uses at each tick.
+
+    A tick is a period of the control loop.
 
     Attributes:
         peer: Index of the peer.
@@ -478,7 +482,9 @@ class _PeerEffect(NamedTuple):
 
 
 class _Tracks(NamedTuple):
-    """Motion of one site over a span of time, with one motion per column.
+    """Simulated motion of one arm over a span of time, for several start states at once.
+
+    Each start state has its own column.
 
     Attributes:
         states: States from the start of the span on, shape (1 + ticks, n_i, columns).
@@ -541,9 +547,10 @@ class _SpanMap:
         self.neutral = self._find_constant_motions(loop)
 
     def _find_sent_values(self, loop: CoupledTicks, j: int) -> Array:
-        """Returns the combinations of a site's states that act on other sites.
+        """Returns the combinations of an arm's states that act on the other arms.
 
-        They are an orthonormal basis of the row space of all effects of the site.
+        Only these must be stored for past ticks. They are an orthonormal basis of the row space
+        of all effects of the arm.
 
         Args:
             loop: The loop.
@@ -580,10 +587,10 @@ class _SpanMap:
         return np.linalg.qr(columns)[0]
 
     def build_constant_columns(self, X: Array) -> Array:
-        """Returns columns for motions in which all states have been constant.
+        """Returns columns of states for motions in which nothing has changed in the past.
 
-        Each column contains what all sites sent at their last ticks, as far back as it is used,
-        and their states. Here every past tick of a site has the same states.
+        Each column contains what all arms sent at their last ticks, as far back as it is used,
+        and their states.
 
         Args:
             X: The constant states, shape (n, columns), with the n states of all sites.
@@ -599,7 +606,9 @@ class _SpanMap:
         return np.vstack(blocks)
 
     def divide_out_constant(self, V: Array) -> Array:
-        """Returns columns less their constant motions, whose multipliers are exactly 1.
+        """Removes motions that never change, such as a constant offset, from columns of states.
+
+        Their multipliers are exactly 1. Without them, the search finds the moving roots.
 
         Args:
             V: Columns, shape (size, columns).
@@ -608,7 +617,7 @@ class _SpanMap:
         return V - constant_part
 
     def _build_tracks(self, V: Array) -> list[_Tracks]:
-        """Returns the tracks of each site, with its past and with room for the span.
+        """Allocates the motion of each arm over the span, and copies the past into it.
 
         Args:
             V: Columns with the past, shape (size, columns).
@@ -626,7 +635,10 @@ class _SpanMap:
         return tracks
 
     def _list_blocks(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> list[Array]:
-        """Returns the parts of all tracks that a column contains at given ticks.
+        """Returns the recorded motion of all arms at given ticks, as blocks of one column.
+
+        A tick is a period of an arm's control loop. The blocks are stacked to the state vector
+        of the map from one span of time to the next.
 
         Args:
             tracks: Tracks of all sites.
@@ -658,9 +670,9 @@ class _SpanMap:
         divided: bool = True,
         sizes: list[Array] | None = None,
     ) -> tuple[Array, list[Array]]:
-        """Computes how small motions develop over the analysed span of time.
+        """Computes how small motions of the arms develop over the analysed span of time.
 
-        For computation the span is split into parts.
+        If they grow over one span, they grow without limit, because the spans repeat.
 
         Args:
             V: Motions at the start of the span, shape (size, columns).
@@ -796,6 +808,8 @@ def _find_multipliers(
 def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
     """Returns the indices of the largest multipliers, by falling modulus.
 
+    A multiplier is the factor by which a small motion grows over the span.
+
     Args:
         mu: The multipliers.
         wanted: Number of distinct moduli.
@@ -838,7 +852,7 @@ def compute_sampled_spectrum(
 
 
 class SampledLoop:
-    """Coupled arms with controllers in ticks, whose roots can be computed about several poses.
+    """Linear model of coupled arms whose controllers act in ticks, for several poses of rest.
 
     The modes about a first pose are a good start for the search of those about a second pose
     nearby, which then takes half of the time.
@@ -861,7 +875,10 @@ class SampledLoop:
 
     @limit_blas_threads()
     def compute_spectrum(self, rest: Equilibrium, wanted: int) -> Spectrum:
-        """Computes the rightmost roots about a rest, see `compute_sampled_spectrum`.
+        """Computes the fastest growing (rightmost) roots of small motions about a pose of rest.
+
+        The control loops with their ticks and delays are linearised, see
+        `compute_sampled_spectrum`.
 
         Args:
             rest: The pose of rest.
@@ -920,7 +937,7 @@ class SampledLoop:
 
     @limit_blas_threads()
     def measure_rightmost_rate(self, pose: Equilibrium, scale_per_s: float) -> float | None:
-        """Computes the real part of the rightmost root about a pose, with limited accuracy.
+        """Computes how fast the fastest small motion about a pose grows, with limited accuracy.
 
         Args:
             pose: The pose about which the loop is linearised.
@@ -947,7 +964,9 @@ class SampledLoop:
 
 
 def _draw_start(span: _SpanMap, n: int) -> Array:
-    """Returns random columns from which the search of modes starts, always the same ones.
+    """Returns random start columns for the search of eigenvectors, equal in every run.
+
+    A fixed seed makes results repeatable.
 
     Args:
         span: The map whose modes are searched.
@@ -965,7 +984,10 @@ def _find_roots(
     wanted: int,
     largest_residual: float,
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
-    """Returns the rightmost roots of a span map, with their vectors.
+    """Returns the fastest growing (rightmost) roots of the loop over a span of time.
+
+    A root is the complex growth rate of a small motion, which follows from an eigenvalue of the
+    map over the span.
 
     Args:
         span: The map.
@@ -1062,7 +1084,10 @@ def _describe_modes(
 
 
 def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
-    """Returns how far a mode's strongest frequency is from its principal value, in rad/s.
+    """Returns how far the strongest frequency of a motion is from its principal root.
+
+    The multiplier of a period determines a frequency only up to multiples of 2 pi / period. The
+    strongest frequency selects one of them.
 
     Args:
         velocity: Velocity of a joint in the mode, with one value per tick.
@@ -1080,7 +1105,9 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first known root that equals s, or None.
+    """Returns the index of the first known root that is equal to a new one, or None.
+
+    A root is a complex growth rate of small motions. Equal roots must not be counted twice.
 
     Args:
         roots: The known roots.

@@ -45,7 +45,7 @@ _SETTLED = 0.01
 
 
 class FrequencyBand(NamedTuple):
-    """A range of frequencies, in Hz."""
+    """A range of frequencies, in Hz, for example that in which a system is not passive."""
 
     from_hz: float
     to_hz: float
@@ -68,16 +68,16 @@ class Minima(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least value of the curve over all frequencies.
+        """Lowest value of the curve over all frequencies.
 
-        For an eigenvalue that must be positive, it is the margin, or a violation if it is
-        negative.
+        If the curve must be positive, such as an eigenvalue, this is the margin. A negative
+        value is a violation.
         """
         return float(self.values.min())
 
     @property
     def least_hz(self) -> float:
-        """Frequency of the deepest minimum of the curve, in Hz, for texts."""
+        """Frequency in Hz at which the curve has its lowest value."""
         least_index = self.values.argmin()
         w_rad_s = self.w_rad_s[least_index]
         return float(w_rad_s / (2.0 * np.pi))
@@ -148,7 +148,10 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
-        """Marks the steps between neighbouring frequencies that must be divided."""
+        """Marks neighbouring frequencies between which the response changes too much.
+
+        These steps of the grid are then divided.
+        """
         size = np.linalg.norm(Y, axis=(1, 2))
         larger_size = np.maximum(size[1:], size[:-1])
         reference = np.maximum(larger_size, 1e-300)
@@ -167,6 +170,8 @@ def _refine(
     find_coarse: Callable[[NDArray[Any]], NDArray[np.bool_]],
 ) -> tuple[Array, NDArray[Any]]:
     """Adds frequencies to a grid where the values of a function require a finer step.
+
+    Resonances need a fine step, and a fine step everywhere would take too long.
 
     Args:
         function: Function that returns values, shape (F, ...), for frequencies, shape (F,).
@@ -199,10 +204,10 @@ def _refine(
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns the same function of frequency, with its values at some frequencies stored.
+    """Returns a frequency response with its values at given frequencies stored.
 
-    The values are computed once, and returned whenever the function is called with this very
-    array.
+    Several analyses evaluate the response at the same frequencies, and the values are then
+    computed only once. They are used whenever the function is called with this very array.
 
     Args:
         response: The function of frequency.
@@ -224,6 +229,8 @@ def find_minima(
 ) -> Minima:
     """Evaluates a curve over frequency, and adds frequencies until its minima are resolved.
 
+    A narrow minimum between two frequencies of a fixed grid would be missed.
+
     Args:
         curve: Function that returns the values of the curve at given frequencies.
         w_rad_s: First frequencies, rising, shape (F,), in rad/s.
@@ -240,7 +247,7 @@ def find_minima(
         return tolerance(w) if tolerance is not None else np.zeros(len(w))
 
     def evaluate(w: Array) -> Array:
-        """Returns the curve and its rounding error at frequencies, shape (F, 2)."""
+        """Returns the curve and its rounding error at given frequencies, shape (F, 2)."""
         values = curve(w)
         rounding = find_rounding(w)
         return np.stack([values, rounding], axis=1)
@@ -288,7 +295,9 @@ def _find_bands_below(
     values: Array,
     level: float,
 ) -> tuple[FrequencyBand, ...]:
-    """Returns the bands in which a curve is below a level. Bisection locates all edges.
+    """Returns the frequency bands in which a curve is below a level, such as zero.
+
+    The edges of the bands are located by bisection.
 
     Args:
         curve: The curve.

@@ -19,10 +19,10 @@ _KEYS = ("mass_kg", "damping_n_s_m", "stiffness_n_m")
 
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
-    """Reads the mass, damping and stiffness of hands that were measured before.
+    """Reads the mass, damping and stiffness of human hands that were measured before.
 
-    The analysis of ports uses them to check stability against these hands instead of all
-    passive operators.
+    Stability can then be checked against these hands instead of every passive operator, which
+    is less strict.
 
     Args:
         files: Paths of JSON files that `trilat identify hand --json` wrote.
@@ -37,10 +37,13 @@ def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
 
 
 def _read_hand(file: Path) -> HandMatrices:
-    """Reads an identified hand from a JSON file.
+    """Reads the measured dynamics of a human hand from a JSON file.
+
+    Args:
+        file: Path of the file.
 
     Raises:
-        UsageError: The file does not contain a hand.
+        UsageError: The file does not contain the dynamics of a hand.
     """
     try:
         values = json.loads(file.read_text(encoding="utf-8"))

@@ -63,7 +63,10 @@ SAMPLED_ROOT_DIFFERENCE = 0.01
 
 @dataclass(frozen=True, repr=False)
 class LinearAnalysis(Result):
-    """Result of the linear stability analysis of a scenario, see `analyse_linear_loop`.
+    """Result of the linear stability analysis of coupled arms, see `analyse_linear_loop`.
+
+    The arms are linearised about a pose of rest. The roots of the loop show whether small
+    motions about this pose decay, and for which network delays.
 
     Attributes:
         scenario: The description of the experiment.
@@ -97,10 +100,10 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """The pose of each end effector at the equilibrium, if end effectors follow each other.
+        """Pose of each arm's end effector (tip) at rest, if end effectors follow each other.
 
-        There is an array for each site (process that runs one arm), with the pose that the site
-        sends to the other sites. The arrays are empty if joints follow each other instead.
+        There is an array for each arm. The arrays are empty if joints follow each other
+        instead.
         """
         sites = self.conditions.sites
         if not sites[0].layout.task:
@@ -118,7 +121,7 @@ class LinearAnalysis(Result):
 
     @property
     def verdict(self) -> str:
-        """Whether small motions die away: "stable", "unstable" or "at the edge".
+        """Whether small motions of the arms die away: "stable", "unstable" or "at the edge".
 
         The roots in `decisive` determine the verdict.
         """
@@ -126,7 +129,7 @@ class LinearAnalysis(Result):
 
     @property
     def is_far_from_rest(self) -> bool:
-        """True if the run ends too far from the analysed equilibrium to be judged by it.
+        """True if the run ends too far from the analysed pose of rest to be judged by it.
 
         The limit is `NEAR_REST_RAD`. False for a scenario without a run, which has no final
         pose.
@@ -166,14 +169,14 @@ class LinearAnalysis(Result):
         return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
 
     def headline(self) -> str:
-        """Returns the scenario, the verdict and the delay margin in one line.
+        """The scenario, the verdict and the delay margin in one line, for the user.
 
-        The delay margin is the delay of all links up to which the loop stays stable.
+        The delay margin is the delay of all network links up to which the arms stay stable.
         """
         return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the analysis as plain values, with the keys of `trilat linear --json`.
+        """Converts the analysis to plain values, as `trilat linear --json` prints them.
 
         Parts that were not requested, or that do not exist for this loop, are None or empty.
         """
@@ -275,7 +278,7 @@ class LinearAnalysis(Result):
 
 
 class _AnalysedLoop(NamedTuple):
-    """The loop that is analysed.
+    """Control loop of all arms that is linearised, with its pose of rest and its delays.
 
     Attributes:
         scenario: The scenario.
@@ -294,9 +297,10 @@ class _AnalysedLoop(NamedTuple):
 
 
 def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
-    """Finds the loop at the end of a run, whose roots a stability certificate states as well.
+    """Finds the control loop at the end of a run, which the linear analysis examines.
 
-    If the arms have no equilibrium near the end, that of a longer run or a prediction is used.
+    A stability certificate states the roots of the same loop. If the arms have no equilibrium
+    near the end, that of a longer run or a prediction is used.
 
     Args:
         scenario: The scenario of the run.
@@ -390,7 +394,7 @@ def analyse_linear_loop(
 
 
 def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
-    """Returns the intervals of stable delays, and the crossings of roots, as plain values.
+    """Converts the network delays for which the arms are stable to plain values for JSON.
 
     Args:
         margin: The delays at which the loop is stable.
@@ -411,7 +415,7 @@ def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
-    """Returns the roots of a loop as plain values.
+    """Converts the roots of a control loop to plain values for JSON output.
 
     Args:
         spectrum: The rightmost roots of the loop.

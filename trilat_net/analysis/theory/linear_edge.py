@@ -71,9 +71,9 @@ def find_rightmost_root(
     *,
     sampled: bool,
 ) -> CharacteristicRoot | None:
-    """Returns the rightmost characteristic root of the loop about an equilibrium.
+    """Returns the fastest growing (rightmost) root of the control loop about a pose of rest.
 
-    Its real part is the growth rate of small motions: the loop is stable if it is negative.
+    Its real part is the growth rate of small motions. If it is negative, they die away.
 
     Args:
         conditions: The numbers of the loop.
@@ -93,8 +93,8 @@ def find_rightmost_root(
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     """Finds the state of a run in which an end effector has penetrated a wall most deeply.
 
-    Only sampled walls are considered, which compute their force once per tick (period of the
-    control loop).
+    The linear analysis then includes the stiffness of the wall. Only sampled walls count, which
+    compute their force once per tick (period of the control loop).
 
     Args:
         scenario: Description of the experiment.
@@ -153,7 +153,7 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
 
 class LinearEdge(NamedTuple):
-    """A value of a scenario's key at which a loop becomes stable or unstable.
+    """A value of one setting at which coupled arms become stable or unstable.
 
     At this value a characteristic root crosses the imaginary axis, and small motions oscillate
     with the frequency of the root.
@@ -172,9 +172,9 @@ class LinearEdge(NamedTuple):
 
 
 class EdgeScan(NamedTuple):
-    """The values of a key, within a range, at which a loop becomes stable or unstable.
+    """Values of one setting, within a range, at which coupled arms become stable or unstable.
 
-    A loop with no edge in the range is stable in the whole range, or unstable.
+    Without such a value, the arms are stable in the whole range, or unstable.
 
     Attributes:
         key: Key of the scenario, such as "control.d".
@@ -190,13 +190,10 @@ class EdgeScan(NamedTuple):
 
 
 def parse_edge_range(text: str) -> tuple[str, float, float]:
-    """Parses a key and a range of values, such as "control.d=0.1:3".
+    """Parses the setting and the range of values in which a stability limit is searched.
 
-    Returns:
-        The key, the lower end and the upper end of the range.
-
-    Raises:
-        UsageError: The text is not a range.
+    Args:
+        text: The text, for example "control.d=0.1:3".
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
@@ -220,9 +217,10 @@ def iterate_linear_edges(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> Iterator[LinearEdge]:
-    """Yields the values of a scenario's key at which the loop becomes stable or unstable.
+    """Yields the values of one setting at which coupled arms become stable or unstable.
 
-    The range is scanned, and each change of stability is then located. The values rise.
+    The range of values is scanned, and each change of stability is then located. The values
+    rise.
 
     Args:
         scenario: The description of the experiment.
@@ -260,7 +258,9 @@ def iterate_linear_edges(
 
 
 class _GrowthPoint(NamedTuple):
-    """Growth rate of the loop at a value of a key.
+    """Growth rate of small motions for one value of the examined setting.
+
+    A positive rate means that the arms are not stable.
 
     Attributes:
         value: Value of the key.
@@ -272,17 +272,19 @@ class _GrowthPoint(NamedTuple):
 
     @property
     def is_unstable(self) -> bool:
-        """True if small motions grow at this value of the setting.
+        """True if small motions of the arms grow at this value of the setting.
 
-        An edge lies between two neighbouring values of which only one is unstable.
+        The limit of stability lies between two neighbouring values of which only one is
+        unstable.
         """
         return self.growth_per_s > 0.0
 
 
 class _GrowthRate:
-    """Growth rate of a loop as a function of a key's value.
+    """Function that computes the growth rate of small motions for a value of one setting.
 
-    Each evaluation follows the equilibrium from the one of the previous evaluation.
+    Each evaluation starts from the pose of rest of the previous one, because the pose may
+    depend on the setting.
 
     Args:
         scenario: The experiment.
@@ -460,6 +462,8 @@ def find_root_crossings(
 ) -> tuple[tuple[float, ...], str]:
     """Finds the values of one setting at which coupled arms become stable or unstable.
 
+    An example is the smallest damping gain with which the arms are stable.
+
     Args:
         scenario: Description of the experiment. The pose of rest is determined with its own
             value of the setting.
@@ -508,7 +512,7 @@ def _assume_equilibrium(
 
 
 def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
-    """Returns the equilibrium that is nearest to the mean of the start poses.
+    """Returns the pose of rest that is nearest to the mean of the arms' start poses.
 
     Args:
         scenario: The experiment.

@@ -63,10 +63,10 @@ class SiteJacobian(NamedTuple):
 
     @property
     def output(self) -> Array:
-        """Matrix that computes what the site sends to the other sites from its own states.
+        """Matrix from the states of an arm to the numbers that the arm sends to the others.
 
-        The site sends the pose that it shares, the velocity of this pose, and the external
-        torque that it reflects, with m numbers each. The matrix has the shape (3 m, states).
+        The numbers are its pose, the velocity of this pose, and the external torque, m of each.
+        The matrix has the shape (3 m, states).
         """
         rates = self.rates
         samples = np.vstack([rates.x, rates.xd, rates.reflected])
@@ -95,7 +95,8 @@ class DelayedTerm(NamedTuple):
 class LinearLoop(NamedTuple):
     """Linear model of the coupled arms near a pose of rest, with network delays.
 
-    The module's docstring has the equation and the notation.
+    It shows whether small motions about this pose grow. The module's docstring has the equation
+    and the notation.
 
     Attributes:
         names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".
@@ -134,7 +135,7 @@ class LinearLoop(NamedTuple):
 
 
 def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
-    """Returns a matrix with given blocks on its diagonal, and zeros elsewhere.
+    """Returns a matrix with given matrices (blocks) on its diagonal, and zeros elsewhere.
 
     `scipy.linalg.block_diag` does the same, but takes twenty times as long for small blocks.
 
@@ -199,9 +200,9 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
 
 
 def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that each site sends to its peers at an equilibrium.
+    """Computes the pose that each arm sends to the other arms while all of them rest.
 
-    It consists of the joint angles, or in task space of the end effector's pose.
+    It consists of the joint angles, or in task space of the pose of the end effector (tip).
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -219,9 +220,9 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that each site tries to reach at an equilibrium.
+    """Computes the pose that the control law of each arm tries to reach at rest.
 
-    It is the mean of its peers' poses, weighted with the dominance factors.
+    It is the mean of the other arms' poses, weighted with the dominance factors.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -407,7 +408,7 @@ def _select_states(
     *,
     all_estimates: bool,
 ) -> SiteJacobian:
-    """Returns a site's derivatives with respect to the states that the loop keeps.
+    """Returns derivatives of an arm's motion with respect to the states that the model has.
 
     Of the parameter estimates of a chain, only independent combinations that change the torque
     at rest are kept, see the module's docstring.
@@ -451,7 +452,9 @@ def _replace_estimate(
     T: Array,
     names: tuple[str, ...],
 ) -> SiteJacobian:
-    """Replaces the estimates theta_hat of a site by the states z = T theta_hat.
+    """Replaces the parameter estimates of a control law by fewer states z = T theta_hat.
+
+    Estimates that influence the motion only through z would add roots that are always zero.
 
     Args:
         layout: Layout of the columns with theta_hat.
@@ -464,7 +467,7 @@ def _replace_estimate(
     estimate = layout.estimate
 
     def convert(derivative: Array) -> Array:
-        """Returns a derivative by the new states."""
+        """Converts a derivative with respect to the estimates to one by the new states z."""
         motion = derivative[:, : estimate.start]
         by_estimate = derivative[:, estimate]
         by_z = by_estimate @ estimate_by_z
@@ -596,7 +599,7 @@ def _name_ports(
 
 
 def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, ...]:
-    """Returns the delayed terms by rising delay.
+    """Orders the terms of a delay-differential equation by their delay.
 
     Args:
         terms: Matrices of state and torque, by the delay in s.
@@ -743,7 +746,7 @@ def _add_form(
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    """Adds the linear form of site i's law to the matrices of the loop.
+    """Adds the linear equations of one arm's control law to the matrices of the whole loop.
 
     Args:
         conditions: The numbers of the loop.

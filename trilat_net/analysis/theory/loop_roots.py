@@ -61,7 +61,9 @@ _BATCH_RECORDS = 4096
 
 
 class _EndLoop(NamedTuple):
-    """The control loop at the end of a run, with the rest about which it is linearised.
+    """Control loop of all arms as it was at the end of a run, with its pose of rest.
+
+    The loop is linearised about this pose to decide whether small motions die away.
 
     Attributes:
         scenario: The scenario up to the end of the run. Delays that only the run shows are
@@ -92,9 +94,9 @@ class _EndLoop(NamedTuple):
 
 @limit_blas_threads()
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
-    """Computes whether small motions about the end pose of a recorded run die away.
+    """Decides by linear analysis whether small motions at the end of a recorded run die away.
 
-    The coupled arms are linearised at the pose at rest next to the last one. The result may
+    The coupled arms are linearised at the pose of rest next to the last pose. The result may
     prove the run stable, or refute it.
 
     Args:
@@ -114,7 +116,7 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
 
 @limit_blas_threads()
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
-    """Computes whether small motions about the end pose of a simulated run die away.
+    """Decides by linear analysis whether small motions at the end of a simulated run die away.
 
     The result is that of `find_log_roots` for a log of the same run, but no log is needed.
     Studies with many runs use this function.
@@ -134,7 +136,9 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
 
 
 def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
-    """Finds the control loop at the end of a recorded run, and the pose of rest near its end.
+    """Finds the control loop at the end of a recorded run, and the nearest pose of rest.
+
+    The linear analysis of this loop shows whether the run is stable.
 
     Args:
         log: The log of the run.
@@ -155,10 +159,11 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
             raise ScenarioError(problem, source=log.source)
 
     def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns which samples of a peer a site had in use at given ticks, from its records.
+        """Returns which messages of another arm were in use at given ticks, from the records.
 
-        A sample is the state that a site sends once per tick, and samples are numbered from 0.
-        A tick without a record has the samples of the last record before.
+        Such a message, a sample, is the state that an arm sends once per tick (control period).
+        Samples are numbered from 0. A tick without a record has the samples of the last record
+        before.
 
         Args:
             i: Index of the receiving site.
@@ -189,9 +194,10 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
 
 
 def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
-    """Finds the control loop at the end of a simulated run, and the rest next to its end.
+    """Finds the control loop at the end of a simulated run, and the nearest pose of rest.
 
-    The loop is that of a log of the same run. The code of imported control laws is executed.
+    The linear analysis of this loop shows whether the run is stable. The code of imported
+    control laws is executed.
 
     Args:
         scenario: The experiment.
@@ -212,7 +218,7 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         return find_log_loop(simulate_scenario(ended), own_laws=True)
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns which samples of a peer a site had in use at ticks, by the delay model.
+        """Returns which messages (samples) of another arm were in use, by the delay model.
 
         The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
         without a log has no records, but the random delays of the link can be drawn again from
@@ -256,10 +262,10 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
 
 
 def resolve_final_scenario(log: Log) -> Scenario:
-    """Returns the scenario of a log with the commands of the run as planned changes.
+    """Returns the scenario of a log, with the users' commands of the run as planned changes.
 
     Its duration is the recorded one, so that the settings in force at its end are those of the
-    final loop.
+    final control loop.
 
     Args:
         log: The log of the run.
@@ -272,7 +278,9 @@ def resolve_final_scenario(log: Log) -> Scenario:
 
 
 class _FixedDelays(NamedTuple):
-    """A scenario in which every delay is known.
+    """A scenario in which the delay of every network link is known at every time.
+
+    A linear analysis needs known delays, but measured delays are known only after the run.
 
     Attributes:
         scenario: The scenario up to the end of the run. A link whose delays only the records
@@ -289,7 +297,7 @@ class _FixedDelays(NamedTuple):
 
 
 class _EndState(NamedTuple):
-    """State of all arms at the end of a run, next to which a rest is sought.
+    """Poses of all arms at the end of a run, near which a pose of rest is searched.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad.
@@ -305,7 +313,7 @@ class _EndState(NamedTuple):
 def _build_end_loop(
     final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
 ) -> _EndLoop:
-    """Returns the final loop, with the equilibrium nearest to a state.
+    """Returns the control loop at the end of a run, with the nearest pose of rest.
 
     Args:
         final: The final loop.
@@ -335,7 +343,9 @@ def _build_end_loop(
 
 
 def _compute_roots(loop: _EndLoop) -> LoopRoots:
-    """Computes the rightmost roots of a loop, as a certificate states them.
+    """Computes the fastest growing (rightmost) roots of the loop at the end of a run.
+
+    A root is the complex growth rate of a small motion. A certificate of stability states them.
 
     Args:
         loop: The loop at the end of a run.
@@ -369,7 +379,10 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
 
 
 def _name_left_out(programs: Sequence[str]) -> str:
-    """Returns which reactions the linearised loop leaves out, as a phrase. Empty if none.
+    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
+
+    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
+    if there is no such program.
 
     Args:
         programs: Sites whose arms a program of the user moves.
@@ -403,7 +416,7 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
 
 
 def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots:
-    """Returns the rightmost root and the verdict, as a certificate states them.
+    """Returns the fastest growing root, and what it says about the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.
@@ -431,7 +444,7 @@ def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots
 
 
 def _explain_no_roots(reason: str) -> LoopRoots:
-    """Returns a result without roots, which says why they could not be computed.
+    """Returns a result without roots, with the reason why they could not be computed.
 
     Args:
         reason: The reason, as a phrase for the user.
@@ -462,10 +475,10 @@ def _end_traces(scenario: Scenario) -> Scenario:
 
 
 def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
-    """Returns for each link, by name, whether only a run shows the delays of its samples.
+    """Finds the network links whose delays are random or measured, so that only a run has them.
 
-    Args:
-        scenario: The scenario up to the end of the run.
+    Returns:
+        For each link, by its name, True if its delays are unknown before a run.
     """
     has_unknown_delay = {}
     for name in scenario.links:
@@ -479,10 +492,10 @@ def _fix_delays(
     last_ticks: Sequence[int],
     find_used: Callable[[int, int, Ints], Ints],
 ) -> _FixedDelays:
-    """Returns a scenario with the delays that occurred in its run.
+    """Returns a scenario in which random and measured delays are those of its run.
 
-    Random and measured delays cannot be predicted. For them the samples in use in the last
-    quarter of the run stand for all later ones.
+    These delays cannot be predicted. The messages in use in the last quarter of the run stand
+    for all later ones.
 
     Args:
         scenario: The scenario up to the end of the run.
@@ -537,9 +550,9 @@ def _fix_delays(
 def _choose_end_state(
     scenario: Scenario, trace: RunTrace, theta_hat: Sequence[Array]
 ) -> _EndState:
-    """Chooses the angles and the estimates of all sites at the end of a run.
+    """Chooses the joint angles and parameter estimates of all arms at the end of a run.
 
-    The angles of a site at rest are the last ones. Those of a site that still moves are the
+    The angles of an arm at rest are the last ones. Those of an arm that still moves are the
     mean over the last quarter of the run, in intervals of 50 ms.
 
     Args:
@@ -569,7 +582,7 @@ def _choose_end_state(
 
 
 def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
-    """Returns the last recorded joint angles of all sites, shape (N, n), in rad.
+    """Returns the last recorded joint angles of all arms, shape (N, n), in rad.
 
     Args:
         scenario: Scenario of the run.
@@ -579,7 +592,7 @@ def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
 
 
 def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Array, Array]]:
-    """Yields the joint angles and the largest speeds of each site, in intervals of 50 ms.
+    """Yields the joint angles and largest speeds of each arm, in intervals of 50 ms.
 
     Args:
         scenario: Scenario of the run.
@@ -597,7 +610,7 @@ def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Arra
 
 
 class _SiteMotion(NamedTuple):
-    """Motion of a site, from its records.
+    """Recorded motion of one arm, and what its control law has learnt.
 
     Attributes:
         t_s: Times of the K records, shape (K,), in s.
@@ -655,10 +668,10 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
 
 
 def _has_sampled_wall(scenario: Scenario) -> bool:
-    """Returns True if the force of some environment is computed once per tick and held.
+    """Returns True if the force of some wall is computed once per control period and held.
 
-    An arm may then chatter at the wall, and its mean pose may be off the wall although it hits
-    it in every cycle.
+    An arm may then chatter at the wall, and its mean pose may be off the wall although the arm
+    hits the wall in every cycle.
 
     Args:
         scenario: Scenario of the run.
@@ -668,7 +681,7 @@ def _has_sampled_wall(scenario: Scenario) -> bool:
 
 
 def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _EndState | None:
-    """Finds the deepest state of arms that chatter at a sampled wall, in the last quarter.
+    """Finds the deepest state of arms that chatter at a wall in the last quarter of a run.
 
     The mean of such a motion may be beside the wall, where the loop is another one. The deepest
     state is inside the wall, so the wall's stiffness is part of the linearised loop.

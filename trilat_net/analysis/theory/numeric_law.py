@@ -141,7 +141,7 @@ class NumericLaw:
         return slice(start, start + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:
-        """Returns the law. It stands for the function that builds the law of a site."""
+        """Returns the law itself, where other code expects a function that builds the law."""
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:
@@ -167,9 +167,10 @@ class NumericLaw:
         return full_memory
 
     def iterate_memory(self, x: Array, ticks: int) -> Array:
-        """Executes the law for some ticks with constant inputs, and returns its memory.
+        """Executes a user's control law with constant inputs until its memory is steady.
 
-        The iteration ends early once the memory no longer changes.
+        The memory are the values that the law stores from one tick (control period) to the
+        next, such as an integral. The iteration ends early once they no longer change.
 
         Args:
             x: Arguments in the order of `ArgumentLayout`, shape (arguments,).
@@ -250,7 +251,12 @@ class NumericLaw:
         return torque, change * self._rate_hz
 
     def _evaluate_tick(self, x: Array, previous: Array) -> Array:
-        """Returns the torque, and the numbers that the law itself remembers, after one tick.
+        """Evaluates a user's control law for one tick, a period of the control loop.
+
+        The result is differentiated numerically, because the code of the law is arbitrary.
+
+        Returns:
+            The torque, and the values that the law stores for its next tick.
 
         Args:
             x: Arguments, shape (arguments,).

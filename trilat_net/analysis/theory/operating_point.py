@@ -52,7 +52,7 @@ from .site_dynamics import SiteRates, evaluate_site_rates
 
 
 class Equilibrium(NamedTuple):
-    """The pose about which the coupled arms are linearised, with all arms at rest.
+    """Pose in which all arms are at rest, about which their motion is linearised.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints end in zeros.
@@ -72,7 +72,9 @@ class Equilibrium(NamedTuple):
 
 
 class _EffectiveDelay(NamedTuple):
-    """Age of the samples that a site uses, over its ticks.
+    """Age of the messages that a control loop uses: mean, smallest and largest.
+
+    The age is the network delay plus the wait for the next tick.
 
     Attributes:
         mean_s: Mean age, in s.
@@ -95,10 +97,10 @@ class _EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The gains, delays, weights and operators from which the linear model of a loop is built.
+    """Gains, delays, weights and operators from which the linear model of the arms is built.
 
     They are those at the end of a run of the scenario, see `OperatingConditions.derive`. N is
-    the number of sites.
+    the number of arms (sites).
 
     Attributes:
         sites: Setups of the sites in scenario order, with the operators and environments in
@@ -122,7 +124,7 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns the linear equations of control laws that their gains do not fully describe.
+        """Returns the linear equations of control laws that gains alone do not describe.
 
         Examples are laws that store numbers, or send waves. `LinearForm` represents their
         equations.
@@ -167,16 +169,16 @@ class OperatingConditions(NamedTuple):
 
     @property
     def has_forms(self) -> bool:
-        """True if gains alone do not describe the control law of some site.
+        """True if gains alone do not describe the control law of some arm.
 
-        Examples are laws that store numbers from tick to tick, or send waves. The coupled arms
-        are then linearised in continuous time only, and not tick by tick.
+        Examples are laws that store numbers from tick to tick (control period), or send waves.
+        The coupled arms are then linearised in continuous time only, and not tick by tick.
         """
         return any(form is not None for form in self.find_forms())
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites, in scenario order."""
+        """Names of the arms' sites (processes), in the order of the scenario."""
         return tuple(site.name for site in self.sites)
 
     @property
@@ -199,10 +201,10 @@ class OperatingConditions(NamedTuple):
         return any(actor.sampled for actor in actors)
 
     def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
-        """Computes how fast the states of every site change.
+        """Computes how fast the states of every arm change: accelerations and learning rates.
 
-        The states of a site (process that runs one arm) are its joint angles, its joint
-        velocities and its parameter estimates.
+        The states of an arm are its joint angles, its joint velocities and its parameter
+        estimates.
 
         Args:
             arguments: States and inputs of each site, in the order of `ArgumentLayout`.
@@ -215,7 +217,7 @@ class OperatingConditions(NamedTuple):
 
     @classmethod
     def derive(cls, scenario: Scenario, *, own_laws: bool = True) -> "OperatingConditions":
-        """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
+        """Collects the numbers of a scenario's linear model, as they are at the end of a run.
 
         They are delays, dominance factors, gains and operators, after all planned changes.
 
@@ -302,7 +304,7 @@ def _describe_laws(scenario: Scenario) -> list[str]:
 
 
 def _is_constant_link(link: LinkBase) -> bool:
-    """Returns True if a link delays every sample by the same time and loses none.
+    """Returns True if a network link delays every message equally, and loses none.
 
     Args:
         link: Delay model of the link, from the scenario.
@@ -312,7 +314,7 @@ def _is_constant_link(link: LinkBase) -> bool:
 
 
 def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
-    """Makes the imported law of a site ready to be evaluated and differentiated.
+    """Creates the user's own control law of an arm, so that it can be differentiated.
 
     Args:
         scenario: The experiment.
@@ -334,10 +336,11 @@ def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> Si
 
 
 def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
-    """Returns the gains with which each site's law acts on small motions, by site.
+    """Returns the gains with which the control law of each arm acts on small motions.
 
-    Raises:
-        ScenarioError: A law has no linear loop, or an arm is not simulated.
+    Args:
+        scenario: The experiment.
+        own_laws: True if the code of imported control laws may be executed.
     """
     gains_by_site: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
@@ -360,7 +363,7 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
 
 
 def _explain_missing_gains(law: Any) -> str:
-    """Returns the reason why a law has no linear loop, as part of a sentence.
+    """Returns the reason why a control law cannot be linearised, as part of a sentence.
 
     Args:
         law: Settings of the control law.
@@ -379,7 +382,9 @@ def _explain_missing_gains(law: Any) -> str:
 
 
 def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBase:
-    """Returns the delay model of a link that is in force at the end of the run.
+    """Returns the delay model of a network link that is in force at the end of the run.
+
+    Earlier models do not matter for the stability of the final motion.
 
     Args:
         scenario: The experiment.
@@ -419,7 +424,7 @@ def compute_effective_delay(
     site: str,
     link: LinkBase,
 ) -> _EffectiveDelay:
-    """Computes the age of a peer's samples at the ticks of a site that use them.
+    """Computes how old the other arm's state is when a control loop uses it.
 
     The ages are those of the run. If the delay repeats after a longer time, they are those of a
     whole period, because the loop goes on after the run.
@@ -516,7 +521,9 @@ def _find_final_dominance(
     sites: tuple[SiteSetup, ...],
     notes: list[str],
 ) -> Array:
-    """Returns the matrix of dominance factors at the end of the run, shape (N, N).
+    """Returns the dominance factors at the end of the run, as a matrix of shape (N, N).
+
+    A dominance factor is the weight, from 0 to 1, with which one arm follows another.
 
     Args:
         scenario: The experiment.
@@ -596,7 +603,7 @@ _PERIODIC = (TorqueKind.CHIRP, TorqueKind.MULTISINE)
 
 
 def _evaluate_script(actor: TorqueSource, t_s: float) -> tuple[float, ...]:
-    """Returns the torque of a scripted operator at a time.
+    """Returns the torque at a given time of an operator that follows a planned signal.
 
     Args:
         actor: The operator, whose torque is a sin^2 pulse or the interpolation of a table.

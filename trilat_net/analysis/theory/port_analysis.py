@@ -82,9 +82,9 @@ def freeze_external_torques(
 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Builds the linear model of the arms and their coupling, without operators.
+    """Builds the linear model of the arms and their coupling, without operators and walls.
 
-    Operators and environments act at its ports, the joints, and are not part of it.
+    Operators and walls act at its ports, the joints, and are not part of the model.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -164,10 +164,10 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
 
 
 class TwoPort(NamedTuple):
-    """Llewellyn's criterion of absolute stability for one joint of two sites.
+    """Result of Llewellyn's stability criterion for one joint of two arms.
 
-    The criterion says whether the loop is stable with every passive operator or environment at
-    each of the two joints. No operator acts at the other joints.
+    The criterion says whether the arms are stable with every passive operator or wall at both
+    joints. Nobody pushes the other joints.
 
     Attributes:
         sites: The two sites.
@@ -231,24 +231,29 @@ class PortAnalysis(NamedTuple):
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """Names of the sites."""
+        """Names of the sites, the processes that each control one arm."""
         return self.scenario.names
 
     @property
     def kind(self) -> str:
-        """Word for a port in tables and texts: "joint", or "axis" for arms in task space."""
+        """Word for the place where an operator pushes an arm: "joint", or "axis" in task space.
+
+        In task space, arms follow each other with their end effectors (tips).
+        """
         return "axis" if self.axes else "joint"
 
     @property
     def speed(self) -> str:
-        """Symbol of the velocity of a port, for tables and figures.
+        """Symbol of the velocity at a port, the place where an operator pushes, for figures.
 
         It is "qd" for joints, and "xd" if end effectors follow each other.
         """
         return "xd" if self.axes else "qd"
 
     def name_port(self, number: int) -> str:
-        """Returns the name of the place where an operator acts, such as "joint 2" or "axis y".
+        """Returns a name for the user of the joint or axis at which an operator pushes an arm.
+
+        Examples are "joint 2" and "axis y".
 
         Args:
             number: Number of the joint, or of the axis of the end effector if end effectors
@@ -258,6 +263,8 @@ class PortAnalysis(NamedTuple):
 
     def impedance_unit(self, number: int = 0) -> str:
         """Returns the unit of the impedance that an operator feels, for tables and figures.
+
+        For a joint, it is N m s/rad.
 
         Args:
             number: Number of a joint, or of an axis of the end effector if end effectors follow
@@ -368,7 +375,10 @@ def _check_absolute_stability(
     Y: port_response.PortResponse,
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Returns the margin of absolute stability over frequency, with the best weights.
+    """Computes the margin of absolute stability over frequency.
+
+    Arms are absolutely stable if they remain stable with every passive hand or wall. The
+    weights of the ports are chosen so that the margin is as large as possible.
 
     Args:
         loop: The loop.
@@ -384,7 +394,9 @@ def _check_absolute_stability(
 
 
 class _HeldHands(NamedTuple):
-    """The end effectors of the masters, and the measured operators that may hold them.
+    """End effectors (tips) of the masters' arms, and the measured human hands that hold them.
+
+    A hand adds mass, damping and stiffness, which can make the arms stable or unstable.
 
     Attributes:
         hands: For each master, the operators that may hold its end effector.
@@ -404,7 +416,14 @@ def _locate_hands(
     loop: LinearLoop,
     hands: Sequence[HandMatrices],
 ) -> _HeldHands:
-    """Finds the end effectors of the masters, which measured operators may hold.
+    """Finds the end effectors of the masters' arms, at which measured human hands may act.
+
+    Args:
+        scenario: The experiment.
+        conditions: The coupled arms.
+        rest: Pose of rest of all arms.
+        loop: The loop, linearised at this pose.
+        hands: The measured hands.
 
     Raises:
         UsageError: An operator was measured along other axes than an end effector has.
@@ -449,7 +468,14 @@ def _check_proof(
     loop: LinearLoop,
     w_rad_s: Array,
 ) -> Passivity | None:
-    """Checks passivity with respect to the output r of the paper's proof.
+    """Checks over frequency the passivity on which the paper's stability proof rests.
+
+    The output of the proof is r, the velocity plus a multiple of the error.
+
+    Args:
+        conditions: The coupled arms.
+        loop: The linearised loop.
+        w_rad_s: Frequencies, in rad/s.
 
     Returns:
         The passivity under the weights of the proof. None if there is no proof for this loop,
@@ -472,9 +498,10 @@ def _check_two_ports(
     Y: port_response.PortResponse,
     w_rad_s: Array,
 ) -> tuple[TwoPort, ...]:
-    """Evaluates Llewellyn's criterion for every pair of sites, at each joint that both have.
+    """Checks for every pair of arms whether they are stable with every passive user and wall.
 
-    With three sites, the third one is once free and once clamped.
+    Llewellyn's criterion is evaluated at each joint that both arms have. With three arms, the
+    third one is once free and once clamped.
     """
     two_ports = []
     sites = port_response.list_port_sites(loop)
@@ -499,10 +526,9 @@ def _check_llewellyn(
     clamped: list[int],
     w_rad_s: Array,
 ) -> frequency_search.Minima:
-    """Evaluates Llewellyn's parameter of two ports over frequency.
+    """Evaluates Llewellyn's stability parameter of two joints over frequency.
 
-    The loop is stable with any passive operators at the two ports if the parameter is never
-    below 1.
+    The arms are stable with any passive operators at the two joints if it is never below 1.
 
     Args:
         Y: Admittance at all ports.
@@ -519,7 +545,7 @@ def _check_llewellyn(
 
 
 def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
-    """Returns a port analysis as plain values, ready for JSON.
+    """Converts an analysis of what operators feel to plain values for JSON.
 
     Infinite numbers become None, as JSON does not know them.
 
@@ -582,7 +608,7 @@ def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
 
 
 def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
-    """Returns what an operator feels of another arm, free and clamped, as plain values.
+    """Converts what an operator feels of another arm, free and clamped, to plain values.
 
     Args:
         transparency: The impedances that the operator feels.
@@ -604,7 +630,7 @@ def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
 
 
 def _list_followed_axes(site: SiteSetup) -> list[int]:
-    """Lists the coordinates along which a site follows its peers.
+    """Lists the joints, or the axes of the end effector, with which an arm follows the others.
 
     Args:
         site: Setup of the site.
@@ -618,7 +644,7 @@ def _list_followed_axes(site: SiteSetup) -> list[int]:
 
 
 def _name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns the names of the axes along which operators move the end effectors.
+    """Returns the names of the axes, such as "y", along which operators move end effectors.
 
     Args:
         conditions: The coupled arms.

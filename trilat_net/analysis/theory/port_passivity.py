@@ -60,10 +60,11 @@ _WEIGHT_TOLERANCE = 1e-3
 
 
 class Passivity(NamedTuple):
-    """Whether a loop is passive at some ports: whether it never supplies net energy there.
+    """Whether coupled arms are passive: they never supply net energy to their operators.
 
-    Y is the admittance over frequency, the velocities at the ports per torque. The loop is
-    passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate transpose.
+    Y is the admittance over frequency, the velocities at the operators' joints per torque. The
+    arms are passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate
+    transpose.
 
     Attributes:
         minima: Least eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands in
@@ -80,11 +81,10 @@ class Passivity(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if the loop is passive at all analysed frequencies.
+        """True if the arms are passive at all analysed frequencies: they never supply energy.
 
         This means that Y + Y^H has no negative eigenvalue, where Y is the admittance of the
-        ports and Y^H its conjugate transpose. The loop then never returns more energy than it
-        received.
+        ports and Y^H its conjugate transpose.
         """
         return not self.minima.below
 
@@ -106,9 +106,10 @@ class HandMatrices(NamedTuple):
     K: Array
 
     def compute_resistance(self, w_rad_s: Array) -> Complex:
-        """Returns the Hermitian part of the operator's impedance, shape (F, n, n), in N s/m.
+        """Returns the resistive part of a human hand's impedance, shape (F, n, n), in N s/m.
 
-        The impedance is Z(j w) = j w M + B + K / (j w).
+        It is the Hermitian part of Z(j w) = j w M + B + K / (j w), with the mass M, the damping
+        B and the stiffness K.
 
         Args:
             w_rad_s: Frequencies w, shape (F,), in rad/s.
@@ -186,7 +187,7 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of these eigenvalues."""
+        """Returns the rounding error of the least eigenvalue at each frequency w, in rad/s."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
@@ -217,7 +218,8 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
 def find_least_eigenvalue(Y: Complex) -> Array:
     """Returns the least eigenvalue of Y + Y^H at each frequency.
 
-    A response Y is passive if it is never negative. Y^H is the conjugate transpose.
+    Here Y is the admittance, from torques to velocities, and Y^H its conjugate transpose. The
+    arms are passive if the value is never negative: they never supply energy to operators.
 
     Args:
         Y: Response, shape (F, p, p).
@@ -286,7 +288,7 @@ def check_passivity(
     """
 
     def evaluate_weighted(w: Array) -> Complex:
-        """Returns the response, with the weights of the ports if there are any."""
+        """Returns the frequency response, with the weights of the ports if there are any."""
         Y = response(w)
         return Y if weights is None else weight_response(Y, weights)
 
@@ -295,7 +297,7 @@ def check_passivity(
         return find_least_eigenvalue(weighted)
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of the least eigenvalue."""
+        """Returns the rounding error of the least eigenvalue at each frequency w, in rad/s."""
         Y = response(w)
         norm = _find_frobenius_norm(Y)
         return EIGENVALUE_ROUNDING * norm
@@ -344,10 +346,10 @@ def llewellyn_parameter(Y: Complex) -> Array:
 
 
 def llewellyn_rounding(Y: Complex) -> Array:
-    """Returns the rounding error of Llewellyn's parameter at each frequency.
+    """Returns the rounding error of Llewellyn's stability parameter at each frequency.
 
     A value within this error of the limit decides nothing. The error is large if almost nothing
-    is transmitted from port to port.
+    is transmitted from one joint to the other.
 
     Args:
         Y: Admittance, shape (F, 2, 2).
@@ -475,9 +477,10 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
 
 
 def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
-    """Returns the smallest ellipsoid around the half of each that can contain the maximum.
+    """Shrinks ellipsoids that contain the maximum of a function, by one step of a search.
 
-    This is the update of the ellipsoid method after a step along the gradient.
+    After a step along the gradient, the maximum lies in one half of an ellipsoid. The result is
+    the smallest ellipsoid around this half. This is the ellipsoid method of optimisation.
 
     Args:
         ellipsoids: Matrices of the ellipsoids, shape (F, n, n).

@@ -59,7 +59,7 @@ _NEGLIGIBLE = 1e-3
 
 
 class LoopOutput(NamedTuple):
-    """An output of a loop that depends on its present and on its past state x.
+    """Output of a linear loop that depends on its present and its delayed states x.
 
     It is y(t) = C x(t) + sum_k C_k x(t - T_k).
 
@@ -72,9 +72,9 @@ class LoopOutput(NamedTuple):
     delayed: tuple[tuple[float, Array], ...] = ()
 
     def evaluate(self, s: Complex) -> Complex:
-        """Returns the matrix from the state to the output at complex frequencies.
+        """Returns the matrix from the state of the arms to an output at complex frequencies s.
 
-        It is C + sum_k C_k e^{-s T_k}.
+        It is C + sum_k C_k e^{-s T_k}, with the network delays T_k.
 
         Args:
             s: Complex frequencies, shape (F,), in 1/s.
@@ -215,6 +215,8 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
 def to_imaginary_axis(w_rad_s: Array) -> Complex:
     """Returns the points s = j w at which a frequency response is evaluated, in 1/s.
 
+    At 1 Hz, w is 6.28 rad/s.
+
     Args:
         w_rad_s: Frequencies w, in rad/s.
     """
@@ -222,10 +224,10 @@ def to_imaginary_axis(w_rad_s: Array) -> Complex:
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the arm's site to which an input or state of a linear model belongs.
+    """Returns the site (arm) in the name of a port or state, for example "m1" for "m1.tau2".
 
     Args:
-        port: Name of the port or state. For "m1.tau2" the site is "m1".
+        port: Name of the input or state of a linear model.
     """
     return port.partition(".")[0]
 
@@ -245,7 +247,9 @@ def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
 
 
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
-    """Finds the ports of a site, the joints at which its operator acts on the loop.
+    """Finds the ports of an arm, the joints at which its operator pushes.
+
+    In the linear model of all arms, each port is an input.
 
     Args:
         loop: The loop.
@@ -268,10 +272,12 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
 
 
 def _parse_port_joint(port: str) -> int:
-    """Returns the number of the joint to which a port belongs.
+    """Returns the joint number in the name of a port, for example 2 for "m1.tau2".
+
+    A port is a joint at which an operator or a wall pushes an arm.
 
     Args:
-        port: Name of the port. For "m1.tau2" the number is 2.
+        port: Name of the port.
     """
     _, _, number = port.rpartition("tau")
     return int(number)
@@ -315,9 +321,9 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
 
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of any link or signal in a linear loop, in s.
+    """Returns the longest delay of any network link or signal in a linear loop, in s.
 
-    Returns 0 for a loop without delays.
+    The result is 0 for a loop without delays.
     """
     delays_s = [term.delay_s for term in loop.delayed]
     return max(delays_s, default=0.0)
@@ -365,12 +371,12 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
 
 
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
-    """Returns the loop with the arm of a site held still by a clamp.
+    """Returns the linear model of the arms with one arm held still by a clamp.
 
-    The torque u_c of the clamp makes the site's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
+    The torque u_c of the clamp makes the arm's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
     u + delayed terms). Here x is the state, u the other torques, A_c and B_c are the rows of
     the loop's matrices for these accelerations, and B_cc is the part of B_c that belongs to the
-    site's own torques. The torque acts wherever the law uses the site's torque.
+    arm's own torques. The torque acts wherever the law uses the torque of this arm.
 
     Args:
         loop: The loop.
@@ -477,7 +483,10 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """Impedance that an operator feels at a joint, with another arm free and clamped.
+    """How much of another arm an operator feels: the impedance with it free and clamped.
+
+    A transparent system feels light while the other arm is free, and stiff while the other arm
+    is clamped.
 
     Attributes:
         operator_site: Site of the operator.
@@ -542,7 +551,7 @@ class Transparency(NamedTuple):
         return self._average_magnitude(difference)
 
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
-        """Returns the magnitudes of the impedances that the operator feels at one frequency.
+        """Returns the magnitudes of the impedances that an operator feels at one frequency.
 
         They are interpolated between the computed frequencies on logarithmic axes.
 
@@ -564,7 +573,7 @@ class Transparency(NamedTuple):
         return free, clamped
 
     def _average_magnitude(self, Z: Complex) -> float:
-        """Returns the mean magnitude of an impedance over the band, on logarithmic axes.
+        """Returns the mean magnitude of an impedance over a frequency band, on log axes.
 
         On these axes each decade of frequency and each decade of magnitude has the same weight.
 
@@ -587,11 +596,11 @@ class Transparency(NamedTuple):
 
 
 def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
-    """Computes what an operator at one site feels of another site, free and clamped.
+    """Computes what an operator feels of another arm that is free, and that is clamped.
 
-    With ideal transparency the operator would feel no impedance while the other site is free,
-    and a rigid one while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j
-    w) with the admittance Y of the loop. All other ports are free.
+    With ideal transparency the operator would feel nothing while the other arm is free, and a
+    rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j w)
+    with the admittance Y of the loop. All other ports are free.
 
     Args:
         loop: The loop.

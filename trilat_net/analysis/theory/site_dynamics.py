@@ -35,7 +35,10 @@ SWITCHING_TOLERANCE = 1e-9
 
 
 class ArgumentLayout:
-    """Positions of the parts of a site's argument vector: state, inputs from peers, own torque.
+    """Positions of quantities in the argument vector of one arm's equations of motion.
+
+    The vector contains the state of the arm, the inputs from other arms, and the torque of its
+    operator. Numerical derivatives are taken with respect to this vector.
 
     Args:
         joints: Number of joints n, which is the length of q, qd and the external torque.
@@ -86,10 +89,10 @@ class ArgumentLayout:
         self.inputs = slice(self.states, self.external_torque.start)
 
     def peer_sample(self, index: int) -> slice:
-        """Returns where the values received from one other site are stored in the vector.
+        """Returns where the argument vector has the values received from one other arm.
 
-        The values are the pose of that site's arm, the velocity of the pose, and the external
-        torque, in this order.
+        The values are the pose of that arm, the velocity of the pose, and the external torque,
+        in this order.
 
         Args:
             index: Index of the other site, where the site itself is not counted.
@@ -121,7 +124,9 @@ _make_layout = cache(ArgumentLayout)
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
-    """Returns the model of a site's arm in given poses, whose methods need no joint angles.
+    """Returns the model of an arm in given poses, with functions of the angles precomputed.
+
+    Its methods, such as the inertia matrix, therefore need no joint angles.
 
     Args:
         site: Setup of the site.
@@ -133,10 +138,10 @@ def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
 
 
 class SiteRates(NamedTuple):
-    """Rates of a site's states, and its torques and outputs, for given arguments.
+    """Rates of change of an arm's states, with its torques and the values that it sends.
 
-    The trailing axes "..." stand for several arguments. In derivatives they have one column for
-    each entry of the argument vector.
+    The trailing axes "..." stand for several evaluations at once. In derivatives they have one
+    column for each entry of the argument vector.
 
     Attributes:
         qdd: Joint accelerations, shape (n, ...), in rad/s^2.
@@ -212,7 +217,9 @@ def _follow(
 
 
 def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
-    """Returns the pose that a site shares: joint angles, or the pose of its end effector.
+    """Returns the pose that an arm sends to the other arms.
+
+    It consists of the joint angles, or in task space of the pose of the end effector (tip).
 
     Args:
         site: Setup of the site.
@@ -271,9 +278,10 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
 
 
 def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
-    """Computes the torque of operators and environments that a site sends to the other sites.
+    """Computes the torque of operators and walls that an arm sends to the other arms.
 
-    It is the entry `reflected` of `evaluate_site_rates`, without the other entries.
+    With this torque, a user feels what another arm touches. It is the entry `reflected` of
+    `evaluate_site_rates`, without the other entries.
 
     Args:
         site: Setup of the site.
@@ -324,7 +332,7 @@ def has_estimate(site: SiteSetup) -> bool:
 
 
 def _as_columns(values: object, like: Numbers) -> Numbers:
-    """Repeats constants, such as gains, for each column of another array.
+    """Adds axes to constants such as gains, so that NumPy repeats them for all columns.
 
     Args:
         values: The constants, of any shape.
@@ -433,7 +441,7 @@ def _evaluate_adaptive_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """Returns True where an estimate is at its limit and its rate points beyond the limit.
+    """Returns True where a parameter estimate is at its limit and would leave its range.
 
     The adaptive law then holds the estimate (projection).
     """
@@ -456,7 +464,7 @@ def _sum_actors(
     *,
     sampled: bool,
 ) -> Numbers:
-    """Returns the sum of the torques of operators and environments.
+    """Returns the total torque with which operators and walls push on an arm.
 
     Args:
         site: Setup of the site, with the operators and environments in force.
@@ -576,10 +584,10 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 
 
 def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
-    """Finds estimates that rest exactly at a limit, and of which the law holds none.
+    """Finds parameter estimates at which the control law has no two-sided derivative.
 
-    The derivative of the law is one-sided there. The result is True for each such estimate,
-    shape (P,).
+    They rest exactly at a limit, and the law does not hold them. The result is True for each
+    such estimate, shape (P,).
     """
     layout = lay_out_arguments(site)
     gains = site.gains

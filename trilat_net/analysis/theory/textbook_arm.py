@@ -65,7 +65,7 @@ _INERTIA_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 
 
 def _build_cross_matrix(a: Numbers) -> Numbers:
-    """Returns the matrix A with A b = a x b for every vector b, shape (3, 3, ...).
+    """Returns the matrix A that computes a cross product, A b = a x b, shape (3, 3, ...).
 
     Args:
         a: The left factor of the cross product, shape (3, ...).
@@ -75,7 +75,7 @@ def _build_cross_matrix(a: Numbers) -> Numbers:
 
 
 def _build_inertia_units() -> Numbers:
-    """Returns the spatial inertia of each unit parameter of a link, shape (10, 6, 6).
+    """Returns the spatial inertia of a link for each unit parameter, shape (10, 6, 6).
 
     A link's inertia is linear in its parameters: mass, first moments, second moments.
     """
@@ -164,10 +164,11 @@ class _PlacedLink(NamedTuple):
 
 
 class PlacedChain:
-    """Dynamics of a serial arm with n joints, evaluated in given poses.
+    """Dynamics of a serial arm with n joints in given poses, such as its inertia matrix.
 
-    It is written from textbook formulas, independently of the simulation. The trailing axes
-    "..." stand for the poses. It has the same methods as the planar arm, `PlacedArm`.
+    It is written from textbook formulas, independently of the simulation, to check the
+    simulation. The trailing axes "..." stand for the poses. It has the same methods as the
+    planar arm, `PlacedArm`.
 
     Args:
         chain: Description of the links and joints.
@@ -287,7 +288,7 @@ class PlacedChain:
         return torque
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns the torque of the joints' friction, which opposes a motion, in N m.
+        """Returns the torque that overcomes the friction in the joints of the arm, in N m.
 
         Args:
             v: Joint velocities, shape (n, ...).
@@ -305,10 +306,13 @@ class PlacedChain:
         return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the torque G(q) that holds the chain against gravity, shape (n, ...), in N m.
+        """Returns the torque with which motors hold the arm still against gravity, in N m.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).
+
+        Returns:
+            Torque, shape (n, ...).
         """
         zeros = np.zeros_like(self._q)
         return self.required_torque(theta, zeros, zeros, zeros)
@@ -354,9 +358,9 @@ class PlacedChain:
         return solve_columns(M, net_torque)
 
     def _compute_stop_torque(self, qd: Numbers) -> Numbers:
-        """Returns the torque of the joints' mechanical stops, shape (n, ...), in N m.
+        """Returns the torque of the mechanical end stops of the joints, shape (n, ...), in N m.
 
-        A stop at the end of a joint's range is a spring with a damper.
+        An end stop is a spring with a damper at the end of a joint's range.
         """
         q = self._q
         stiffness = self._get_per_joint("stop_stiffness")
@@ -379,7 +383,7 @@ class PlacedChain:
         return total
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector in the frame of the base, in m.
+        """Returns the position of the end effector (tip) in the frame of the base, in m.
 
         The shape is (3, ...), with one column for each set of joint angles.
         """
@@ -458,7 +462,7 @@ class PlacedChain:
         return rate + frame_rate
 
     def _move_to_tip(self, columns: Numbers) -> Numbers:
-        """Converts spatial velocities of the last link to the point of the end effector.
+        """Converts spatial velocities from the last link to the end effector (tip of the arm).
 
         The arguments are along the axes of the link, and the results along those of the base.
         Both have the shape (6, n, ...).
@@ -485,7 +489,9 @@ def _multiply_inertia_units(motion: Numbers) -> Numbers:
 
 
 def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
-    """Returns the matrix X that transforms spatial velocities into a link's frame.
+    """Returns the matrix that transforms a spatial velocity into the frame of the next link.
+
+    A spatial velocity has six components, three of rotation and three of translation.
 
     Args:
         R: Orientation of the link in the frame of the link before, shape (3, 3, ...).
@@ -677,10 +683,10 @@ def _find_quaternion(R: Numbers) -> Numbers:
 
 
 def _relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
-    """Returns the rotation that turns one orientation into another, as a rotation vector.
+    """Returns the rotation vector that turns one orientation into another, in rad.
 
-    The rotation vector has the direction of the axis and the length of the angle. Its
-    components are those in the axes of the base.
+    It has the direction of the axis and the length of the angle. Its components are those along
+    the axes of the base.
 
     Args:
         other: Rotation matrix of the orientation before the rotation, shape (3, 3, ...).
@@ -738,8 +744,8 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
 class Following(NamedTuple):
     """Errors and reference motion with which an arm follows other arms.
 
-    Either its n joints follow, or its end effector along m coordinates. In the first case m is
-    n.
+    Either its n joints follow, or its end effector (tip) along m coordinates. In the first case
+    m is n.
 
     Attributes:
         x: Pose that other arms can follow, shape (m, ...).
@@ -836,7 +842,7 @@ def follow_joints(
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
-    """Returns the pose of the end effector that a site sends to its peers.
+    """Returns the pose of the end effector (tip) that an arm sends to the other arms.
 
     It is the position in m, and the rotation vector in rad if the task includes orientation.
 
@@ -861,7 +867,7 @@ def follow_in_task(
     x_des: Numbers,
     xd_des: Numbers,
 ) -> Following:
-    """Computes the errors and the reference motion with which an end effector follows a pose.
+    """Computes the errors and the reference motion of an end effector that follows a pose.
 
     The pose has m coordinates, and the arm has n joints.
 
@@ -928,9 +934,10 @@ def follow_in_task(
 
 
 def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
-    """Returns the difference x - x_des of two poses, shape (m, ...).
+    """Returns the difference x - x_des of two poses of an end effector, shape (m, ...).
 
-    Orientations R and R_des differ by the rotation vector Log(R R_des').
+    Positions are subtracted. Orientations R and R_des differ by the rotation vector Log(R
+    R_des').
     """
     e = x - x_des
     if len(x) == POSITION:

@@ -69,7 +69,7 @@ class EnvelopeTrend(StrEnum):
 
 
 class EnvelopeFit(NamedTuple):
-    """Trend of the magnitude of an oscillation, computed by `fit_envelopes`.
+    """Trend of an oscillation's amplitude: growing, decaying or constant. See `fit_envelopes`.
 
     The envelope is the largest magnitude of a signal in each short interval of time.
 
@@ -118,7 +118,7 @@ def fit_envelopes(
 ) -> list[EnvelopeFit]:
     """Determines whether oscillations grow, decay or stay, over the second half of a run.
 
-    The module's docstring defines the classes of the trend.
+    The module's docstring defines these classes of the trend.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
@@ -170,7 +170,10 @@ def _find_window_maxima(
     windows: int,
     floor: float,
 ) -> Array | None:
-    """Returns the maximum of each envelope in equal windows of the second half of the run.
+    """Returns the maximum amplitude in each of several equal windows of time.
+
+    Maxima of windows remove the oscillation. Only the second half of the run counts, after the
+    first transients.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
@@ -195,7 +198,9 @@ def _find_window_maxima(
 
 
 def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[EnvelopeFit]:
-    """Fits a line through the logarithms of each envelope's maxima, and classifies its trend.
+    """Fits a line to the logarithm of a motion's amplitude, and classifies its trend.
+
+    An amplitude that falls exponentially gives a straight line with a negative slope.
 
     Args:
         maxima: Maxima of n equal windows of C envelopes, shape (n, C).
@@ -241,7 +246,9 @@ def _classify_trend(
     *,
     dead: bool,
 ) -> EnvelopeTrend:
-    """Returns the class of the trend of an envelope, as the module's docstring defines it.
+    """Returns whether an amplitude grows, decays or stays, from a fitted line and its error.
+
+    The docstring of the module defines these classes.
 
     Args:
         change: Change of the envelope's logarithm over the half, according to the line.

@@ -130,10 +130,10 @@ def estimate_miss_probability(directions: int) -> float:
 
 
 class RestDeparture(NamedTuple):
-    """A time in which a run and its twins moved away from rest by themselves.
+    """Interval of time in which a run moved away from rest by itself, so that rest is unstable.
 
-    Twins are repeated runs with a small push. Nobody acts on the arms during this time, which
-    shows that the rest position is unstable.
+    Its twins, repeated runs with a small push, did the same. Nobody acted on the arms during
+    this time.
 
     Attributes:
         from_s: Start, in s.
@@ -149,9 +149,9 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """Whether small pushes grow or die away in repetitions of a run, computed by `judge_twins`.
+    """Whether the effects of small pushes on a run grow or die away, see `judge_twins`.
 
-    Each push is made in a repetition of its own, which is called a twin. The difference between
+    Each push is made in a repetition of the run, which is called a twin. The difference between
     the twin and the run is then observed.
 
     Attributes:
@@ -184,16 +184,16 @@ class TwinGrowth(NamedTuple):
 
     @property
     def worst(self) -> PushGrowth | None:
-        """The push whose effect grew most, or died away most slowly.
+        """The small push whose effect on the run grew most, or died away most slowly.
 
-        A push is a small disturbance in a repetition of the run. The trend of this push counts
-        as the trend of the whole run. None if there are no pushes.
+        Each push was made in a repetition of the run. The trend of this push counts as the
+        trend of the whole run. None if there are no pushes.
         """
         return max(self.pushes, key=_rank_badness, default=None)
 
     @property
     def trend(self) -> EnvelopeTrend:
-        """Whether the worst push of the run grows or dies away, as a class.
+        """Whether the effect of the worst push grows or dies away, as a class.
 
         The worst push is the push whose effect grows most or dies away most slowly. Undecided
         if there are no pushes.
@@ -232,7 +232,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def _miss_text(self) -> str:
-        """A clause on how likely random pushes of all joints miss a growth, for the user.
+        """A clause for the user on how likely random pushes fail to reveal an unstable run.
 
         Empty if each joint was pushed by itself.
         """
@@ -258,10 +258,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def judged_bursts(self) -> float:
-        """Mean number of bursts of lost samples in the judged part of the run.
+        """Mean number of bursts of lost messages in the judged part of the run.
 
-        A trend over few bursts says little about the run with more of them. The link with the
-        fewest bursts counts. Infinite if no link loses samples in bursts.
+        A trend over few bursts says little about a run with more of them. The network link with
+        the fewest bursts counts. Infinite if no link loses messages in bursts.
         """
         if self.burst_interval_s is None:
             return math.inf
@@ -380,9 +380,9 @@ class TwinGrowth(NamedTuple):
         *,
         own_laws: bool = False,
     ) -> "TwinGrowth":
-        """Repeats a recorded run with small pushes, and judges whether the pushes grow.
+        """Repeats a recorded run with small pushes, and judges whether their effects grow.
 
-        Each repetition with a push is called a twin.
+        If they grow, the run is not stable. Each repetition with a push is called a twin.
 
         Args:
             log: The log of the run.
@@ -411,10 +411,9 @@ class TwinGrowth(NamedTuple):
         duration_s: float,
         count: int | None = None,
     ) -> "TwinGrowth":
-        """Simulates a scenario with small pushes, and judges whether the pushes grow.
+        """Simulates a scenario with small pushes, and judges whether their effects grow.
 
-        This needs no log: the run and its repetitions with a push, the twins, are executed in
-        virtual time.
+        This needs no log: the run and its repetitions with a push, the twins, are simulated.
 
         Args:
             scenario: The description of the experiment.
@@ -435,9 +434,9 @@ def judge_twins(
     counts_from_s: float,
     quiet_from_s: float,
 ) -> TwinGrowth:
-    """Judges whether the pushes in the twins of a run grow or die away.
+    """Judges whether the effects of small pushes on a run grow or die away.
 
-    A twin is a repetition of the run with a small push. Its difference from the run is
+    Each push is made in a repetition of the run, a twin. The difference between twin and run is
     evaluated over the judged part of the run.
 
     Args:
@@ -511,7 +510,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
 
 
 def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
-    """Moves the start of the part that counts so that its second half has whole periods.
+    """Moves the start of the judged part of a run so that its second half has whole periods.
 
     Otherwise the judgement would depend on the part of the period in which the run ends.
 
@@ -605,7 +604,7 @@ def _measure_interval(differences: Array, scale: Array, largest: Array) -> Array
 def _running_maximum(values: Array) -> Array:
     """Returns the maximum over half a second before and after each value, shape (K,).
 
-    It removes the zero crossings of an oscillation.
+    It turns an oscillation into its amplitude, without the zero crossings.
     """
     padded = np.pad(values, BUCKETS_PER_S // 2, constant_values=-np.inf)
     windows = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1)
@@ -614,7 +613,7 @@ def _running_maximum(values: Array) -> Array:
 
 
 def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
-    """Returns whether an amplitude grows, decays or stays, from its logarithm over time.
+    """Returns whether a small difference between two runs grows, decays or stays.
 
     Args:
         t_s: Times, shape (K,), in s.
@@ -869,10 +868,10 @@ class PushedTwins(Result):
         return self.describe(worst) if worst else self.growth.text
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each push: what was pushed, and how its effect develops.
+        """Returns a table row for each small push: what was pushed, and how its effect evolves.
 
-        A push is a small disturbance in a repetition of the run. The keys are those of an entry
-        of `pushes` in `trilat twin --json`.
+        Each push was made in a repetition of the run. The keys are those of an entry of
+        `pushes` in `trilat twin --json`.
         """
         rows = self.growth.to_json()["pushes"]
         return [
@@ -881,7 +880,7 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the pushes and how they develop, with the keys of `trilat twin --json`.
+        """Converts pushes and their effects to plain values, as `trilat twin --json` prints.
 
         The entry "linear" is None if the growth was not compared with characteristic roots.
         """
@@ -967,13 +966,12 @@ def twin(
 
 
 def _parse_push(text: str) -> tuple[str, float]:
-    """Parses a push such as "m1.q1=1e-6".
+    """Parses the small push with which a run is repeated, such as "m1.q1=1e-6".
 
-    Returns:
-        The target and the size. The size may be missing and then has a default value.
+    The example moves joint 1 of arm m1 by 1e-6 rad.
 
-    Raises:
-        UsageError: The size is not a number.
+    Args:
+        text: The text that the user gave.
     """
     target, separator, size = text.partition("=")
     try:
@@ -988,11 +986,10 @@ def _parse_push(text: str) -> tuple[str, float]:
 def _parse_sizes(text: str) -> list[float]:
     """Parses a range of push sizes such as "1e-9:1e-3".
 
-    Returns:
-        The sizes from the lower to the upper end of the range, each ten times the one before.
+    A run is repeated with each size, to see whether the growth depends on it.
 
-    Raises:
-        UsageError: The text is no range, or the range is too short or too large.
+    Args:
+        text: The text that the user gave.
     """
     try:
         low, high = map(float, text.split(":"))

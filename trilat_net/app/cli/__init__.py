@@ -93,9 +93,10 @@ _SUBJECTS = {
 
 
 class _Group(TyperGroup):
-    """A group of commands that suggests a command in place of an unknown one.
+    """A group of commands such as `trilat log`, which corrects misspelled commands.
 
-    The group also has the commands that other packages add to it.
+    In place of an unknown command, it suggests a similar one. The group also has the commands
+    that other packages add to it.
     """
 
     def __init__(self, *, name: str | None = None, **settings: Any) -> None:
@@ -162,7 +163,7 @@ class _Commands(_Group):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Returns the names of all commands in the order of the help, which has panels.
+        """Returns the names of all commands in the order in which the help lists them.
 
         Commands of other packages without a place in this order come last.
         """
@@ -219,9 +220,10 @@ def _main(
 
 
 def _deferred(read: Callable[[Any], Any]) -> Any:
-    """Returns a property that reads a value when the value is needed.
+    """Returns a property that reads a value only when the value is needed.
 
-    Click assigns such attributes when it makes a command. The assigned values are ignored.
+    Click, the library of the command line, assigns such attributes when it makes a command. The
+    assigned values are ignored.
 
     Args:
         read: Method that returns the value.
@@ -230,9 +232,10 @@ def _deferred(read: Callable[[Any], Any]) -> Any:
 
 
 class _PackageCommand(TyperCommand):
-    """A command of another package, which is imported when somebody uses the command.
+    """A command of another package, which is imported only when somebody uses it.
 
-    The help of the whole program needs only the first sentence of the command's help.
+    Importing all packages would make every command start slowly. The help of the whole program
+    needs only the first sentence of the command's help.
 
     Args:
         command_line: Name of the command, with that of its group, as in "identify hand".
@@ -247,7 +250,7 @@ class _PackageCommand(TyperCommand):
 
     @cached_property
     def _command(self) -> Any:
-        """The imported command.
+        """The function of the command, which is imported from its package at the first use.
 
         Raises:
             UsageError: The package of the command is not installed or cannot be imported.
@@ -297,7 +300,7 @@ class _PackageCommand(TyperCommand):
         return self._command.params
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
-        """Parses the arguments of the command. The command of the context is the imported one.
+        """Parses the arguments with the real command, which is imported from its package now.
 
         Raises:
             UsageError: The package of the command is not installed or cannot be imported.
@@ -306,7 +309,7 @@ class _PackageCommand(TyperCommand):
 
 
 def _list_package_commands(group: str) -> Iterator[_PackageCommand]:
-    """Yields the commands of other packages that belong to a group.
+    """Yields the commands that other installed packages add to the command line.
 
     Args:
         group: Name of the group. Empty for commands without a group.
@@ -384,7 +387,7 @@ _GROUP_OPTIONS = {"set": "--session paper "}
 
 
 def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
-    """Adds a command to a group of commands, with its help and its examples.
+    """Adds a command to the command line, with its help and its examples.
 
     Args:
         group: The group.
@@ -462,7 +465,7 @@ _MEMORY_ERRORS = (
 
 
 def _run() -> None:
-    """Runs `trilat`, and names the remedy if a library is missing.
+    """Runs the command line program `trilat`, and names the remedy if a library is missing.
 
     An installation may lack libraries that only some commands need.
     """

@@ -261,7 +261,7 @@ def log_view_command(
 
 
 def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
-    """Writes the files with which other viewers show a log, and prints how to use them.
+    """Writes layout files for the viewers Foxglove and RViz, and prints how to use them.
 
     A viewer then opens with the plots of all arms, which need not be arranged by hand.
 
@@ -289,9 +289,9 @@ def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) 
 
 
 def _open_page(files: list[Path]) -> None:
-    """Opens the page of a log in a browser, in place of the viewer Rerun.
+    """Opens the report (web page) of a log in a browser.
 
-    If the page is missing, it is written first, as by `trilat report`.
+    If the report is missing, it is written first, as by `trilat report`.
 
     Args:
         files: The log, or its parts.

@@ -106,10 +106,10 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Returns the sites without which a session may begin, after checking them.
+    """Checks which arms may be absent at the start of a session, as an option names them.
 
-    Sites that join later are permitted only if the arms glide back to each other after a break.
-    Only the first site decides about the start of a session.
+    Arms that join later are permitted only if all arms glide back to each other after a break.
+    Only the first site (process of an arm) decides about the start of a session.
 
     Args:
         scenario: The scenario of the session.
@@ -249,7 +249,7 @@ def record_command(
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Returns the path of a session's log, and creates the folder for the log and its report.
+    """Chooses the file of a session's log, and creates the folder for it and its report.
 
     Args:
         output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
@@ -272,7 +272,7 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 
 def _conclude(files: list[Path], *, png: bool) -> None:
-    """Checks a finished log, and writes its report into the folder of the log.
+    """Checks a finished log, and writes a report about the run into the folder of the log.
 
     Args:
         files: Paths of all files into which the log was split.
@@ -429,7 +429,7 @@ def replay_command(
 def _announce_playback(
     header: "SessionHeader", name: str, rate: float, print_line: Callable[[str], None]
 ) -> None:
-    """Prints which sites of a log are replayed, as which session, and how fast.
+    """Prints which arms of a log are replayed, as which session, and how fast.
 
     A note warns if the messages have another version than those of this program.
 
@@ -541,10 +541,9 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
 
 
 def _show_playback(outcome: "PlaybackSummary") -> None:
-    """Prints the outcome of a replay.
+    """Prints the outcome of a replay: numbers of messages, duration and lateness.
 
-    It has the number of messages of each channel, the duration, the delay of the messages
-    behind their schedule, and whether a recorder received all of them.
+    The user also sees whether a recorder received all of the messages.
     """
     if terminal.err.is_interactive:
         terminal.err.file.write("\r" + " " * 72 + "\r")  # erases the line of the progress
@@ -579,7 +578,7 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
-    """Warns of files of a log that were not finished, for example because of a power failure.
+    """Warns the user of log files that were cut off, for example by a power failure.
 
     Args:
         torn: For each file the problem.
@@ -701,7 +700,9 @@ def _print_router_line(text: str) -> None:
 
 
 def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Returns the limit at which a log is split into parts, from an option like --split-size.
+    """Parses an option such as --split-size, the size or duration at which a log is split.
+
+    For example, 2 MB with the scale 1e6 gives 2000000 bytes.
 
     Args:
         option: Name of the option, for the error message.

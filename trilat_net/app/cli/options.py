@@ -79,7 +79,7 @@ def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
 
 
 def flag(names: str, text: str = "", **settings: Any) -> Any:
-    """Declares a command-line option without a value, as in `--json`.
+    """Declares a command-line option that is on or off, as in `--json`.
 
     Args:
         names: Names of the option, as in "--json" or "--ports/--no-ports".
@@ -156,7 +156,7 @@ def list_laws() -> list[str]:
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Returns the scenarios with which a shell may complete the word that a user types.
+    """Lists the scenarios that the shell offers when the user presses the tab key.
 
     They are the shipped scenarios, and the TOML files of a folder.
 
@@ -178,7 +178,9 @@ def complete_scenarios(incomplete: str) -> list[str]:
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Lists the names of plots that begin with the letters that the user has typed in a shell.
+    """Lists the names of figures that begin with the letters that the user has typed.
+
+    The shell offers these names when the user presses the tab key.
 
     Args:
         incomplete: The letters before the completion.
@@ -189,7 +191,7 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Returns the names of arms (sites) with which a shell may complete the word of a user.
+    """Lists the names of arms that the shell offers when the user presses the tab key.
 
     Args:
         context: The command line, whose scenario or log has the sites.
@@ -329,9 +331,10 @@ MOST_LETTERS = 80
 
 
 def check_session_name(name: str) -> str:
-    """Checks that the name of a session can be part of a Zenoh key, and returns the name.
+    """Checks that the name of a session can be part of a network address, and returns it.
 
-    Zenoh is the network protocol, and its keys are the names of the channels.
+    Zenoh, the network library, calls such an address a key, in which some characters are not
+    allowed.
 
     Raises:
         UsageError: The name is too long or has other characters.
@@ -444,9 +447,9 @@ AllOption = Annotated[
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Refuses the path of a figure that cannot be written.
+    """Refuses the path of a figure that cannot be written, before the figure is computed.
 
-    The check is made before the result is computed, which may take long.
+    The computation may take long, and would be lost.
 
     Args:
         path: Path of the figure. None if no figure was requested.
@@ -502,7 +505,7 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Loads the scenario of a command, and applies the options that change it.
+    """Loads the scenario that a command names, with the changes that its options request.
 
     Args:
         source: Name of a shipped scenario, or path of a TOML file.
@@ -520,7 +523,7 @@ def load_chosen_scenario(
 def _refuse_double_setting(
     overrides: list[str] | None, key: str, option: str, given: float | None
 ) -> None:
-    """Refuses a setting of the scenario that the user has given in two ways.
+    """Raises an error if the user has given a setting in two ways that may contradict.
 
     For example, --duration 5 and --set duration_s=10 contradict each other.
 
@@ -548,9 +551,9 @@ def _find_key(override: str) -> str:
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
-    """Returns the changes of the scenario that --set and --duration ask for, in this order.
+    """Returns the changes of a scenario that the options --set and --duration request.
 
-    An experiment is changed in this way without editing its file.
+    A user can in this way change an experiment for one run without editing its file.
 
     Args:
         overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
@@ -567,7 +570,7 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Splits the names that an option lists: "adaptive, p_d" gives ["adaptive", "p_d"].
+    """Splits the names that a user gave in one option: "adaptive, p_d" gives two names.
 
     None, which stands for an absent option, gives an empty list.
     """
@@ -575,7 +578,7 @@ def split_names(text: str | None) -> list[str]:
 
 
 def list_used_options(context: typer.Context) -> list[str]:
-    """Lists the options and arguments that the user wrote on the command line.
+    """Lists the options that the user wrote on the command line, without those at defaults.
 
     Commands use the list to refuse combinations: an option with its default value is no
     conflict.
@@ -592,10 +595,10 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """The options with which a process takes part in a session as one of its members.
+    """Options with which a process connects to the other processes of a session.
 
-    The members of a session are its sites and recorders. The options say at which endpoints the
-    process listens, to which it connects, and with which keys.
+    The options say at which network endpoints the process listens, to which it connects, and
+    with which keys.
     """
 
     listen: ListenOption = None
@@ -636,9 +639,9 @@ class MemberOptions(NamedTuple):
         *,
         stops: bool = False,
     ) -> "Connection":
-        """Returns the connection that the options describe, secured by the keys of the process.
+        """Returns the network connection that the options of a command describe, with its keys.
 
-        Prints a note if the keys expire soon.
+        A note for the user is printed if the keys expire soon.
 
         Args:
             listen_else: Endpoints at which to listen if the options name none.
@@ -673,7 +676,7 @@ class Reach(NamedTuple):
     keys: KeysOption = None
 
     def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
-        """Returns the connection to the session that the command line options describe.
+        """Returns the connection to a running session that the command-line options describe.
 
         If the session is encrypted, the option --keys names the keys of the command.
 
@@ -689,7 +692,7 @@ class Reach(NamedTuple):
 
 
 class LawFiles(NamedTuple):
-    """The options that allow files to run as the user-written control laws that a log names.
+    """Options that permit a log's control laws, written by a user, to be executed.
 
     A log may come from somebody else. Code that it names runs only with the permission of the
     user.
@@ -720,7 +723,7 @@ class LawFiles(NamedTuple):
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Opens a log, and warns the user if code from another person will be executed.
+        """Opens a log, and warns the user if code of another person will be executed.
 
         A log may name files with control laws, which are executed if the run is repeated.
 
@@ -737,7 +740,7 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """The options of a command that runs a session on this machine and reports on it.
+    """Options of a command that runs a session on this machine and reports on it.
 
     The options override parts of the scenario (`load`), name the folder of the results, and say
     what is written and printed.
@@ -754,7 +757,7 @@ class RunOptions(NamedTuple):
     as_json: JsonOption = False
 
     def load(self, source: str, longest_s: float | None = None) -> "Scenario":
-        """Returns the scenario of the run, with the changes that the options ask for.
+        """Loads the scenario of the run, with the changes that the command's options request.
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
@@ -820,7 +823,9 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def parse_viz_rate(text: str) -> float:
-    """Parses the option `--views`, the rate of the messages for viewers such as Foxglove.
+    """Parses the option `--views`: how many messages per second viewers such as Foxglove get.
+
+    Fewer messages make the log smaller.
 
     Args:
         text: A number from 1 to 1e6, "off" or "full".

@@ -28,7 +28,9 @@ _PROGRESS_LINES = 10
 def show_progress(
     label: str, print_line: Callable[[str], None], items: str = "runs"
 ) -> Iterator[Callable[[int, int], None]]:
-    """Shows progress as a bar in a terminal, and elsewhere as a few printed lines.
+    """Shows the progress of a long computation as a bar in a terminal.
+
+    Elsewhere, for example in a log file, a few lines are printed instead.
 
     Args:
         label: Label of the bar.
@@ -79,7 +81,9 @@ def show_progress(
 
 
 def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, with its results in a new folder, for commands with several runs.
+    """Runs a scenario live, and stores its results in a new folder.
+
+    Commands that run several scenarios use it, so that results do not replace each other.
 
     Args:
         scenario: The scenario.

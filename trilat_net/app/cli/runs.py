@@ -107,7 +107,7 @@ def sim_command(
 
 
 def _describe_length(scenario: "Scenario", path: Path) -> str:
-    """Returns how long a simulated run is and which arms (sites) it has, as a phrase.
+    """Returns a phrase on how long a simulated run is and which arms it has.
 
     A run that diverged is shorter than planned, and the phrase says so.
 
@@ -394,7 +394,9 @@ def figure_command(
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints the names of all figures. Figures that a log cannot have follow with the reason.
+    """Prints the names of all figures that a command can draw from a log.
+
+    Figures that the log has no data for follow, with the reason.
 
     Args:
         log: The log.
@@ -605,7 +607,7 @@ def linear_command(
 
 
 def _parse_pose(text: str | None) -> tuple[float, ...] | None:
-    """Parses joint angles from a string such as "0.1,0.3".
+    """Parses the joint angles that a user gave on the command line, such as "0.1,0.3".
 
     Args:
         text: The text. None if the user gave no pose.

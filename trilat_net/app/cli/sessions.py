@@ -51,7 +51,7 @@ class _SessionPage(Protocol):
         """Shows the session while it runs. `SessionAttendant` explains arguments and result."""
 
     def offer_results(self, paths: Iterable[Path]) -> None:
-        """Offers the report and the log for download to those who look at the page.
+        """Adds links to the session's web page, for downloading the report and the log.
 
         Args:
             paths: Files that the run has written.
@@ -83,7 +83,7 @@ def _describe_log(path: Path) -> str:
 def run_and_report(
     chosen: "Scenario", run: options.RunOptions, page: "_SessionPage | None" = None
 ) -> None:
-    """Runs a scenario live, then verifies its log and writes a report.
+    """Runs a scenario live, then checks its log and writes a report about the run.
 
     Args:
         chosen: The scenario.
@@ -266,10 +266,9 @@ _OPTIONS_WITH_MODE = {
 
 
 def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
-    """Refuses options that do not belong to the selected mode of `trilat ping`.
+    """Raises an error for options that have no effect in the selected mode of `trilat ping`.
 
-    The command has modes for sessions, for ROS 2 topics and for benchmarks. An option of
-    another mode would have no effect.
+    The command has modes for sessions, for ROS 2 topics and for benchmarks.
 
     Args:
         context: The command line.
@@ -301,6 +300,8 @@ def _benchmark(
     as_json: bool,
 ) -> None:
     """Measures whether the network is good enough for a scenario, and prints the result.
+
+    The network is good enough if the arms would be stable with its delays.
 
     Args:
         scenario: Name of a shipped scenario, or path of a TOML file.
@@ -336,7 +337,7 @@ def _benchmark(
 def _ping_topic(
     topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool
 ) -> None:
-    """Measures the delay of the messages of a ROS 2 topic, and prints the result.
+    """Measures the network delay of the messages of a ROS 2 topic, and prints the result.
 
     Args:
         topic: Name of the topic.
@@ -378,7 +379,7 @@ def _ping_topic(
 def _run_far_end(
     endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
 ) -> None:
-    """Replies to benchmarks from other machines, for a time or until Ctrl-C.
+    """Replies to network benchmarks from other machines, for a time or until Ctrl-C.
 
     This is the counterpart of `trilat ping --benchmark`: it sends every message back at once.
 
@@ -413,9 +414,9 @@ SitesArgument = Annotated[
 
 
 def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
-    """Prepares the connection to a running session.
+    """Prepares the connection over which a command sends requests to a running session.
 
-    The commands `trilat stop`, `set` and others send their requests over it.
+    `trilat stop` and `trilat set` are such commands.
 
     Args:
         session: Name of the session.
@@ -487,10 +488,13 @@ _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
 
 
 def _parse_milliseconds(text: str) -> float:
-    """Parses a time with its unit, such as 350ms or 0.35s.
+    """Parses a time with its unit, such as 350ms or 0.35s, as a user gives it for a delay.
+
+    Args:
+        text: The text that the user gave.
 
     Returns:
-        The time in ms.
+        The time in ms, which is 350 for both examples.
 
     Raises:
         UsageError: The text is not a number with a unit.
@@ -506,7 +510,10 @@ def _parse_milliseconds(text: str) -> float:
 
 
 def _parse_share(text: str) -> float:
-    """Parses a number or a percentage, such as 0.05 or 5%.
+    """Parses a number or a percentage, such as 0.05 or 5%, as a user gives it for a loss.
+
+    Args:
+        text: The text that the user gave.
 
     Returns:
         The number, which is 0.05 for both examples.
@@ -637,7 +644,7 @@ def set_dominance_command(
 
 
 def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> None:
-    """Requests a change from a site of the running session, and prints its reply.
+    """Requests a change, such as another delay, from a running arm, and prints the reply.
 
     Args:
         context: The command line. `set_command` has stored the session and the connection in

@@ -94,9 +94,10 @@ def _limit_by_later(values: Ints) -> Ints:
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """Stores K messages compactly, as a table of numbers and one buffer with all payloads.
+    """K messages of a log in compact form: a table of numbers, and one buffer with contents.
 
-    Several batches may share the same buffer.
+    A Python object per message would need much more memory. Several batches may share the same
+    buffer.
 
     Attributes:
         rows: Table with a row per message, shape (K, 5). The columns are the deadline after the
@@ -113,15 +114,15 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Time at which each message is due, in ns after the start of the session, shape (K,).
+        """Time of each message, in ns after the start of the session, shape (K,).
 
-        The player publishes each message at this time, scaled by the speed of playing.
+        The player publishes each message at this time, scaled by the speed of the replay.
         """
         return self.rows[:, _TIME]
 
     @property
     def end_ns(self) -> int:
-        """Time at which the last message is due, in ns after the start of the session.
+        """Time of the last message of the batch, in ns after the start of the session.
 
         An empty batch has no such time, and raises IndexError.
         """
@@ -129,7 +130,10 @@ class MessageBatch:
 
     @property
     def channels(self) -> Ints:
-        """Channel of each message, shape (K,)."""
+        """Number of the channel of each message, shape (K,).
+
+        A channel is a topic of the log, such as the records of one arm.
+        """
         return self.rows[:, _CHANNEL]
 
     @property
@@ -147,7 +151,7 @@ class MessageBatch:
         return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
-        """Returns the encoded content of one message, exactly as it was published originally.
+        """Returns the encoded content of one message, exactly as it was first published.
 
         Args:
             index: Index of the message in this batch, 0 for the first one.
@@ -167,7 +171,7 @@ class MessageBatch:
             yield t_ns, channel, number, bytes(view[start:end])
 
     def part(self, indices: slice | Ints) -> "MessageBatch":
-        """Selects some of the messages, without copying their payloads.
+        """Selects some of the messages, without copying their contents.
 
         Args:
             indices: Which messages are selected, and in which order.
@@ -216,9 +220,9 @@ class MessageBatch:
 
 
 class BatchBuilder:
-    """Collects messages in the order of a log file, and sorts them into the order of playing.
+    """Collects messages in the order of a log file, and sorts them for replaying.
 
-    To play a log means to publish its messages again, each at its original time.
+    To replay a log means to publish its messages again, each at its original time.
 
     Args:
         kept: Messages that were sorted in an earlier step but have not been played yet. They
@@ -237,11 +241,16 @@ class BatchBuilder:
 
     @property
     def memory(self) -> int:
-        """Memory that the messages added so far need, in bytes."""
+        """Memory that the messages added so far occupy, in bytes.
+
+        The reader of a log limits it, because a log may be larger than the machine's memory.
+        """
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message, in the order of the file, to those that will be sorted for playing.
+        """Adds a message in the order of the log file.
+
+        All messages are sorted later for playing.
 
         Args:
             t_ns: Time of the message after the start of the session, in ns.
@@ -255,7 +264,7 @@ class BatchBuilder:
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Returns the added messages in the order in which they are played.
+        """Returns the added messages in the order in which they are replayed.
 
         Two files of a session may contain the same message, which is included only once.
 
@@ -278,7 +287,7 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Returns the indices of messages that repeat an earlier one, and need not be played.
+        """Finds messages that repeat an earlier one, and need not be replayed.
 
         Two files of a session may contain the same message.
 
@@ -297,7 +306,7 @@ class BatchBuilder:
 
 
 def _find_equal_numbers(rows: Ints) -> Ints:
-    """Finds the messages that have the same channel and number as another message.
+    """Finds the messages that have the same channel (topic) and number as another message.
 
     Such messages may be copies of each other. The messages are sorted by channel and number, so
     that equal ones are neighbours, and each one is compared with the next.

@@ -49,9 +49,9 @@ and above other processes.
 
 
 class _RoundEnd(NamedTuple):
-    """States that the messages of a round have ended, in the stream from the reader process.
+    """Message from the process that reads a log: all messages of a round were sent.
 
-    A round is one pass through the log. A log that is played in a loop has several rounds.
+    A round is one pass through the log. A log that is replayed in a loop has several rounds.
 
     Attributes:
         strays: Number of messages that could not be played in order, because their place in the
@@ -64,7 +64,9 @@ class _RoundEnd(NamedTuple):
 
 
 class _ReadPiece(NamedTuple):
-    """Piece of a log that the reader process sends to the player.
+    """A piece of a log that the process that reads the file sends to the player.
+
+    A separate process reads, so that decompression does not delay published messages.
 
     Attributes:
         topics: Topics of all channels that were found so far. The index of a topic is the
@@ -77,10 +79,10 @@ class _ReadPiece(NamedTuple):
 
 
 class MessageSource:
-    """Supplies the messages of a log in the order in which they are played.
+    """Supplies the messages of a log in the order in which they are replayed.
 
-    A log that is played in a loop has several rounds, passes through the log. Its messages are
-    supplied round after round.
+    A log that is replayed in a loop has several rounds, passes through the log. Its messages
+    are supplied round after round.
 
     Args:
         header: Description of the files. The topics and damages that are found during reading
@@ -171,7 +173,8 @@ class MessageSource:
     def fill(self) -> bool:
         """Fetches messages in advance from the process that reads the log, without waiting.
 
-        The bytes are read from the pipe and decoded. `poll` then returns the messages.
+        The player calls it while there is time before the next message. The bytes are read from
+        the pipe and decoded. `poll` then returns the messages.
 
         Returns:
             True if bytes were read. False if none are available now, or if enough messages have
@@ -213,7 +216,7 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Supplies the messages again from the first one, when a log is played in a loop.
+        """Supplies the messages of the log again from the first one, for replaying in a loop.
 
         A log in memory is queued once more. For a long log, the reader process begins again on
         its own.
@@ -224,7 +227,7 @@ class MessageSource:
             self._ahead.append(_RoundEnd(0, {}))
 
     def close(self) -> None:
-        """Ends the reader process and its pipe, if they exist. Further calls have no effect."""
+        """Ends the process that reads the log file. Further calls have no effect."""
         if self._process is not None:
             self._process.terminate()
             self._process.join()
@@ -278,10 +281,10 @@ def sort_messages(
 
 
 class _MessageSorter:
-    """Messages that wait for their turn.
+    """Buffer that brings the messages of a log file into the order of their sending times.
 
-    It counts the strays, messages that arrive when a later message of their channel has been
-    released already.
+    Log files have the order of arrival. A message that comes too late for sorting, after a
+    later one of its channel was released, is a stray and is counted.
     """
 
     def __init__(self) -> None:
@@ -295,7 +298,7 @@ class _MessageSorter:
         return self._waiting.memory
 
     def add(self, message: PlayedMessage) -> None:
-        """Stores a message until it can be sorted and released to the player.
+        """Stores the next message of the file until it can be released in the right order.
 
         Args:
             message: The next message in the order of the file.
@@ -322,7 +325,7 @@ class _MessageSorter:
         return self._release(sorted_messages, due_count)
 
     def release_half(self) -> tuple[MessageBatch, int]:
-        """Removes the earlier half of the messages, because they need too much memory.
+        """Releases the earlier half of the waiting messages, because they need too much memory.
 
         Returns:
             The messages in play order, and the number of strays: messages that came too late,

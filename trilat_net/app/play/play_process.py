@@ -46,7 +46,7 @@ PROGRESS_EVERY_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """States how a log is played, as the options of the command line say.
+    """How a log is replayed over the network, as the options of the command line say.
 
     Attributes:
         session: Name of the session in which the log is played.
@@ -66,7 +66,7 @@ class PlayOptions:
 
 
 class PlaybackSummary(NamedTuple):
-    """Result of playing a log, from which the summary for the user is composed.
+    """Result of replaying a log: numbers of messages, duration and lateness, for the user.
 
     Attributes:
         counts: Number of published messages, by the topic in the file.
@@ -99,10 +99,10 @@ class PlaybackSummary(NamedTuple):
 
 @dataclass
 class Playback:
-    """One playback of a log, which other programs see as a session with a name of its own.
+    """One replay of a log, which other programs see as a running session.
 
-    The object replies to other programs in place of the original sites, while its `Player`
-    publishes the messages.
+    The session has a name of its own. The object replies to other programs in place of the
+    original arms, while its `Player` publishes the messages.
 
     Attributes:
         bus: Network connection of the player.
@@ -160,7 +160,7 @@ class Playback:
             self.show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
-        """Plays the log to its end, and stays until all recorders have every message.
+        """Replays the log to its end, and stays until all recorders have every message.
 
         The process may be asked to end earlier by `stopped`.
 

@@ -39,9 +39,9 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Converts times in a log to the times on the clock at which messages are published.
+    """Schedule of a replay: converts times in a log to times on the player's clock.
 
-    The conversion is a linear function of the start time and the speed of playing.
+    The conversion is a linear function of the start time and the speed of the replay.
 
     Attributes:
         origin_ns: Deadline of the time `start_ns` on the clock, in ns.
@@ -58,6 +58,8 @@ class Pace:
     def due_ns(self, t_ns: int) -> int:
         """Computes the deadline of a message: the time on the player's clock when it is due.
 
+        At double speed, for example, a message 4 s after the start is due after 2 s.
+
         Args:
             t_ns: Time of the message in the log, in ns after the start of the recorded session.
 
@@ -67,7 +69,7 @@ class Pace:
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
     def later(self, length_ns: int) -> "Pace":
-        """Computes the deadlines for the next round, when a log is played in a loop.
+        """Returns the deadlines for the next round, when a log is replayed in a loop.
 
         Args:
             length_ns: Time in the log after which the next round begins, counted from the
@@ -136,10 +138,10 @@ LATENESS_LIMIT_US = 100_000
 
 
 class LatenessSummary(NamedTuple):
-    """States how late messages were published: median, 99th percentile and maximum, in us.
+    """How late messages were published in a replay: median, 99th percentile and maximum.
 
-    If a percentile is above `LATENESS_LIMIT_US`, the histogram does not resolve it. Then it is
-    replaced by the maximum.
+    The times are in us. If a percentile is above `LATENESS_LIMIT_US`, the histogram does not
+    resolve it. Then it is replaced by the maximum.
     """
 
     p50_us: int
@@ -148,7 +150,7 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Counts messages by their lateness: the time from the deadline to the publication.
+    """Counts the published messages of a replay by their lateness behind the deadline.
 
     Percentiles can be computed at any time from the counts, without storing every lateness. The
     width of an interval is 1 us.
@@ -162,7 +164,7 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Counts the lateness of one published message.
+        """Counts how late one message was published.
 
         The method is called for every message, and must therefore be fast.
 
@@ -222,7 +224,7 @@ Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """How far the playing of a log has come, for the line that the user sees.
+    """Progress of replaying a log, for the line that the user sees in the terminal.
 
     Attributes:
         position_ns: Time of the next message, in ns after the start of the recorded session.
@@ -236,7 +238,9 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """Publishes the messages of a log, each at its deadline, once or in a loop.
+    """Publishes the messages of a recorded log again, each at its deadline, once or in a loop.
+
+    Programs such as a monitor then work as if the session were running.
 
     Args:
         source: Supplies the messages in the order in which they are played.
@@ -410,7 +414,7 @@ class Player:
                 next_numbers[channel] = number + 1
 
     def _use_slack(self, due_ns: int, now_ns: int) -> bool:
-        """Does other work until shortly before a deadline.
+        """Does other work until shortly before the deadline of the next message.
 
         Such work includes replies to other programs and reading in advance. Shortly before the
         deadline, nothing may delay the player.

@@ -47,7 +47,7 @@ PlayTime = Literal["publish", "log"]
 
 @dataclass(frozen=True, slots=True)
 class PlaySelection:
-    """States which messages of a log are played, by channel and by time.
+    """Which messages of a log are replayed, by channel and by time.
 
     Attributes:
         channels: Filter of the channels. If it includes no channel explicitly, the channels of
@@ -65,10 +65,10 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
-        """Finds out whether the messages of a channel are played.
+        """Returns True if the messages of a channel (topic) of the log are replayed.
 
-        By default, these are the channels of the sites, the processes that each control one
-        arm. If the user includes channels explicitly, only the user's filter counts.
+        By default, these are the channels of the arms. If the user includes channels
+        explicitly, only the user's filter counts.
 
         Args:
             topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -83,7 +83,7 @@ class PlaySelection:
         return is_candidate and self.channels.accepts(key)
 
     def contains(self, t_ns: int) -> bool:
-        """Returns True if a time is in the part of the session that is played.
+        """Returns True if a time is in the selected part of the session, such as 5 s to 10 s.
 
         Args:
             t_ns: The time, for example of a message, in ns after the start of the session.
@@ -101,7 +101,7 @@ def parse_selection(
     duration_s: float | None,
     time: str,
 ) -> PlaySelection:
-    """Parses the options of a command that select which messages of a log are played.
+    """Parses the options of a command that select which messages of a log are replayed.
 
     The user limits the part of the session by `--start`, and by either `--stop` or
     `--duration`.
@@ -161,7 +161,9 @@ would repeat, because each start numbers its events from 0.
 
 
 class _PayloadHeader(msgspec.Struct):
-    """The fields of a message that are decoded. They exist in all versions of the schema.
+    """The few fields of a message that the player decodes.
+
+    They exist in all versions of the message format, so that old logs can be replayed.
 
     Attributes:
         boot: Number that identifies the start of the sender. It is -1 if it cannot be decoded.
@@ -185,7 +187,7 @@ def _decode_header(payload: bytes) -> _PayloadHeader:
 
 @dataclass(slots=True)
 class SessionHeader:
-    """Describes the recorded session that is played. It grows while the files are read.
+    """Description of the recorded session that is replayed, collected while files are read.
 
     Attributes:
         session: Name of the recorded session.
@@ -214,9 +216,9 @@ class SessionHeader:
 
 
 class _PlayedChannel:
-    """A channel of a file, which numbers its messages.
+    """A channel (topic) of a log file, which numbers its messages in the order of sending.
 
-    The numbers tell in which order the messages of the channel are played.
+    Messages are replayed in this order.
 
     Args:
         topic: Topic of the channel.
@@ -297,7 +299,7 @@ class _PlayedChannel:
 
 
 class SessionReader:
-    """Reads the messages of a recorded session that are played, from the first to the last.
+    """Reads the messages of a recorded session from its log files, for replaying them.
 
     Args:
         paths: The files of the log. Several files are the parts of a session, in their order.
@@ -318,7 +320,7 @@ class SessionReader:
         self._progress = progress
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the selected messages of all files, file by file, in the order of each file.
+        """Yields the messages to replay from all files of a log, in the order of each file.
 
         Raises:
             LogError: A file is missing, is no log of trilat-net, or belongs to another session
@@ -330,10 +332,10 @@ class SessionReader:
                 yield from self._read_file(path, reader)
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
-        """Yields the messages of a file that are played, and completes the session's header.
+        """Yields the messages of a log file that are replayed, and completes the header.
 
-        Each message is yielded with its time, the number of its channel, and the number that
-        orders it within the channel.
+        The header describes the session. Each message is yielded with its time, the number of
+        its channel, and the number that orders it within the channel.
 
         Args:
             path: The file.

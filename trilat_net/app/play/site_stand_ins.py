@@ -52,7 +52,7 @@ from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
 
 class _ChannelMessages(NamedTuple):
-    """The messages of one channel in a batch.
+    """Replayed messages of one channel (topic) that are stored for recorders.
 
     Attributes:
         numbers: Numbers of the messages in ascending order, shape (K,).
@@ -65,7 +65,7 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Lists the stored messages from a given number on, for one reply to a recorder.
+        """Lists the stored messages from a given number on, for a reply to a recorder.
 
         Args:
             number: Smallest number of a message in the list.
@@ -83,9 +83,9 @@ class _ChannelMessages(NamedTuple):
 
 
 class PlayedHistory:
-    """Stores the messages that were played, so that they can be sent again.
+    """Stores replayed messages, so that recorders that missed some can request them again.
 
-    A recorder requests them if it has missed some.
+    Recorders request lost messages of a real session in the same way.
 
     Args:
         kept_ns: Duration of the log for which messages are stored, in ns. None to store all
@@ -101,7 +101,7 @@ class PlayedHistory:
         self._messages: dict[int, deque[_ChannelMessages]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Stores messages that will be played next, so that recorders can request them again.
+        """Stores messages before they are played, so that recorders can request them again.
 
         Messages that are older than the limit `kept_ns` are removed.
 
@@ -128,7 +128,7 @@ class PlayedHistory:
         self._messages.clear()
 
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Finds consecutive messages for one reply to a recorder.
+        """Finds consecutive replayed messages for one reply to a recorder that missed them.
 
         A reply has no gaps. It contains at most `BACKFILL_MESSAGES` messages and, unless a
         single message is larger, at most `BACKFILL_BYTES` bytes.
@@ -192,9 +192,9 @@ so that its encoding takes long.
 
 
 class SiteStandIns:
-    """Acts for all sites of a recorded session while its log is played.
+    """Takes the place of all arms' processes of a recorded session while it is replayed.
 
-    To other programs, a log that is played thus looks like a running session: its sites
+    To other programs, a log that is replayed thus looks like a running session: its arms
     announce themselves, reply to queries, and send messages again that a recorder missed.
 
     Args:
@@ -320,7 +320,7 @@ class SiteStandIns:
         return identity
 
     def are_recorders_listening(self) -> bool:
-        """Queries the identities of all recorders that are present on the network.
+        """Checks whether all recorders on the network are ready to receive replayed messages.
 
         Returns:
             True if all of them have replied, so that they will receive the messages.
@@ -345,7 +345,7 @@ class SiteStandIns:
         return True
 
     def _find_channel(self, site: str, channel: str) -> int:
-        """Returns the number of a site's channel among the played channels.
+        """Returns the number of an arm's channel (topic), such as its records, in the replay.
 
         It is -1 if the log has no such channel.
         """
@@ -409,7 +409,7 @@ class SiteStandIns:
         start_index, boot = self._find_start(site)
 
         def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
-            """Finds the messages that a recorder requests because it has missed them.
+            """Finds the replayed messages that a recorder requests again after missing them.
 
             Args:
                 request: The channel, and the numbers of the first and last requested message.

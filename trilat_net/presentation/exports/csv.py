@@ -17,7 +17,7 @@ _ROWS_AT_ONCE = 4096
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
-    """Writes the tables of a log, their description and the scenario into a folder.
+    """Exports a log as CSV tables in a folder, with their description and the scenario.
 
     Args:
         log: Log of the run that is exported.

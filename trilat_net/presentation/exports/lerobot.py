@@ -129,7 +129,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 class _Feature(NamedTuple):
-    """A vector of n numbers in each of F frames, such as the state of the slave.
+    """A vector of n numbers in each frame of a dataset, such as the joint angles of an arm.
 
     Attributes:
         key: Name of the feature in the dataset.
@@ -143,7 +143,9 @@ class _Feature(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """A part of a run that the marks of `session.episode` enclose.
+    """A part of a run that becomes an episode of the dataset: one attempt at a task.
+
+    Marks of a program, `session.episode`, enclose the part.
 
     Attributes:
         name: Name of the episode. Empty for a run without marks.
@@ -204,7 +206,9 @@ def _write(
     task: str = "",
     episodes: str = "log",
 ) -> str:
-    """Writes logs as one dataset.
+    """Exports logs as one LeRobot dataset, with which robot policies are trained.
+
+    An episode of the dataset is one run, or an attempt within a run.
 
     Args:
         logs: The logs, at least one.
@@ -352,7 +356,7 @@ def _write(
 
 
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Checks a setting that has a few possible values.
+    """Checks that a user gave one of the possible values for a setting.
 
     Args:
         name: Name of the setting.
@@ -367,9 +371,10 @@ def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 
 
 def _choose_plugin_site(log: Log, settings: _Settings) -> str:
-    """Returns the user whose arm the LeRobot plugin will hold.
+    """Chooses the user's arm that the LeRobot plugin, a learnt policy, will move later.
 
-    It is the user that the settings name, or else the program, or else the last user.
+    It is the arm that the settings name, or else that of the program, or else that of the last
+    user.
 
     Args:
         log: Log of a run with at least one user.
@@ -429,7 +434,7 @@ def _find_successes(frames: _Frames) -> NDArray[np.bool_]:
 
 
 def _write_json(folder: Path, files: dict[str, Any]) -> None:
-    """Writes JSON files into a folder.
+    """Writes the JSON files of a LeRobot dataset into its folder.
 
     Args:
         folder: The folder.
@@ -714,9 +719,9 @@ def _read_ages(log: Log, receiver: str, sender: str) -> Array:
 
 
 def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:
-    """Returns the reference q_des that the slave follows, and the names of its n numbers.
+    """Returns the pose that the slave arm follows in each frame, and the names of its numbers.
 
-    A learning program takes it as the action of the demonstrator.
+    A learning program takes this reference q_des as the action of the demonstrator.
 
     Args:
         log: Log of the run that is exported.
@@ -804,7 +809,7 @@ def _read_commands(
 def _write_tables(
     folder: Path, dataset: Columns, starts: Sequence[int], tasks: list[str]
 ) -> dict[str, Any]:
-    """Writes the tables of a dataset as Parquet files.
+    """Writes the frames and episodes of a dataset as Parquet files, as LeRobot requires.
 
     Args:
         folder: Folder of the dataset.
@@ -854,7 +859,7 @@ def _write_tables(
 def _describe_dataset(
     fps: int, names: Names, columns: Columns, episodes: int, tasks: int
 ) -> dict[str, Any]:
-    """Returns the contents of the file meta/info.json, which describes a data set in LeRobot.
+    """Returns the contents of meta/info.json, the file that describes a LeRobot data set.
 
     LeRobot is a library for learning from demonstrations of robots. It reads there how many
     episodes there are, where they are stored, and which numbers (features) each frame contains.
@@ -894,7 +899,7 @@ def _describe_dataset(
 def _describe_episode(
     dataset: Columns, first: int, end: int, tasks: list[str]
 ) -> dict[str, Any]:
-    """Returns the row of an episode in the table of episodes.
+    """Returns the table row of one episode: its frames, its length and its task.
 
     Args:
         dataset: Columns of all frames.

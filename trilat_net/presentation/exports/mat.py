@@ -28,7 +28,7 @@ _KEYWORDS = {
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
-    """Writes the tables of a log as structs, their description and the scenario as texts.
+    """Exports a log as a MATLAB file: tables as structs, with description and scenario.
 
     Args:
         log: Log of the run that is exported.
@@ -71,9 +71,9 @@ def _write(log: Log, path: Path, written: Written) -> None:
 
 
 def _name_table(table: Table) -> str:
-    """Returns the name of a table in the file.
+    """Returns the name under which a table is stored in the MATLAB file.
 
-    A site whose name is a keyword of MATLAB gets the ending "_site".
+    A name that is a keyword of MATLAB, such as "end", gets the ending "_site".
     """
     name = f"{table.name}_site" if table.name in _KEYWORDS else table.name
     return name_inside(table, name, ".")

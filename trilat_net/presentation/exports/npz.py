@@ -15,7 +15,7 @@ from ..export import ExportFormat, Written, name_inside, read_texts, store_table
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
-    """Writes the columns of a log as arrays, and their description and the scenario as texts.
+    """Exports a log as a NumPy .npz file: columns as arrays, with description and scenario.
 
     Args:
         log: Log of the run that is exported.

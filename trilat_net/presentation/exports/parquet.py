@@ -13,7 +13,7 @@ from ..export import ExportFormat, Written, write_table_files
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
-    """Writes the tables of a log, their description and the scenario into a folder.
+    """Exports a log as Parquet tables in a folder, with their description and the scenario.
 
     Args:
         log: Log of the run that is exported.

@@ -137,7 +137,7 @@ def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channe
 
 
 class _SiteBag:
-    """Converts the messages of one site for a bag.
+    """Converts the messages of one arm to standard ROS 2 messages in a bag, a file of messages.
 
     Args:
         log: Log of the run that is exported.

@@ -247,7 +247,7 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
 
 
 def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
-    """Returns the mean delay that the scenario states for a link, as the points of a line.
+    """Returns the mean delay that the scenario states for a network link, as a line to draw.
 
     Figures draw this line dashed beside the measured delays, which should agree with it.
 
@@ -289,7 +289,7 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 
 def is_unsteady(ages_ms: Array) -> bool:
-    """Tells whether ages fluctuate so often that a line would look like a filled area.
+    """Returns True if ages fluctuate so often that a line would look like a filled area.
 
     The figure then draws the spread of the ages as a band.
 
@@ -323,8 +323,7 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 def explain_missing_loop_times(log: Log) -> str:
     """Returns the reason why a log has no figures about the timing of the control loops.
 
-    Only sites in real time measure how late a tick (control period) began, and how long it
-    took.
+    Only runs in real time measure how late a tick (control period) began, and how long it took.
 
     Args:
         log: Log of the run.
@@ -364,7 +363,7 @@ def choose_bin_edges_us(log: Log) -> Array:
 
 
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
-    """Counts how many times lie in each bin of a histogram.
+    """Counts how many times lie in each bin of a histogram of control loop timing.
 
     Times below 1 us count in the first bin.
 
@@ -386,10 +385,9 @@ def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     in_report=True,
 )
 def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws histograms of the timing of each site's control loop, in us.
+    """Draws histograms of how late the control loops began their periods, in us.
 
-    They show the lateness, by which a tick began after its planned time, and the time that its
-    computation took.
+    Further histograms show how long the computation of a period (tick) took.
 
     Args:
         log: Log of the run.

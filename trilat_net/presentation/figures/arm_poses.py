@@ -69,7 +69,7 @@ _BASE: dict[str, Any] = {
 
 
 class _ArmPose(NamedTuple):
-    """The pose of a site's arm at some time, as points in the plane of a picture.
+    """Pose of an arm at one time, as points in the plane of a picture.
 
     Attributes:
         actual: Base, joints and end effector, shape (L, 2), in m.
@@ -87,7 +87,7 @@ class _ArmPose(NamedTuple):
     bodies: Sequence[Array] = ()
 
     def scale(self, factor: float) -> "_ArmPose":
-        """Returns the pose with all points multiplied by a factor.
+        """Returns the pose with all points multiplied by a factor, for another unit.
 
         This converts a pose in m to the units of a picture.
 
@@ -103,7 +103,7 @@ class _ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points that are drawn for this pose, to find the bounds of the picture.
+        """Returns all points that are drawn for this pose, from which the picture is scaled.
 
         Returns:
             The points of the arms, of their paths and of the touched bodies, shape (K, 2), in
@@ -150,7 +150,7 @@ def trace_bodies_m(
 
 
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
-    """Projects points of an arm to the plane of a picture.
+    """Projects points of an arm to the plane of a picture, in m.
 
     A planar arm lies in the plane already. An arm in space is seen from one fixed direction,
     with "up" opposite to gravity.
@@ -220,7 +220,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
-    """Returns the pose of a site's arm at a time, with the path of its end effector until then.
+    """Returns the pose of an arm at a given time, with the path of its end effector (tip).
 
     The pose is that of the newest record at or before the time.
 
@@ -367,9 +367,9 @@ def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
-    """Draws the poses of all arms at a few times, as vector pictures for the report's web page.
+    """Draws the poses of all arms at a few times, as SVG pictures for the report's web page.
 
-    There is a row per site and a column per time. Sites without records are left out.
+    There is a row per arm and a column per time. Arms without records are left out.
 
     Args:
         log: Log of the run.
@@ -407,7 +407,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
 def _measure_picture(
     pose: _ArmPose | None, index: int, bounds: PictureBox, label: str
 ) -> dict[str, Any]:
-    """Returns the values that the SVG template of a pose needs: lines, joints and view box.
+    """Returns the coordinates that the SVG template of a pose needs: lines, joints, view box.
 
     The page of the report contains such a picture for each arm, at a few times.
 

@@ -122,9 +122,10 @@ def draw_functional(
     in_report=True,
 )
 def _draw_certificate(log: Log, form: FigureSize) -> Figure:
-    """Draws the energy function V of the stability proof over the course of a log.
+    """Draws the energy function V of the stability proof over the time of a run.
 
-    This function is called through the registry of figures.
+    V must never rise by energy that nobody supplied. This function is called through the
+    registry of figures.
     """
     own_laws = may_run_user_laws(log.scenario)
     return draw_functional(log, certify(log, own_laws=own_laws), form)
@@ -214,10 +215,10 @@ def _choose_legend_pt(form: FigureSize) -> float:
 
 
 def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyBalance) -> None:
-    """Draws V and the contribution of each site to V.
+    """Draws the energy V of the stability proof, and the contribution of each arm.
 
-    If the weights of the sites that the paper states do not apply, V with these weights is
-    drawn as a dashed line for comparison.
+    If the weights of the arms that the paper states do not apply, V with these weights is drawn
+    as a dashed line for comparison.
     """
     _draw_line(balance, axes, balance.V, **_TOTAL)
     paper_balance = certificate.paper_balance

@@ -32,7 +32,7 @@ _LETTERS_PER_IN = 15.0
 
 
 class _ComparedSignal(NamedTuple):
-    """A signal of the sites that can be drawn for several runs.
+    """A quantity of the arms, such as the error, that a figure compares between runs.
 
     Attributes:
         name: Name for the labels of the value axes.
@@ -65,7 +65,7 @@ def draw_compared_runs(
 ) -> Figure:
     """Draws a signal, such as the joint angles, of several runs over one another.
 
-    There is a panel per site (arm) and joint. The dashes of a line distinguish the runs.
+    There is a panel per arm and joint. The dashes of a line distinguish the runs.
 
     Args:
         logs: Logs of the runs, by their names in the legend.
@@ -148,7 +148,7 @@ def _style_run(number: int, form: FigureSize) -> style.LineOptions:
 
 
 def list_common_sites(logs: Mapping[str, Log]) -> list[str]:
-    """Lists the sites that all logs have, in the order of the first log.
+    """Lists the arms that all compared runs have, in the order of the first run.
 
     Args:
         logs: The logs, by their names.

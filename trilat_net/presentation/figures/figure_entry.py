@@ -30,7 +30,7 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A figure that can be drawn from a log, with a description and a drawing function.
+    """A kind of figure that can be drawn from any log, such as the joint angles over time.
 
     Attributes:
         about: Description of the contents, for lists of figures.
@@ -78,7 +78,7 @@ def draws(
     """
 
     def register(draw: Drawing) -> Drawing:
-        """Registers a function, and returns it unchanged."""
+        """Registers a function that draws a figure under its name, and returns it unchanged."""
         other = _ENTRIES.get(name)
         if other is not None:
             modules = f"{other.draw.__module__} and {draw.__module__}"

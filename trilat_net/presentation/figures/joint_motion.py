@@ -715,9 +715,9 @@ def thin_path(path: Array) -> Array:
 
 
 def list_sites_with_changing_dominance(log: Log) -> list[str]:
-    """Lists the sites whose dominance factors change during the run, in scenario order.
+    """Lists the arms whose dominance factors change during the run, in scenario order.
 
-    A dominance factor is the weight with which a site follows another one.
+    A dominance factor is the weight with which an arm follows another one.
 
     Args:
         log: Log of the run.
@@ -776,10 +776,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _list_sites_with_walls(log: Log) -> list[str]:
-    """Lists the names of those sites whose arm can touch a wall.
-
-    A site is a process that runs one arm. The sites have the order of the scenario, the
-    description of the experiment.
+    """Lists the arms that can touch a wall, in the order of the scenario.
 
     Args:
         log: Log of the run.

@@ -103,9 +103,9 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the texts and line styles for the legend of the figure of impedances.
+    """Returns the texts and line styles for the legend of a figure of impedances.
 
-    An operator at one site feels an impedance that depends on the other site, which is free to
+    The impedance that an operator feels at one arm depends on another arm, which is free to
     move or clamped.
     """
     operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
@@ -124,10 +124,9 @@ def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
 def _plot_impedance(
     ports: PortAnalysis, responses: Sequence[Transparency], magnitude: Axes, phase: Axes
 ) -> None:
-    """Draws the impedances along one joint at the sites of the operators.
+    """Draws the impedance that each operator feels along one joint, over frequency.
 
-    Each site has two lines: the impedance while the other site is free, and while it is
-    clamped.
+    Each arm has two lines: the impedance while another arm is free, and while it is clamped.
 
     Args:
         ports: Analysis of the ports, the places at which operators hold the arms.

@@ -84,7 +84,7 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes figures of a log to files, as for a paper.
+    """Draws figures of a log, and writes them to files with the sizes and fonts of a paper.
 
     Args:
         log: Log of the run.
@@ -268,10 +268,14 @@ def _write(
 
 
 def _find_figure(log: Log, name: str) -> FigureEntry:
-    """Returns the registered figure of a name.
+    """Finds the figure with the name that a user gave.
+
+    Args:
+        log: Log from which the figure will be drawn.
+        name: Name of the figure.
 
     Raises:
-        UsageError: There is no such figure, or the log has nothing to show in it.
+        UsageError: No figure has this name, or the log has nothing to show in it.
     """
     if name == OVERLAY:
         raise UsageError("overlay shows several runs in one figure: add --with FILE")

@@ -45,7 +45,7 @@ _MAX_SPANS = 1_000
 
 
 class _Panel(NamedTuple):
-    """Description of one of the panels of the overview: the quantity that it shows.
+    """One panel of the overview of a run: the quantity that it shows for every arm.
 
     Attributes:
         name: Name of the quantity.
@@ -77,9 +77,9 @@ def _compute_largest_torque(log: Log, site: str) -> Array:
 
 
 def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
-    """Returns the age of the oldest sample in use in each record, shape (K,), in ms.
+    """Returns the age of the oldest state of another arm that a control loop used, in ms.
 
-    A record without any sample in use has the value NaN.
+    The result has a value per record, shape (K,). It is NaN while no state was in use.
     """
     ages_ms = plot_signals.sample_ages_ms(log, site)
     # NumPy prints a warning for a row of NaN only. Therefore -inf stands for unknown ages.
@@ -98,7 +98,7 @@ _PANELS = (
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the most important quantities of one run in four panels, with a line per site.
+    """Draws the most important quantities of one run in four panels, with a line per arm.
 
     The title has the judgement whether the run was stable, and the settling time.
 
@@ -197,7 +197,7 @@ def _list_lowest(panels: list[Axes], form: FigureSize) -> list[Axes]:
 
 
 def _style_run(number: int) -> dict[str, Any]:
-    """Returns the options of the line of a run.
+    """Returns colour and dashes of the line that shows one of several runs.
 
     Lines are solid until every colour is used. Further runs have the same colours with dashes.
     """
@@ -210,9 +210,10 @@ def _style_run(number: int) -> dict[str, Any]:
 
 
 def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
-    """Returns the largest value of all sites of a run over time, as one curve to compare runs.
+    """Returns the largest value of all arms of a run over time, as one curve per run.
 
-    Time is divided into equal spans, and the curve has a point per span.
+    Time is divided into equal spans, and the curve has a point per span. Several runs can be
+    compared in one panel in this way.
 
     Returns:
         Middles of the spans in s, and largest values, each of shape (S,). The value of a span
@@ -237,7 +238,7 @@ def _select_drawable(panel: _Panel, values: Array) -> Array:
 
 
 def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
-    """Scales the value axis of a panel to all of its lines.
+    """Scales the value axis of a panel so that all of its lines fit.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

@@ -67,7 +67,9 @@ _NOTE: dict[str, Any] = {
 
 
 class _DifferenceLine(NamedTuple):
-    """A line that shows the difference between a run and its repetition with a small push.
+    """A line that shows how far a run and its repetition with a small push are apart.
+
+    If the line grows, small pushes grow, and the run is not stable.
 
     Attributes:
         label: Text of the line in the legend.
@@ -179,7 +181,7 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Returns the line style of each joint: the colour of its arm and dashes for its number.
+    """Returns the line style of each joint: the colour of its arm, and dashes for its number.
 
     Args:
         log: Log with the arms.
@@ -197,7 +199,7 @@ def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
 def _draw_differences(
     axes: Axes, pushed: PushedTwins, lines: Sequence[_DifferenceLine], rated: PushGrowth
 ) -> None:
-    """Draws the differences between a run and its pushed repetitions (twins) over time.
+    """Draws how far a run and its slightly pushed repetitions (twins) are apart over time.
 
     The growth rate of one push is drawn beside the lines of this push.
 
@@ -357,7 +359,7 @@ def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
 
 
 def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
-    """Draws the speed of the fastest joint of every site of the run, in rad/s.
+    """Draws the speed of the fastest joint of every arm, in rad/s.
 
     The panel above shows how the differences between the run and its slightly pushed
     repetitions change. Both panels have the same time axis.
