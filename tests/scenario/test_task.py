@@ -1,5 +1,6 @@
 """Mistakes of sites in task space, and keys without effect: each is refused at its own key."""
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -7,8 +8,10 @@ import pytest
 
 from tests.task_arms import planar_task
 from trilat_net.errors import ScenarioError
+from trilat_net.execution import simulate_scenario
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario.describe import describe_scenario
+from trilat_net.scenario.laws import LAWS
 
 TEXT = planar_task()
 
@@ -90,3 +93,19 @@ def test_start_near_a_singular_pose_is_reported(elbow_rad: float, damped: bool) 
     least = np.sqrt(0.5 * (squares - np.sqrt(squares**2 - 4.0 * s * s)))
     assert f"start pose {least:.3g}," in line
     assert ("its inverse is damped" in line) == damped
+
+
+@pytest.mark.parametrize("name", ["unlike_arms", "wall_in_space"])
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_every_law_runs_or_is_refused(law: str, name: str) -> None:
+    """Gains per joint and per shared coordinate differ in number if arms share positions."""
+    changes = {"control": {"law": law}, "scheme": "digital", "duration_s": 0.01}
+    with suppress(ScenarioError):
+        log = simulate_scenario(load_scenario(name, changes))
+        assert all(np.isfinite(log[site].tau).all() for site in log.sites)
+
+
+def test_damping_from_stiffness_needs_joint_space() -> None:
+    with pytest.raises(ScenarioError, match="choose p_d or pd_d") as refused:
+        load_scenario("unlike_arms", {"control": {"law": "lee_spong"}})
+    assert refused.value.path == "sites.m1.control.law"

@@ -107,6 +107,10 @@ class LawSettings(Frozen, frozen=True):
     """True if the energy function V of the paper's stability proof applies to the law."""
     planar: ClassVar[bool] = False
     """True if the law uses the planar arm's regressor and cannot control a chain."""
+    needs_joint_space: ClassVar[bool] = False
+    """True if the law combines numbers per joint with numbers per shared coordinate. It then
+    cannot control arms that share positions of their end effectors.
+    """
     compares_positions: ClassVar[bool] = False
     """True if the law itself compares positions of end effectors, not angles of joints."""
 

@@ -43,6 +43,7 @@ class LeeSpong(ControlLaw):
     P_e: NotNegativeJoints = (0.0,)
     gravity: NotNegative = 1.0
 
+    needs_joint_space: ClassVar = True
     tune: ClassVar = {"K": STIFFNESS, "Kd": ERROR_DAMPING, "d_extra": DAMPING}
 
     @property

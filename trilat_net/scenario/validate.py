@@ -379,6 +379,12 @@ def _check_joint_space(scenario: Scenario) -> None:
                 path=f"sites.{name}.arm",
             )
         law = scenario.sites[name].control
+        if spaces[name] != "joints" and law.needs_joint_space:
+            raise ScenarioError(
+                f"{law.tag} computes the damping of the joints from a stiffness per joint, but "
+                f"the space of {name} is {spaces[name]!r}: choose p_d or pd_d",
+                path=f"sites.{name}.control.law",
+            )
         if scenario.arms[name].chain is not None and law.planar:
             raise ScenarioError(
                 f"{law.tag} uses the regressor of the planar two-link arm, but this arm is a "
