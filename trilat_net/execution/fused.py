@@ -58,7 +58,14 @@ from ..errors import LawFailed, ScenarioError, count_nouns
 from ..log import Log
 from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
-from ..scenario import PlantPlayer, Scenario, Wall, make_hand_players, refuse_external_arms
+from ..scenario import (
+    PlantPlayer,
+    Scenario,
+    Wall,
+    draw_link_samples,
+    make_hand_players,
+    refuse_external_arms,
+)
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
@@ -363,6 +370,8 @@ class FusedRun:
         self._progress["diverged_ns"] = -1
         self._next_samples = np.zeros((count, count - 1), dtype=np.int64)
         self._sent = self._allocate_records(keep)
+        # The samples that each site uses in all ticks, computed when they are read.
+        self._used: dict[int, IntArray] = {}
         joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
         self._sums: RowArray = np.zeros(count, sums_dtype(joints))
@@ -405,7 +414,6 @@ class FusedRun:
         return RecentRecords(
             t_ns=np.zeros((site_count, pages), dtype=np.int64),
             rows=np.zeros((site_count, pages, floats)),
-            used=np.full((site_count, pages, site_count - 1), -1),
         )
 
     def _connect_hands(
@@ -1023,7 +1031,8 @@ class FusedRun:
     def read_samples_in_use(self, i: int, count: int) -> IntArray:
         """Returns which samples a site used in its latest ticks, shape (count, peers).
 
-        A sample is the state that a peer, another site, sent in one of its ticks.
+        A sample is the state that a peer, another site, sent in one of its ticks. The samples
+        follow from the delays of the links alone, so they are computed again and not stored.
 
         Args:
             i: Index of the site.
@@ -1033,10 +1042,17 @@ class FusedRun:
             For each tick the tick in which each peer sent the sample. It is -1 before the first
             sample.
         """
+        if i not in self._used:
+            name = self.scenario.names[i]
+            ticks = self.scenario.ticks(name)
+            rate_hz = self.scenario.sites[name].rate_hz
+            used = [
+                draw_link_samples(link, rate_hz, self.scenario.duration_s)[:ticks]
+                for link in self.scenario.setup(name).links
+            ]
+            self._used[i] = np.stack(used, axis=1)
         stop = int(self._progress[i]["tick"])
-        positions = np.arange(stop - count, stop) % self._sent.t_ns.shape[1]
-        used: IntArray = self._sent.used[i, positions]
-        return used
+        return self._used[i][stop - count : stop]
 
     @property
     def records(self) -> Array:

@@ -62,6 +62,7 @@ __all__ = [
     "LinkSchedule",
     "NoDelay",
     "PictureDelay",
+    "draw_link_samples",
     "draw_used_samples",
     "first_ticks",
     # Operators and environments
@@ -168,7 +169,13 @@ if TYPE_CHECKING:
         resolve_change,
         to_core_change,
     )
-    from .sample_uses import LinkSchedule, PictureDelay, draw_used_samples, first_ticks
+    from .sample_uses import (
+        LinkSchedule,
+        PictureDelay,
+        draw_link_samples,
+        draw_used_samples,
+        first_ticks,
+    )
     from .scenario_reader import (
         ExperimentText,
         embedded_names_reader,
@@ -218,7 +225,9 @@ else:
                 "LinkTables describe_change find_owner find_requester make_site_order "
                 "parse_core_change resolve_change to_core_change"
             ),
-            "sample_uses": "LinkSchedule PictureDelay draw_used_samples first_ticks",
+            "sample_uses": (
+                "LinkSchedule PictureDelay draw_link_samples draw_used_samples first_ticks"
+            ),
             "scenario_reader": (
                 "ExperimentText embedded_names_reader find_site list_shipped load_scenario "
                 "parse_embedded parse_scenario read_source read_template reseed_scenario"

@@ -171,12 +171,26 @@ def draw_used_samples(
         models=(link.to_core_model(),),
         traces=(link.points,),
     )
-    sent = round(duration_s * sender_hz)
-    samples, releases = LinkSchedule(setup).draw_releases(sent, receiver_hz)
-    ticks = max(2, round(duration_s * receiver_hz))
-    used = _list_newest(samples, releases, ticks)
+    used = draw_link_samples(setup, receiver_hz, duration_s)
     used.flags.writeable = False
     return used
+
+
+def draw_link_samples(setup: LinkSetup, receiver_hz: int, duration_s: float) -> IntArray:
+    """Computes which message is in use in each control period, for a link with all its changes.
+
+    Args:
+        setup: The link of an arm, with its planned changes and outages, see `Scenario.setup`.
+        receiver_hz: Tick rate of the receiving site, in Hz.
+        duration_s: Duration of the run, in s.
+
+    Returns:
+        Number of the sample in every tick, shape (ticks,). -1 before the first sample.
+    """
+    sent = round(duration_s * setup.rate_hz)
+    samples, releases = LinkSchedule(setup).draw_releases(sent, receiver_hz)
+    ticks = max(2, round(duration_s * receiver_hz))
+    return _list_newest(samples, releases, ticks)
 
 
 def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:

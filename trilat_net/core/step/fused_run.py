@@ -24,7 +24,7 @@ from ..links.link import LinkArrays, accept_sample, release_sample
 from ..plug.compiled_law import law_stage
 from .jit import leaf
 from .kernel import act_stages, channel_of, reference_stages, torque_stage
-from .row_fields import LinkRow, ProgressRow, SiteRow, SumsRow, row_dtype
+from .row_fields import ProgressRow, SiteRow, SumsRow, row_dtype
 from .site_arrays import SiteArrays
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
@@ -47,13 +47,10 @@ class RecentRecords(NamedTuple):
         t_ns: Times of the records, in ns since the start of the session. The length is a power
             of two.
         rows: Floating-point numbers of the records, one row per record, see `Layout.columns`.
-        used: Tick in which each peer sent the sample that is in use, one row per record. It is
-            -1 before the first sample.
     """
 
     t_ns: IntArray
     rows: Array
-    used: IntArray
 
 
 @cache
@@ -557,8 +554,7 @@ def sense_site(
         progress: State of the simulation, one row per site, see `ProgressRow`.
         next_samples: Number of the next sample to accept, for each of N sites and P peers,
             shape (N, P).
-        sent: Latest records of the sites, from which the samples are taken. The samples in use
-            are written into the new record.
+        sent: Latest records of the sites, from which the samples are taken.
         feed: Inputs of the recorded run.
         arrays: Arrays of all sites.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
@@ -568,7 +564,6 @@ def sense_site(
     t_ns = site_progress.t_ns
     rate_hz = site_progress.rate_hz
     links = arrays.links[i]
-    page = k & (sent.t_ns.shape[1] - 1)
     for p in range(links.shape[0]):
         # The peers of a site are all other sites, in scenario order.
         j = p if p < i else p + 1
@@ -582,7 +577,7 @@ def sense_site(
         )
         peer: SiteRow = arrays.site[j, 0]
         peer_progress: ProgressRow = progress[j]
-        records = RecentRecords(sent.t_ns[j], sent.rows[j], sent.used[j])
+        records = RecentRecords(sent.t_ns[j], sent.rows[j])
         if k + 1 < feed.first.shape[2]:
             for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
                 _accept_record(
@@ -605,8 +600,6 @@ def sense_site(
                 link=link,
             )
         release_sample(k, rate_hz, link)
-        row: LinkRow = links[p]
-        sent.used[i, page, p] = row.used
     _apply_recorded_hand(i, k, arrays.actors[i], feed)
     reference_stages(
         k=k,

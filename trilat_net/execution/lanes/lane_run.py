@@ -436,8 +436,6 @@ class LaneRun:
         self._states = np.zeros((self._sites, self._pages + 1, LANES, width))
         self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
         self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
-        # The samples in use of the kept records, a ring buffer: shape (N, P, LANES, rows).
-        self._used_records = np.zeros((*self._used.shape[:3], 0), np.int64)
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
 
         def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
@@ -581,8 +579,6 @@ class LaneRun:
         self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
         first = self._ticks.copy()
         record_rows = self._records.shape[1]
-        if record_rows > 1 and not self._used_records.size:
-            self._used_records = np.zeros((*self._used.shape[:3], record_rows), np.int64)
         self._step_to(np.array(ticks))
         records = None
         if record_rows > 1:
@@ -664,7 +660,6 @@ class LaneRun:
         while (self._ticks < ticks).any() and running:
             end = self._find_block_end(ticks)
             self._keep_states(self._use_samples(end))
-            self._keep_samples_in_use(end)
             running = run_block(
                 first=self._ticks.copy(),
                 ticks=self._ticks,
@@ -689,21 +684,6 @@ class LaneRun:
                 present=present,
                 ended=self._ended,
             )
-
-    def _keep_samples_in_use(self, end: IntArray) -> None:
-        """Copies the samples in use of a block of ticks to those of the kept records, if any.
-
-        Args:
-            end: Tick of each site after the block, shape (N,).
-        """
-        rows = self._used_records.shape[3]
-        if not rows:
-            return
-        lanes = slice(len(self.runs))
-        for i, (first, last) in enumerate(zip(self._ticks.tolist(), end.tolist(), strict=True)):
-            kept = np.arange(max(last - first - rows, 0), last - first)
-            positions = (first + kept) % rows
-            self._used_records[i][:, lanes, positions] = self._used[i][:, lanes, kept]
 
     def _list_present(self) -> EndedRuns:
         """Returns the present state of all simulated runs, as views that share their memory.
@@ -763,7 +743,6 @@ class LaneRun:
         ):
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
         self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
-        self._used_records[:, :, : len(lanes)] = self._used_records[:, :, lanes]
         self._ended.ticks[:] = -1
         self._deliveries = keep_link_states(self._deliveries, lanes)
         self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
@@ -803,8 +782,6 @@ class LaneRun:
             # The equation of `tick_ns`.
             sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
             sent.rows[i, pages] = records[i, ticks - first]
-            rows = ticks % self._used_records.shape[3]
-            sent.used[i, pages] = self._used_records[i, :, lane, rows]
 
     def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
         """Copies the state of a run that was simulated with others into its `FusedRun` object.
