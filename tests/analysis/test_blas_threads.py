@@ -16,7 +16,7 @@ def library(request: pytest.FixtureRequest) -> Iterator[blas_threads._BlasFuncti
     """The functions of a library, with two threads, as on a machine with two processors."""
     functions = blas_threads._find_blas_functions(request.param)
     if functions is None:
-        pytest.skip(f"{request.param} has no OpenBLAS that can be asked")
+        pytest.skip(f"{request.param} has no OpenBLAS whose threads can be read")
     before = functions.get_threads()
     functions.set_threads(2)
     yield functions

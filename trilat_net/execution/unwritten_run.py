@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, IntArray, link_key
+from ..core import Array
 from ..log import Log, UnwrittenLog
 from ..records import NS_PER_S
-from ..scenario import Scenario, draw_used_samples
+from ..scenario import Scenario
 from .fused import FusedRun
 from .virtual import simulate_scenario
 
@@ -50,13 +50,14 @@ def simulate_columns(scenario: Scenario) -> Log:
         return simulate_scenario(scenario)
 
     columns = {}
-    for name in scenario.names:
+    for i, name in enumerate(scenario.names):
         rows = np.concatenate(blocks[name])
+        used = run.read_samples_in_use(i, len(rows))
         ticks = np.arange(len(rows), dtype=np.int64)
         site_columns: dict[str, Any] = {
             "mode": np.full(len(rows), "run", dtype=object),
             "t_ns": ticks * NS_PER_S // scenario.sites[name].rate_hz,
-            "used": {peer: _find_used(scenario, name, peer) for peer in scenario.peers(name)},
+            "used": dict(zip(scenario.peers(name), used.T, strict=True)),
         }
         for field, place in scenario.layout(name).columns().items():
             site_columns[field] = rows[:, place]
@@ -80,25 +81,3 @@ def _is_described_by_columns(scenario: Scenario) -> bool:
         if lengths.get("hand") or lengths.get("bodies") or site.on_stale.action != "use":
             return False
     return True
-
-
-def _find_used(scenario: Scenario, site: str, peer: str) -> IntArray:
-    """Returns which received state of a peer a site used in each control period (tick).
-
-    Args:
-        scenario: Description of the experiment.
-        site: Name of the receiving site.
-        peer: Name of the sending site.
-
-    Returns:
-        Number of the sample in each tick, shape (K,). -1 before the first sample.
-    """
-    link = f"{peer}->{site}"
-    used = draw_used_samples(
-        link=scenario.links[link],
-        key=link_key(scenario.seed, link),
-        receiver_hz=scenario.sites[site].rate_hz,
-        sender_hz=scenario.sites[peer].rate_hz,
-        duration_s=scenario.duration_s,
-    )
-    return used[: scenario.ticks(site)]
