@@ -450,16 +450,18 @@ def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
     return site_ticks >= LANE_SITE_TICKS
 
 
-def _has_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Returns True if the code for several runs side by side exists from an earlier study.
+def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
+    """Decides whether a sweep simulates several runs at once, and compiles their code for it.
 
-    A small sweep then uses it as well, although it would not be worth its compilation.
+    The code is compiled once for all workers, if the sweep is large. A small sweep uses code
+    that exists from an earlier study, but would not be worth its compilation.
 
     Args:
         plan: The sweep. The code is that of its first cell.
         runs: Number of runs that remain.
     """
-    if plan.judge == "linear" or runs < 2:
+    is_large = _uses_lanes(plan, runs)
+    if plan.judge == "linear" or (runs < 2 and not is_large):
         return False
     # A sweep of single runs must not load the code of lanes.
     from trilat_net.execution import prepare_lanes
@@ -467,23 +469,11 @@ def _has_lanes(plan: SweepPlan, runs: int) -> bool:
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
     except ScenarioError:
-        return False
+        return is_large  # the workers compile the code of other cells
+    if is_large:
+        prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
+        return True
     return prepare_lanes(scenario, runs, least_site_ticks=math.inf)
-
-
-def _compile_lanes(plan: SweepPlan) -> None:
-    """Compiles the code for several runs side by side (in SIMD lanes), once for all workers.
-
-    Args:
-        plan: The sweep. The code is that of its first cell.
-    """
-    from trilat_net.execution import prepare_lanes
-
-    try:
-        scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
-    except ScenarioError:
-        return  # the workers compile the code
-    prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
 
 
 def estimate_sweep(
@@ -741,10 +731,7 @@ class _SweepWork:
             cells: Number of cells that have to run.
         """
         runs = cells - len(self._journal.done)
-        if _uses_lanes(self._plan, runs):
-            _compile_lanes(self._plan)
-            return True
-        return _has_lanes(self._plan, runs)
+        return _prepare_lanes(self._plan, runs)
 
     def _list_runs(self, cell: int) -> list[CellRun]:
         """Returns the finished runs of a cell, in the order of the seeds."""
