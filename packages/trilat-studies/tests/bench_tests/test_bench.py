@@ -342,6 +342,8 @@ def test_an_interrupted_confirmation_resumes(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_run, "run_bench_task", run_bounded)
+    # If their code exists, lanes would run the cells instead.
+    monkeypatch.setattr(bench_run, "prepare_kinds", lambda _: {})
     folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
         run_bench(folder, on=executor, progress=interrupt_first_repetition)
