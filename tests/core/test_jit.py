@@ -116,3 +116,39 @@ def test_wheels_compile_nothing_and_keep_the_bits(tmp_path: Path) -> None:
     assert generic == host
     (tmp_path / "file").touch()  # no cache can be made there
     assert run_leaves(tmp_path / "shipped", tmp_path / "file") == (host, 0)
+
+
+CALLERS = """
+import numba, numpy as np
+from trilat_net.core.step.jit import leaf
+@leaf
+def double(x): return 2.0 * x
+print(double(1.5))
+@leaf
+def twice_double(x): return double(x) + double(x + 1.0)
+@numba.njit
+def other(x): return double(x) - 1.0
+print(twice_double(2.0), other(3.0))
+print(double.stats.cache_hits.total(), twice_double.stats.cache_hits.total())
+"""
+
+
+def test_loaded_machine_code_has_compiled_callers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second process loads the first leaf for Python, and then compiles what calls it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    file = tmp_path / "callers.py"
+    file.write_text(CALLERS)
+    outputs = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, file], capture_output=True, text=True, check=True
+        )
+        outputs.append(done.stdout.splitlines())
+        for stored in tmp_path.rglob("callers.twice_double*"):
+            stored.unlink()
+    first, second = outputs
+    assert first[:-1] == second[:-1] == ["3.0", "10.0 5.0"]
+    assert first[-1] == "0 0"
+    assert second[-1] == "2 0"  # `other` needs machine code again
