@@ -37,6 +37,7 @@ from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info, State
 from .pinging import RepeatedQuery
+from .scenario_difference import describe_scenario_difference
 from .wire import M, decode, encode, split_states
 
 
@@ -509,7 +510,7 @@ class Membership:
             if is_running:
                 raise SessionError(
                     f"session {self._session!r} runs another scenario, "
-                    f"according to {info.member}"
+                    f"according to {info.member}{self._describe_difference(info)}"
                 )
             self._refuse(info)
             return
@@ -532,6 +533,20 @@ class Membership:
             return bool(info.boots)
         return self._late.may_join_late and info.member != self.local_info.member
 
+    def _describe_difference(self, info: Info) -> str:
+        """Returns a phrase on the settings in which the scenario of another member differs.
+
+        It begins with a semicolon. It is empty if no settings can be named.
+
+        Args:
+            info: Identity of the other member, with its scenario.
+        """
+        local = self.local_info
+        phrase = describe_scenario_difference(
+            info.scenario, local.scenario, info.member, local.member
+        )
+        return f"; {phrase}" if phrase else ""
+
     def _refuse(self, info: Info) -> None:
         """Refuses a member whose scenario differs, or gives up if that member is the leader.
 
@@ -547,18 +562,23 @@ class Membership:
             SessionError: The other member is the leader.
         """
         local = self.local_info
+        must_leave = not self.is_leader and info.member == self._sites[0]
+        must_report = self.is_leader and info.boot not in self._refused_boots
+        if not must_leave and not must_report:
+            return
+
         text = (
             f"the scenarios differ: {info.member} has scenario {info.scenario_sha256[:16]}, "
             f"{local.member} has scenario {local.scenario_sha256[:16]}"
+            f"{self._describe_difference(info)}"
         )
-        if not self.is_leader and info.member == self._sites[0]:
+        if must_leave:
             raise SessionError(
                 f"{text}; the leader {info.member} decides: start this site with the same "
                 "--scenario and the same --set"
             )
-        if self.is_leader and info.boot not in self._refused_boots:
-            self._refused_boots.add(info.boot)
-            self._publisher.publish("refused", text, about=info.member)
+        self._refused_boots.add(info.boot)
+        self._publisher.publish("refused", text, about=info.member)
 
 
 class Epoch(NamedTuple):

@@ -1,0 +1,91 @@
+"""Names the settings in which the scenarios of two members of a session differ.
+
+A session starts only if all of its members (processes) have the same scenario. Their identities
+contain its text, so an error message can say which setting was forgotten on one machine.
+
+Invariant:
+    - The text of another member may come from any program on the network. Whatever it contains,
+      the result is one short line without control characters.
+"""
+
+import json
+import tomllib
+from collections.abc import Iterator
+from typing import Any
+
+LISTED_SETTINGS = 3
+"""Number of settings whose values are stated. The others are counted."""
+_VALUE_LENGTH = 40
+"""Longest text of a value, in characters."""
+_ABSENT = "absent"
+_DESCRIPTIONS = ("title", "about", "assumed")
+"""Settings that have no effect. They are named last."""
+
+
+def describe_scenario_difference(
+    first_text: str, second_text: str, first_member: str, second_member: str
+) -> str:
+    """Returns a phrase that names the settings in which two scenarios differ.
+
+    An example is "link.delay_ms is 150.0 at s and 100.0 at m1".
+
+    Args:
+        first_text: Text of the first member's scenario, in TOML.
+        second_text: Text of the second member's scenario.
+        first_member: Name of the first member.
+        second_member: Name of the second member.
+
+    Returns:
+        The phrase. Empty if a text cannot be read, or if no setting differs.
+    """
+    first = _read_settings(first_text)
+    second = _read_settings(second_text)
+    if first is None or second is None:
+        return ""
+    names = [name for name in (second | first) if first.get(name) != second.get(name)]
+    names.sort(key=_DESCRIPTIONS.__contains__)
+    phrases = []
+    for name in names[:LISTED_SETTINGS]:
+        first_value = first.get(name, _ABSENT)
+        second_value = second.get(name, _ABSENT)
+        phrases.append(
+            f"{name} is {first_value} at {first_member} and {second_value} at {second_member}"
+        )
+    more = len(names) - LISTED_SETTINGS
+    if more > 0:
+        settings = "setting differs" if more == 1 else "settings differ"
+        phrases.append(f"{more} more {settings}")
+    return "; ".join(phrases)
+
+
+def _read_settings(text: str) -> dict[str, str] | None:
+    """Returns the settings of a scenario by their dotted names, with their values as text.
+
+    Args:
+        text: The scenario, in TOML.
+
+    Returns:
+        The settings. None if the text is not TOML, or is nested too deeply.
+    """
+    try:
+        return dict(_list_settings(tomllib.loads(text)))
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return None
+
+
+def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yields the dotted name and the value of each setting of a table and of its subtables."""
+    for key, value in table.items():
+        name = prefix + _shorten(key)
+        if isinstance(value, dict):
+            yield from _list_settings(value, f"{name}.")
+        else:
+            yield name, _shorten(json.dumps(value, default=str))
+
+
+def _shorten(text: str) -> str:
+    """Returns a text without control characters, cut to `_VALUE_LENGTH` characters."""
+    printable = "".join(c if c.isprintable() else "?" for c in text)
+    if len(printable) <= _VALUE_LENGTH:
+        return printable
+    return printable[: _VALUE_LENGTH - 3] + "..."
