@@ -1033,25 +1033,26 @@ class FusedRun:
 
         A sample is the state that a peer, another site, sent in one of its ticks. The samples
         follow from the delays of the links alone, so they are computed again and not stored.
+        The run must not be one that repeats a log, whose samples arrived as recorded.
 
         Args:
             i: Index of the site.
-            count: Number of ticks, at most the number of stored records.
+            count: Number of ticks, at most the number of executed ticks.
 
         Returns:
             For each tick the tick in which each peer sent the sample. It is -1 before the first
             sample.
         """
-        if i not in self._used:
+        stop = int(self._progress[i]["tick"])
+        if i not in self._used or len(self._used[i]) < stop:
+            duration_s = max(self.scenario.duration_s, self.ran_s)
             name = self.scenario.names[i]
-            ticks = self.scenario.ticks(name)
             rate_hz = self.scenario.sites[name].rate_hz
             used = [
-                draw_link_samples(link, rate_hz, self.scenario.duration_s)[:ticks]
+                draw_link_samples(link, rate_hz, duration_s)
                 for link in self.scenario.setup(name).links
             ]
             self._used[i] = np.stack(used, axis=1)
-        stop = int(self._progress[i]["tick"])
         return self._used[i][stop - count : stop]
 
     @property
