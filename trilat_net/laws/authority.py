@@ -170,13 +170,13 @@ class Authority(ControlLaw):
             The condition. None if the law does not compensate gravity exactly, because then no
             condition is known.
         """
-        if self.gravity != 1.0:
-            return None
         users = []
         for n, law in enumerate(situation.laws):
             if getattr(law, "leads", False):
                 users.append(n)
         if situation.site not in users:
+            if self.gravity != 1.0:
+                return None
             text = (
                 "it follows and closes no loop: stable in continuous time for every delay and "
                 "d > 0"

@@ -111,8 +111,6 @@ class LeeSpong(ControlLaw):
             The condition. None if the law does not compensate gravity exactly, because then no
             condition is known.
         """
-        if self.gravity != 1.0:
-            return None
         return judge_position_exchange(situation, "K", "damping")
 
     @classmethod

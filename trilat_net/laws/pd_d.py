@@ -94,8 +94,6 @@ class PdD(ControlLaw):
             The condition of P+d on K and d. None if the law does not compensate gravity
             exactly, because then no condition is known.
         """
-        if not self.exchanges_positions():
-            return None
         return judge_position_exchange(situation, "K", "d")
 
     def exchanges_positions(self) -> bool:
