@@ -226,7 +226,8 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         """
         used = run.read_samples_in_use(i, last_ticks[i] + 1)
         # A site is no peer of itself, so the peers after it move up by one column.
-        return used[ticks, j - (j > i)]
+        samples: Ints = used[ticks, j - (j > i)]
+        return samples
 
     final = _fix_delays(ended, last_ticks, draw_samples)
     trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
@@ -643,11 +644,9 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
         scenario: The scenario up to the end of the run.
     """
     run = FusedRun(scenario, keep=_BATCH_RECORDS + 1)
-    fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
     batches: list[list[_SiteMotion]] = [[] for _ in scenario.names]
-    while run.ran_s < scenario.duration_s and run.diverged_s is None:
-        run.advance_to(min(run.ran_s + _BATCH_RECORDS / fastest_hz, scenario.duration_s))
-        for n, (t_ns, rows) in enumerate(run.pop_records()):
+    for records in run.iterate_batches():
+        for n, (t_ns, rows) in enumerate(records):
             columns = scenario.layout(scenario.names[n]).columns()
             batch = _SiteMotion(
                 t_s=t_ns / NS_PER_S,
