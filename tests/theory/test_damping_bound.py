@@ -235,7 +235,7 @@ def judged(count: int, ticks: int, d: float) -> StabilityCondition:
     laws = (SimpleNamespace(K=(K_PAIR,), d=(d,)),) * count
     names, delay_s = tuple(map(str, range(count))), ticks * TICK_S * (equal(count) > 0.0)
     situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=TICK_S)
-    condition = judge_position_exchange(situation, "K", "d")
+    condition = judge_position_exchange(situation, "d")
     assert condition is not None
     return condition
 

@@ -183,7 +183,7 @@ class Authority(ControlLaw):
             )
             return StabilityCondition(True, text)
         loop_of_users = situation.restrict(users)
-        return judge_position_exchange(loop_of_users, "K", "d")
+        return judge_position_exchange(loop_of_users, "d")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

@@ -148,9 +148,7 @@ def find_least_reversible(alpha: Array) -> float | None:
     return float(eigenvalues.real.min())
 
 
-def judge_position_exchange(
-    situation: LawSituation, stiffness: str, damping: str
-) -> StabilityCondition | None:
+def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityCondition | None:
     """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
 
     The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
@@ -164,7 +162,6 @@ def judge_position_exchange(
 
     Args:
         situation: The situation of the site.
-        stiffness: Name of the law's attribute with K.
         damping: Name of the law's attribute with d.
 
     Returns:
@@ -187,7 +184,7 @@ def judge_position_exchange(
         )
         return StabilityCondition(True, text)
     hold_s = situation.hold_s
-    K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
+    K = np.array([getattr(law, "K", [np.nan]) for law in laws])
     d = np.array([getattr(law, damping, [np.nan]) for law in laws])
 
     # Cases in which no condition is known. A law without K has NaN here.

@@ -119,7 +119,7 @@ class SaturatedPd(ControlLaw):
             condition is known.
         """
         # The condition of P+d, a spring K to the peers and a damper d.
-        condition = judge_position_exchange(situation, "K", "d")
+        condition = judge_position_exchange(situation, "d")
         if condition is None:
             return None
         if not situation.gravity_nm:
