@@ -864,7 +864,6 @@ def _compute_run_metrics(
     durations_s = []
     ends = []
     end_errors_rad = []
-    end_poses_rad = {}
     for name, stats in with_records.items():
         # The run lasts until the end of the period after the last tick.
         period_s = 1.0 / scenario.sites[name].rate_hz
@@ -873,15 +872,6 @@ def _compute_run_metrics(
         ends.append(end)
         end_error_rad = np.abs(end.e).max(initial=0.0)
         end_errors_rad.append(float(end_error_rad))
-        last_second = stats.end(stats.last_ns)
-        last_pose_rad = last_second.q[-1]
-        end_poses_rad[name] = tuple(last_pose_rad.tolist())
-
-    ages = {}
-    for name, stats in site_stats.items():
-        peers = scenario.peers(name)
-        for peer, age in zip(peers, stats.link_ages, strict=True):
-            ages[f"{peer}->{name}"] = age
     windows_by_site = [stats.windows for stats in site_stats.values()]
     sites_by_window = zip(*windows_by_site, strict=True)
 
@@ -905,14 +895,45 @@ def _compute_run_metrics(
         rms_error_rad=find_largest("rms_error_rad"),
         end_error_rad=max(end_errors_rad, default=None),
         end_spread_rad=_compute_end_spread_rad(ends) if all_ran else None,
-        end_pose_rad=end_poses_rad,
+        end_pose_rad=_list_end_poses(with_records),
         peak_torque_nm=find_largest("peak_torque_nm"),
         peak_speed_rad_s=find_largest("peak_speed_rad_s"),
-        ages=ages,
+        ages=_list_link_ages(scenario, site_stats),
         late_samples=late_samples,
         missing=missing,
         windows=tuple(map(_merge_windows, sites_by_window)),
     )
+
+
+def _list_end_poses(site_stats: Mapping[str, SiteStats]) -> dict[str, tuple[float, ...]]:
+    """Returns the last joint angles of each arm, in rad, by the name of its site.
+
+    Args:
+        site_stats: Statistics of the sites, each of which has records.
+    """
+    poses_rad = {}
+    for name, stats in site_stats.items():
+        last_second = stats.end(stats.last_ns)
+        last_pose_rad = last_second.q[-1]
+        poses_rad[name] = tuple(last_pose_rad.tolist())
+    return poses_rad
+
+
+def _list_link_ages(
+    scenario: Scenario, site_stats: Mapping[str, SiteStats]
+) -> dict[str, LinkAge]:
+    """Returns the ages of the samples in use on each link, by the name of the link.
+
+    Args:
+        scenario: Scenario of the run.
+        site_stats: Statistics of each site.
+    """
+    ages = {}
+    for name, stats in site_stats.items():
+        peers = scenario.peers(name)
+        for peer, age in zip(peers, stats.link_ages, strict=True):
+            ages[f"{peer}->{name}"] = age
+    return ages
 
 
 def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
