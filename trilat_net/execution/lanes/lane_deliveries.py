@@ -64,7 +64,7 @@ _CONSTANT = int(DelayKind.CONSTANT)
 _UNIFORM = int(DelayKind.UNIFORM)
 
 
-class DelayNumbers(NamedTuple):
+class _DelayNumbers(NamedTuple):
     """Parameters of a distribution of network delays, for the function `draw_delay_us`.
 
     The delays of successive samples (sent states) are independent. The kind of the distribution
@@ -227,7 +227,7 @@ def _draw_uniform_delays(
         scale: Largest deviation from the mean, us.
         delays_us: Receives the delays, us, shape (count,).
     """
-    numbers = DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
+    numbers = _DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
     for index in range(count):
         drawn_us = draw_delay_us(key, first + index, DELAY, numbers)
         delays_us[index] = clamp_delay_us(drawn_us)
