@@ -235,7 +235,30 @@ def judged(count: int, ticks: int, d: float) -> StabilityCondition:
     laws = (SimpleNamespace(K=(K_PAIR,), d=(d,)),) * count
     names, delay_s = tuple(map(str, range(count))), ticks * TICK_S * (equal(count) > 0.0)
     situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=TICK_S)
-    return judge_position_exchange(situation, "K", "d")
+    condition = judge_position_exchange(situation, "d")
+    assert condition is not None
+    return condition
+
+
+@pytest.mark.parametrize("law", ["p_d", "pd_d", "lee_spong", "saturated_pd", "authority"])
+def test_springs_need_exact_gravity_everywhere(law: str) -> None:
+    """A site that compensates 0.9 of gravity has no condition, and its peer an undecided one."""
+    control = {"law": law, "leads": True} if law == "authority" else {"law": law}
+    alike, unlike = (
+        load_scenario(
+            "two_sites",
+            {
+                "link.delay_ms": 5.0,
+                "sites.m.control": {**control, "gravity": factor},
+                "sites.s.control": control,
+            },
+        )
+        for factor in (1.0, 0.9)
+    )
+    (line,) = describe_law_conditions(alike)
+    assert line.startswith(f"condition of {law} at m, s holds")
+    (line,) = describe_law_conditions(unlike)
+    assert line.startswith(f"condition of {law} at s is undecided: known for gravity = 1")
 
 
 def growth(count: int, ticks: int, d: float, mass: float) -> float:

@@ -174,6 +174,45 @@ def test_log_and_fused_run_have_the_same_roots() -> None:
     assert find_run_roots(scenario, run) == find_log_roots(tn.simulate(scenario))
 
 
+JITTER = {"model": "uniform", "delay_ms": 30.0, "half_width_ms": 20.0}
+LOSSY = {"model": "uniform", "delay_ms": 60.0, "half_width_ms": 30.0, "loss": 0.2}
+
+
+@pytest.mark.parametrize(
+    "links",
+    [
+        {"links.m->s": {**LOSSY, "outages_s": [[1.0, 1.5], [3.6, 3.9]]}},
+        {"timeline": [{"at_s": 2.0, "link": "m->s", "to": LOSSY}]},
+        {"timeline": [{"at_s": 3.5, "link": "s->m", "to": LOSSY}], "sites.m.rate_hz": 500},
+    ],
+)
+def test_changed_random_links_have_the_logs_roots(links: dict[str, Any]) -> None:
+    """The samples in use are drawn with the outages and changes, also beyond the duration."""
+    scenario = pair(**{"link": JITTER, "duration_s": 4.0, **links})
+    run = FusedRun(scenario)
+    for until_s in (4.0, 5.0):
+        run.advance_to(until_s)
+        log = tn.simulate(pair(**{"link": JITTER, "duration_s": until_s, **links}))
+        roots = find_run_roots(scenario, run)
+        assert roots.verdict
+        assert roots == find_log_roots(log)
+
+
+def test_arms_that_hold_have_no_roots() -> None:
+    scenario = pair(
+        **{
+            "duration_s": 3.0,
+            "links.m->s": {"model": "constant", "delay_ms": 30.0, "outages_s": [[2.0, 9.0]]},
+            "sites.s.on_stale": {"action": "hold", "age_ms": 300.0},
+        }
+    )
+    run = FusedRun(scenario)
+    run.advance_to(3.0)
+    roots = find_run_roots(scenario, run)
+    assert roots == find_log_roots(tn.simulate(scenario))
+    assert "s ends in the mode 'hold'" in roots.text
+
+
 SLOWER = {"link": "m->s", "to": {"model": "constant", "delay_ms": 300.0}}
 SAME = {"link": "m->s", "to": {"model": "constant", "delay_ms": 200.0}}
 

@@ -19,7 +19,7 @@ Invariant:
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -354,6 +354,7 @@ class FusedRun:
         self.pending_deliveries: Callable[[], None] | None = None
         self.scenario = scenario
         self._settled_rad = settled_rad
+        self._keep = keep
         self._inputs = inputs or _make_prompt_inputs(count)
         self._hands: dict[int, _HandActor] = {}
         if inputs is None:
@@ -1028,30 +1029,58 @@ class FusedRun:
             self._popped_ticks[i] = stop
         return records
 
+    @property
+    def is_finished(self) -> bool:
+        """True if the run has the whole duration of its scenario, or if an arm has diverged."""
+        return self.ran_s >= self.scenario.duration_s or self.diverged_s is not None
+
+    def find_batch_end(self) -> float:
+        """Returns the time up to which the run may go on before its records are read, in s.
+
+        In this time no site (arm controller) produces more records than the run stores, see
+        `keep` of the constructor. The time is at most the duration of the scenario.
+        """
+        fastest_hz = int(self._progress["rate_hz"].max())
+        return min(self.ran_s + (self._keep - 1) / fastest_hz, self.scenario.duration_s)
+
+    def iterate_batches(self) -> Iterator[list[tuple[IntArray, Array]]]:
+        """Simulates the scenario to its end, and yields all records batch by batch.
+
+        A long run thus needs memory for the latest `keep` records of each site (arm controller)
+        only. `keep` must be at least 2.
+
+        Yields:
+            The records since the previous batch, in the form of `pop_records`.
+        """
+        while not self.is_finished:
+            self.advance_to(self.find_batch_end())
+            yield self.pop_records()
+
     def read_samples_in_use(self, i: int, count: int) -> IntArray:
         """Returns which samples a site used in its latest ticks, shape (count, peers).
 
         A sample is the state that a peer, another site, sent in one of its ticks. The samples
         follow from the delays of the links alone, so they are computed again and not stored.
+        The run must not be one that repeats a log, whose samples arrived as recorded.
 
         Args:
             i: Index of the site.
-            count: Number of ticks, at most the number of stored records.
+            count: Number of ticks, at most the number of executed ticks.
 
         Returns:
             For each tick the tick in which each peer sent the sample. It is -1 before the first
             sample.
         """
-        if i not in self._used:
+        stop = int(self._progress[i]["tick"])
+        if i not in self._used or len(self._used[i]) < stop:
+            duration_s = max(self.scenario.duration_s, self.ran_s)
             name = self.scenario.names[i]
-            ticks = self.scenario.ticks(name)
             rate_hz = self.scenario.sites[name].rate_hz
             used = [
-                draw_link_samples(link, rate_hz, self.scenario.duration_s)[:ticks]
+                draw_link_samples(link, rate_hz, duration_s)
                 for link in self.scenario.setup(name).links
             ]
             self._used[i] = np.stack(used, axis=1)
-        stop = int(self._progress[i]["tick"])
         return self._used[i][stop - count : stop]
 
     @property

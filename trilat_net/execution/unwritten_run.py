@@ -39,12 +39,9 @@ def simulate_columns(scenario: Scenario) -> Log:
     if not _is_described_by_columns(scenario):
         return simulate_scenario(scenario)
     run = FusedRun(scenario, keep=_BLOCK_TICKS + 1)
-    fastest_hz = max(site.rate_hz for site in scenario.sites.values())
-    block_s = _BLOCK_TICKS / fastest_hz
     blocks: dict[str, list[Array]] = {name: [] for name in scenario.names}
-    while run.ran_s < scenario.duration_s and run.diverged_s is None:
-        run.advance_to(min(run.ran_s + block_s, scenario.duration_s))
-        for name, (_, rows) in zip(scenario.names, run.pop_records(), strict=True):
+    for batch in run.iterate_batches():
+        for name, (_, rows) in zip(scenario.names, batch, strict=True):
             blocks[name].append(rows)
     if run.diverged_s is not None:
         return simulate_scenario(scenario)

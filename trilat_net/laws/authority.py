@@ -170,20 +170,20 @@ class Authority(ControlLaw):
             The condition. None if the law does not compensate gravity exactly, because then no
             condition is known.
         """
-        if self.gravity != 1.0:
-            return None
         users = []
         for n, law in enumerate(situation.laws):
             if getattr(law, "leads", False):
                 users.append(n)
         if situation.site not in users:
+            if self.gravity != 1.0:
+                return None
             text = (
                 "it follows and closes no loop: stable in continuous time for every delay and "
                 "d > 0"
             )
             return StabilityCondition(True, text)
         loop_of_users = situation.restrict(users)
-        return judge_position_exchange(loop_of_users, "K", "d")
+        return judge_position_exchange(loop_of_users, "d")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

@@ -148,9 +148,7 @@ def find_least_reversible(alpha: Array) -> float | None:
     return float(eigenvalues.real.min())
 
 
-def judge_position_exchange(
-    situation: LawSituation, stiffness: str, damping: str
-) -> StabilityCondition:
+def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityCondition | None:
     """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
 
     The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
@@ -164,14 +162,18 @@ def judge_position_exchange(
 
     Args:
         situation: The situation of the site.
-        stiffness: Name of the law's attribute with K.
         damping: Name of the law's attribute with d.
 
     Returns:
         The condition. It is undecided for delays that vary, for several tick rates, in task
-        space, and if the sites have different laws or ratios Kd / K.
+        space, if the sites have different laws or ratios Kd / K, and if another site does not
+        compensate gravity exactly. None if the law of the site itself does not, because then no
+        condition is known.
     """
     laws = situation.laws
+    gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
+    if gravity_factors[situation.site] != 1.0:
+        return None
     if situation.in_task_space:
         # The stiffness belongs to coordinates of the end effector, and the damping to joints.
         return StabilityCondition(None, "known for joints that follow joints")
@@ -182,13 +184,15 @@ def judge_position_exchange(
         )
         return StabilityCondition(True, text)
     hold_s = situation.hold_s
-    K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
+    K = np.array([getattr(law, "K", [np.nan]) for law in laws])
     d = np.array([getattr(law, damping, [np.nan]) for law in laws])
 
     # Cases in which no condition is known. A law without K has NaN here.
     if np.isnan(situation.longest_s) or np.isnan(K).any():
         text = "known for constant delays, and with this law at all sites"
         return StabilityCondition(None, text)
+    if any(factor != 1.0 for factor in gravity_factors):
+        return StabilityCondition(None, "known for gravity = 1 at all sites")
     error_dampings = [np.broadcast_to(getattr(law, "Kd", 0.0), K.shape[1:]) for law in laws]
     ratios_s = np.array(error_dampings) / K
     if not np.allclose(ratios_s, ratios_s[0], rtol=1e-9, atol=0.0):

@@ -353,7 +353,7 @@ def _find_stiffest_wall(
     laws: Sequence[Any],
     dominance_factors: Array,
     slave: int,
-    hands: Sequence[Sequence[ArmLoad]] = (),
+    hands: Sequence[Sequence[ArmLoad]],
 ) -> float:
     """Returns the largest wall stiffness with loop gain below 1 at all frequencies, N m/rad.
 

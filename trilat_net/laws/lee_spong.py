@@ -111,9 +111,7 @@ class LeeSpong(ControlLaw):
             The condition. None if the law does not compensate gravity exactly, because then no
             condition is known.
         """
-        if self.gravity != 1.0:
-            return None
-        return judge_position_exchange(situation, "K", "damping")
+        return judge_position_exchange(situation, "damping")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

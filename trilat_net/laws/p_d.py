@@ -83,9 +83,7 @@ class PD(ControlLaw):
             The condition of `judge_position_exchange`. None if the law does not compensate
             gravity exactly, because then no condition is known.
         """
-        if not self.exchanges_positions():
-            return None
-        return judge_position_exchange(situation, "K", "d")
+        return judge_position_exchange(situation, "d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.

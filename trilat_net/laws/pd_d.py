@@ -94,9 +94,7 @@ class PdD(ControlLaw):
             The condition of P+d on K and d. None if the law does not compensate gravity
             exactly, because then no condition is known.
         """
-        if not self.exchanges_positions():
-            return None
-        return judge_position_exchange(situation, "K", "d")
+        return judge_position_exchange(situation, "d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.

@@ -118,14 +118,14 @@ class SaturatedPd(ControlLaw):
             The condition. None if the law does not compensate gravity exactly, because then no
             condition is known.
         """
-        if self.gravity != 1.0:
-            return None
         # The condition of P+d, a spring K to the peers and a damper d.
-        condition = judge_position_exchange(situation, "K", "d")
+        condition = judge_position_exchange(situation, "d")
+        if condition is None:
+            return None
         if not situation.gravity_nm:
             text = f"{condition.text}; and tau_limit_nm above gravity + P + d |qd|"
             return condition._replace(text=text)
-        gravity = self.gravity * np.array(situation.gravity_nm)
+        gravity = np.array(situation.gravity_nm)
         tau_limit = np.array(situation.tau_limit_nm)
         margin = tau_limit - gravity - np.array(self.P)
         if margin.min() <= 0.0:

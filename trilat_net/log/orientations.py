@@ -24,14 +24,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core import POSE, POSITION, Array
-from ..scenario import TASK_AXES
 
 QUATERNION_AXES = ("qw", "qx", "qy", "qz")
 """Names of the four numbers of a quaternion, in tables."""
 MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
 """Names of the six numbers of an orientation, with row and column of the rotation matrix."""
-_SIX_AXES = (*TASK_AXES[:POSITION], *MATRIX_ENTRIES)
-"""Names of the nine numbers of a pose: the position, and six numbers for the orientation."""
 
 
 def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:

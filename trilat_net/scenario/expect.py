@@ -152,10 +152,10 @@ def complete_expect(
         if site["arm"].get("urdf"):
             chain = read_arm(msgspec.convert(site["arm"], Arm), urdf_texts)
             joint_names[name] = tuple(joint.name for joint in chain.joints)
-    return {**written, "windows": number_window_joints(written["windows"], joint_names)}
+    return {**written, "windows": _number_window_joints(written["windows"], joint_names)}
 
 
-def number_window_joints(
+def _number_window_joints(
     written: list[TomlTable], joint_names: Mapping[str, tuple[str, ...]]
 ) -> list[TomlTable]:
     """Replaces the names of joints in expectations by their numbers.

@@ -235,7 +235,7 @@ def check_keys(
     return table
 
 
-def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
+def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str]) -> str:
     """Explains that a table must not have a key, and suggests the key that may be meant.
 
     Args:

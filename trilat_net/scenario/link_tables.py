@@ -38,7 +38,7 @@ def complete_link_tables(
     """
     link_names = [f"{peer}->{site}" for site in names for peer in names if peer != site]
     check_keys(written, link_names, "links", list_link_paths())
-    common_link = join_link(common, {}, "link")
+    common_link = _join_link(common, {}, "link")
     return {
         name: complete_link(
             written=check_table(written.get(name, {}), TomlTable, f"links.{name}"),
@@ -69,7 +69,7 @@ def complete_link(
     Raises:
         ScenarioError: A key is unknown, missing or wrong, or a file cannot be used.
     """
-    link = join_link(written, common, path)
+    link = _join_link(written, common, path)
     kind = DELAY_MODELS[link["model"]]
     if link["model"] == "trace":
         is_common_file = "file" in common and "file" not in written
@@ -85,7 +85,7 @@ def complete_link(
     return link
 
 
-def join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
+def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
     """Returns the settings of a link, completed with the settings that the link inherits.
 
     The source of settings that the author left out depends on what the author wrote:
@@ -152,7 +152,7 @@ def change_link(written: TomlTable, name: str, current: TomlTable, path: str) ->
         raise ScenarioError(f"there is no link {name!r}{hint}", path=f"{path}.link")
 
     before = current[name]
-    after = join_link(written, before, f"{path}.to")
+    after = _join_link(written, before, f"{path}.to")
     if any(key in after for key in TRACE_KEYS):
         raise ScenarioError("no file can be named here", path=f"{path}.to.file")
     if after["model"] == "trace" and after.get("trace") != before.get("trace"):

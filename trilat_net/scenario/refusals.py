@@ -99,7 +99,7 @@ def refuse(
         problem = f"is missing; the value must be {must_be}" if must_be else "is missing"
     else:
         problem = _describe_wrong_value(message, table, kind, location, path)
-    return ScenarioError(problem, path=join_path(path, location))
+    return ScenarioError(problem, path=_join_path(path, location))
 
 
 def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] = ()) -> T:
@@ -152,7 +152,7 @@ def convert_drawn(
         raise ScenarioError(problem, path=refusal.path) from None
 
 
-def join_path(path: str, location: Location) -> str:
+def _join_path(path: str, location: Location) -> str:
     """Returns the dotted path of a value inside a table, as in `sites.m1.q0_rad[0]`.
 
     Args:
@@ -167,7 +167,7 @@ def join_path(path: str, location: Location) -> str:
     return path
 
 
-def describe_wrong_type(value: Any, expected: str) -> str:
+def _describe_wrong_type(value: Any, expected: str) -> str:
     """Explains what is wrong with a value from a scenario file that has the wrong type.
 
     Args:
@@ -220,7 +220,7 @@ def _describe_wrong_value(
     if message.startswith("Expected `object`, got `"):
         return "must be a table"
     if message.startswith("Expected `array`, got `") and any(map(_is_list_of_tables, hints)):
-        return f"must be a list of tables [[{join_path(path, location)}]]"
+        return f"must be a list of tables [[{_join_path(path, location)}]]"
     return reword_problem(message)
 
 
@@ -241,9 +241,9 @@ def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
     """
     vector_length = _find_extra(kind, location, "per")
     if vector_length is None:
-        return describe_wrong_type(value, "a number")
+        return _describe_wrong_type(value, "a number")
     entry = _VECTOR_ENTRY[vector_length]
-    return describe_wrong_type(value, f"a number, or a list with one for each {entry}")
+    return _describe_wrong_type(value, f"a number, or a list with one for each {entry}")
 
 
 def _quoted_key(problem: str, start: str) -> str | None:

@@ -81,7 +81,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         "sites": sites,
         "dominance": dominance_rows,
         "links": links,
-        "timeline": complete_timeline(written.timeline, links, site_names),
+        "timeline": _complete_timeline(written.timeline, links, site_names),
         "expect": expect,
         "drawn": draws.drawn,
         "urdf": files.list_used_texts(sites),
@@ -123,7 +123,7 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
     return factors
 
 
-def complete_timeline(
+def _complete_timeline(
     written: Sequence[WrittenChange], links: TomlTable, site_names: list[str]
 ) -> list[TomlTable]:
     """Returns the planned changes of an experiment, each complete in itself.

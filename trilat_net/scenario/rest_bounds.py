@@ -86,7 +86,7 @@ class _ArmSamples(NamedTuple):
     coriolis: Array
 
 
-def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> _RestBounds:
+def find_rest_bounds(scenario: Scenario, site: str) -> _RestBounds:
     """Computes bounds of the time, energy and speeds with which an arm comes to rest.
 
     A user needs them before a real arm moves: how long and how fast may it still move after a
@@ -95,15 +95,13 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
     Args:
         scenario: Description of the experiment. The site must have the stale rule "glide",
             under which damping brings the arm to rest when the site stops.
-        site: Name of the site whose arm stops.
-        qd: Speed of each joint at the beginning of the stop, in rad/s, shape (n,). By default,
-            the speed limits of the site.
+        site: Name of the site whose arm stops. At the beginning, its joints are as fast as its
+            limits allow.
     """
     spec = scenario.sites[site]
     setup = scenario.setup(site)
     joints = len(spec.q0_rad)
-    qd = np.asarray(setup.qd_limit_rad_s if qd is None else qd)
-    speed = np.abs(np.broadcast_to(qd, joints)).astype(float)
+    speed = np.broadcast_to(setup.qd_limit_rad_s, joints).astype(float)
     limit_nm = np.broadcast_to(setup.tau_limit_nm, joints).astype(float)
     if spec.arm.urdf:
         samples = _sample_chain(scenario.arms[site], np.array(spec.q0_rad), speed)

@@ -109,7 +109,7 @@ def _is_other_module(module: str, file: Path) -> bool:
     return not file.samefile(spec.origin)
 
 
-def name_skeleton_class(module: str, kind: str = "law") -> str:
+def name_skeleton_class(module: str, kind: str) -> str:
     """Returns the name of the class in a new file that a user completes.
 
     For example, the modules mylaw and my_law contain the class MyLaw, and spring contains

@@ -62,8 +62,10 @@ def build_resume_hint(*arguments: str) -> str:
     return f"finished runs are kept: make room, and continue with: {command}"
 
 
-def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Converts a table to CSV text with a header line.
+def encode_csv(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = (), *, header: bool = True
+) -> str:
+    """Converts a table to CSV text.
 
     None becomes an empty field.
 
@@ -71,12 +73,15 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
         rows: The rows, as values by column.
         columns: The columns. Empty stands for all keys of the rows, in the order in which they
             first appear.
+        header: True if the text begins with a line of the names of the columns. A table that
+            is written in pieces has it only in the first one.
     """
     stream = io.StringIO()
     all_keys = itertools.chain.from_iterable(rows)
-    header = columns or list(dict.fromkeys(all_keys))
-    writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
+    names = columns or list(dict.fromkeys(all_keys))
+    writer = csv.DictWriter(stream, names, extrasaction="ignore", lineterminator="\n")
+    if header:
+        writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue()
 

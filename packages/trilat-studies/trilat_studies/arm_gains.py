@@ -817,6 +817,20 @@ class _GainSearch:
         }
 
 
+def _write_control_line(law: str, gains: Mapping[str, Sequence[float]]) -> str:
+    """Returns the line of a scenario that selects a law with these gains.
+
+    Args:
+        law: Name of the law.
+        gains: Values of each gain, one per joint.
+    """
+    assignments = []
+    for name, values in gains.items():
+        text = msgspec.json.encode(values).decode()
+        assignments.append(f"{name} = {text}")
+    return f'control = {{ law = "{law}", {", ".join(assignments)} }}'
+
+
 def tune_arm(
     arm: str | Path,
     delay: str | float,
@@ -904,13 +918,9 @@ def tune_arm(
         runs.append(run)
 
     gains = {}
-    assignments = []
     for name in ("K", "Kd", "d"):
         if name in tuned_law.kind.tune:
-            values = list(getattr(tuned_law, name))
-            gains[name] = values
-            text = msgspec.json.encode(values).decode()
-            assignments.append(f"{name} = {text}")
+            gains[name] = list(getattr(tuned_law, name))
     tuned_run = runs[0]
     tuned_is_stable = tuned_run["stable"] is True
     agree = tuned_is_stable and all(run["agrees"] for run in runs)
@@ -927,7 +937,7 @@ def tune_arm(
         edge=edge,
         runs=runs,
         agree=agree,
-        line=f'control = {{ law = "{law}", {", ".join(assignments)} }}',
+        line=_write_control_line(law, gains),
         curve=search.trace_edge(pose) if curve else [],
     )
 

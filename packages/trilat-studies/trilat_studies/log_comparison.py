@@ -417,7 +417,7 @@ def _measure_difference(row: _ComparisonRow) -> float:
 
 
 def _select_most_different(
-    rows: Sequence[_ComparisonRow], shown_keys: Sequence[str] = ()
+    rows: Sequence[_ComparisonRow], shown_keys: Sequence[str]
 ) -> list[_ComparisonRow]:
     """Returns the metrics that differ most between runs, in their order.
 

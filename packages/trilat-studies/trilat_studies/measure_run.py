@@ -269,11 +269,8 @@ def run_compiled_in_batches(
         The finished run, with its final state and the time at which a site left its limits.
     """
     compiled = _CompiledRun(scenario, receivers)
-    run = compiled.run
-    while not compiled.is_finished:
-        run.advance_to(compiled.find_next_end())
-        compiled.pass_records()
-    return run
+    compiled.finish()
+    return compiled.run
 
 
 class _CompiledRun:
@@ -284,7 +281,7 @@ class _CompiledRun:
         receivers: For each site, the function that receives its batches.
 
     Attributes:
-        run: The run, which the caller advances to `find_next_end`.
+        run: The run.
     """
 
     def __init__(
@@ -295,31 +292,20 @@ class _CompiledRun:
         self._receivers = receivers
         self._columns = {name: scenario.layout(name).columns() for name in scenario.names}
         self._axes = {name: arm.axes for name, arm in scenario.arms.items()}
-        fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
-        # In this time no site produces more records than the run keeps.
-        self._period_s = BATCH_RECORDS / fastest_hz
 
-    @property
-    def is_finished(self) -> bool:
-        """True if the simulation has its whole duration, or if an arm has left its limits."""
-        run = self.run
-        return run.ran_s >= self._scenario.duration_s or run.diverged_s is not None
+    def finish(self) -> None:
+        """Simulates the run to its end, and passes its records on."""
+        for batch in self.run.iterate_batches():
+            self.pass_records(batch)
 
-    def find_next_end(self) -> float:
-        """Returns the time up to which the simulation continues next, in s.
+    def pass_records(self, batch: Sequence[tuple[Ints, Array]]) -> None:
+        """Passes records on to the functions that evaluate the arms.
 
-        A long run is simulated in batches, so that its records need little memory.
-        """
-        return min(self.run.ran_s + self._period_s, self._scenario.duration_s)
-
-    def pass_records(self) -> None:
-        """Passes the records since the last call on to the function that evaluates an arm.
-
-        They do not state which states (samples) of other arms were in use.
+        Args:
+            batch: The latest records of each site, see `FusedRun.pop_records`.
         """
         no_columns = slice(0, 0)  # for vectors that the site does not have
-        records_of_sites = self.run.pop_records()
-        pairs = zip(self._scenario.names, records_of_sites, strict=True)
+        pairs = zip(self._scenario.names, batch, strict=True)
         for i, (name, site_records) in enumerate(pairs):
             t_ns, rows = site_records
             if not len(t_ns):
@@ -330,9 +316,8 @@ class _CompiledRun:
                 vector_columns = columns.get(key, no_columns)
                 vectors.append(rows[:, vector_columns])
             used = self.run.read_samples_in_use(i, len(t_ns))
-            batch = _build_batch(self._axes[name], t_ns, used, *vectors)
             receive = self._receivers[name]
-            receive(batch)
+            receive(_build_batch(self._axes[name], t_ns, used, *vectors))
 
 
 class WholeRun(NamedTuple):
@@ -409,11 +394,11 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
 
     for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
-        while running := [member for member in members if not member.is_finished]:
+        while running := [member for member in members if not member.run.is_finished]:
             # Runs of a group have the same duration, and are at the same time.
-            group.advance_to(running[0].find_next_end())
+            group.advance_to(running[0].run.find_batch_end())
             for member in running:
-                member.pass_records()
+                member.pass_records(member.run.pop_records())
         for index in group.members:
             yield index, group.obstacle
 
@@ -879,7 +864,6 @@ def _compute_run_metrics(
     durations_s = []
     ends = []
     end_errors_rad = []
-    end_poses_rad = {}
     for name, stats in with_records.items():
         # The run lasts until the end of the period after the last tick.
         period_s = 1.0 / scenario.sites[name].rate_hz
@@ -888,15 +872,6 @@ def _compute_run_metrics(
         ends.append(end)
         end_error_rad = np.abs(end.e).max(initial=0.0)
         end_errors_rad.append(float(end_error_rad))
-        last_second = stats.end(stats.last_ns)
-        last_pose_rad = last_second.q[-1]
-        end_poses_rad[name] = tuple(last_pose_rad.tolist())
-
-    ages = {}
-    for name, stats in site_stats.items():
-        peers = scenario.peers(name)
-        for peer, age in zip(peers, stats.link_ages, strict=True):
-            ages[f"{peer}->{name}"] = age
     windows_by_site = [stats.windows for stats in site_stats.values()]
     sites_by_window = zip(*windows_by_site, strict=True)
 
@@ -920,14 +895,45 @@ def _compute_run_metrics(
         rms_error_rad=find_largest("rms_error_rad"),
         end_error_rad=max(end_errors_rad, default=None),
         end_spread_rad=_compute_end_spread_rad(ends) if all_ran else None,
-        end_pose_rad=end_poses_rad,
+        end_pose_rad=_list_end_poses(with_records),
         peak_torque_nm=find_largest("peak_torque_nm"),
         peak_speed_rad_s=find_largest("peak_speed_rad_s"),
-        ages=ages,
+        ages=_list_link_ages(scenario, site_stats),
         late_samples=late_samples,
         missing=missing,
         windows=tuple(map(_merge_windows, sites_by_window)),
     )
+
+
+def _list_end_poses(site_stats: Mapping[str, SiteStats]) -> dict[str, tuple[float, ...]]:
+    """Returns the last joint angles of each arm, in rad, by the name of its site.
+
+    Args:
+        site_stats: Statistics of the sites, each of which has records.
+    """
+    poses_rad = {}
+    for name, stats in site_stats.items():
+        last_second = stats.end(stats.last_ns)
+        last_pose_rad = last_second.q[-1]
+        poses_rad[name] = tuple(last_pose_rad.tolist())
+    return poses_rad
+
+
+def _list_link_ages(
+    scenario: Scenario, site_stats: Mapping[str, SiteStats]
+) -> dict[str, LinkAge]:
+    """Returns the ages of the samples in use on each link, by the name of the link.
+
+    Args:
+        scenario: Scenario of the run.
+        site_stats: Statistics of each site.
+    """
+    ages = {}
+    for name, stats in site_stats.items():
+        peers = scenario.peers(name)
+        for peer, age in zip(peers, stats.link_ages, strict=True):
+            ages[f"{peer}->{name}"] = age
+    return ages
 
 
 def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
@@ -1031,11 +1037,8 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     measured = _MeasuredRun(scenario)
     if measured.compiled is None:
         return measured.measure_ticks()
-    compiled = measured.compiled
-    while not compiled.is_finished:
-        compiled.run.advance_to(compiled.find_next_end())
-        compiled.pass_records()
-    return measured.measure_compiled(compiled.run)
+    measured.compiled.finish()
+    return measured.measure_compiled(measured.compiled.run)
 
 
 def measure_virtual_runs(

@@ -30,13 +30,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ...core import BUCKETS_PER_S, Array, link_key
+from ...core import BUCKETS_PER_S, Array
 from ...errors import ScenarioError, join_words
-from ...execution import FusedRun, simulate_scenario
+from ...execution import FusedRun
 from ...log import Ints, Log
 from ...own_code import ImportedLaw
-from ...records import NS_PER_S
-from ...scenario import ConstantDelay, LinkBase, Scenario, draw_used_samples
+from ...records import NS_PER_S, Mode
+from ...scenario import ConstantDelay, LinkBase, Scenario
 from ..blas_threads import limit_blas_threads
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
@@ -151,12 +151,7 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
     if not all(map(len, site_logs)):
         raise ScenarioError("a site has no records", source=log.source)
     for site_log in site_logs:
-        mode = site_log.mode[-1]
-        if mode == "diverged":
-            raise ScenarioError("the run diverged", source=log.source)
-        if mode != "run":
-            problem = f"{site_log.name} ends in the mode {mode!r}"
-            raise ScenarioError(problem, source=log.source)
+        _check_mode(site_log.name, site_log.mode[-1], log.source)
 
     def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
         """Returns which messages of another arm were in use at given ticks, from the records.
@@ -204,25 +199,22 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         run: Its run in the fused loop.
 
     Raises:
-        ScenarioError: The loop cannot be linearised, or the run diverged.
+        ScenarioError: The loop cannot be linearised, or the run ended without a rest.
     """
     if run.diverged_s is not None:
-        raise ScenarioError("the run diverged", source=scenario.name)
+        _check_mode(scenario.names[0], "diverged", scenario.name)
+    for i, name in enumerate(scenario.names):
+        mode = Mode(int(run.arrays(i).site[0]["mode"]))
+        _check_mode(name, mode.name.lower(), scenario.name)
     ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
-    changes_links = any(change.link for change in ended.timeline)
-    has_outages = any(link.outages_s for link in ended.links.values())
-    has_unknown_delays = any(_list_unknown_delays(_end_traces(ended)).values())
-    if has_unknown_delays and (changes_links or has_outages):
-        # Only a log shows which samples are in use while one model of delays replaces another,
-        # or during an outage.
-        return find_log_loop(simulate_scenario(ended), own_laws=True)
+    last_ticks = [ended.ticks(name) - 1 for name in ended.names]
 
     def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
         """Returns which messages (samples) of another arm were in use, by the delay model.
 
         The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
         without a log has no records, but the random delays of the link can be drawn again from
-        its seed.
+        its seed. They include its planned changes and outages.
 
         Args:
             i: Index of the receiving site.
@@ -232,19 +224,11 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         Returns:
             Numbers of the samples, shape (K,). -1 before the first sample.
         """
-        site = ended.names[i]
-        peer = ended.names[j]
-        name = f"{peer}->{site}"
-        drawn = draw_used_samples(
-            link=ended.links[name],
-            key=link_key(ended.seed, name),
-            receiver_hz=ended.sites[site].rate_hz,
-            sender_hz=ended.sites[peer].rate_hz,
-            duration_s=ended.duration_s,
-        )
-        return drawn[ticks]
+        used = run.read_samples_in_use(i, last_ticks[i] + 1)
+        # A site is no peer of itself, so the peers after it move up by one column.
+        samples: Ints = used[ticks, j - (j > i)]
+        return samples
 
-    last_ticks = [ended.ticks(name) - 1 for name in ended.names]
     final = _fix_delays(ended, last_ticks, draw_samples)
     trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
     state = None
@@ -259,6 +243,23 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
     loop = _build_end_loop(final, state, trace, own_laws=True)
     programs = [site for site in scenario.names if has_program_hand(scenario, site)]
     return loop._replace(programs=tuple(programs))
+
+
+def _check_mode(site: str, mode: str, source: str) -> None:
+    """Checks that an arm followed the others in the last control period of a run.
+
+    Args:
+        site: Name of the site, the process that runs the arm.
+        mode: Last mode of the site, as a log states it.
+        source: Name of the log or scenario for the error message.
+
+    Raises:
+        ScenarioError: The run diverged, or the arm did not follow the others.
+    """
+    if mode == "diverged":
+        raise ScenarioError("the run diverged", source=source)
+    if mode != "run":
+        raise ScenarioError(f"{site} ends in the mode {mode!r}", source=source)
 
 
 def resolve_final_scenario(log: Log) -> Scenario:
@@ -643,11 +644,9 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
         scenario: The scenario up to the end of the run.
     """
     run = FusedRun(scenario, keep=_BATCH_RECORDS + 1)
-    fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
     batches: list[list[_SiteMotion]] = [[] for _ in scenario.names]
-    while run.ran_s < scenario.duration_s and run.diverged_s is None:
-        run.advance_to(min(run.ran_s + _BATCH_RECORDS / fastest_hz, scenario.duration_s))
-        for n, (t_ns, rows) in enumerate(run.pop_records()):
+    for records in run.iterate_batches():
+        for n, (t_ns, rows) in enumerate(records):
             columns = scenario.layout(scenario.names[n]).columns()
             batch = _SiteMotion(
                 t_s=t_ns / NS_PER_S,

@@ -165,7 +165,6 @@ _RECORDED = int(TorqueKind.RECORDED)
 _VISCOUS = int(TorqueKind.VISCOUS)
 _WALL = int(TorqueKind.WALL)
 _CHIRP = int(TorqueKind.CHIRP)
-_MULTISINE = int(TorqueKind.MULTISINE)
 _OWN_JOINTS, _OWN_TIP = map(int, OWN_KINDS)
 _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 

@@ -252,7 +252,7 @@ def update_external_torque(
 
 
 @leaf
-def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
+def _add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
     """Returns x + step_s * rate: two joint values after a time at constant rates."""
     first = x[0] + step_s * rate[0]
     second = x[1] + step_s * rate[1]
@@ -332,8 +332,8 @@ def advance_stage(
     Returns:
         Joint velocities and joint accelerations at the stage.
     """
-    stage_q = add_scaled(q, ahead_s, qd_before)
-    stage_qd = add_scaled(qd, ahead_s, qdd_before)
+    stage_q = _add_scaled(q, ahead_s, qd_before)
+    stage_qd = _add_scaled(qd, ahead_s, qdd_before)
     stage_qdd = find_stage_acceleration(
         t_s=t_s + ahead_s,
         q=stage_q,
@@ -382,8 +382,8 @@ def combine_stages(
     v_sum_1 = qd[1] + 2.0 * qd_2[1] + 2.0 * qd_3[1] + qd_4[1]
     a_sum_0 = qdd_1[0] + 2.0 * qdd_2[0] + 2.0 * qdd_3[0] + qdd_4[0]
     a_sum_1 = qdd_1[1] + 2.0 * qdd_2[1] + 2.0 * qdd_3[1] + qdd_4[1]
-    q_next = add_scaled(q, sixth, (v_sum_0, v_sum_1))
-    qd_next = add_scaled(qd, sixth, (a_sum_0, a_sum_1))
+    q_next = _add_scaled(q, sixth, (v_sum_0, v_sum_1))
+    qd_next = _add_scaled(qd, sixth, (a_sum_0, a_sum_1))
     return q_next, qd_next
 
 

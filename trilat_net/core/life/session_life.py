@@ -336,11 +336,12 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
         enter_rest(t_ns, _WAITING, _ENABLE, site)
     elif order == _ORDER_HELD and mode == _STOPPED and site.reason == _RELEASED:
         enter_rest(t_ns, _WAITING, _HELD, site)
-    elif order == _ORDER_STOP and site.reason == _RELEASED and mode == _STOPPED:
-        # The brakes of a real arm hold it since the release, and must not open again.
-        site.reason = _STOP_RELEASED
-    elif order == _ORDER_RELEASED and site.reason == _STOP and mode == _STOPPED:
-        # Until now a torque held the arm, which nobody supervises any more.
+    elif mode == _STOPPED and (
+        (order == _ORDER_STOP and site.reason == _RELEASED)
+        or (order == _ORDER_RELEASED and site.reason == _STOP)
+    ):
+        # The brakes of a real arm hold it from the release on, and must not open again. An arm
+        # that was ordered to stop first was held by a torque, which nobody supervises any more.
         site.reason = _STOP_RELEASED
     elif stops and mode != _FAULT and mode != _STOPPED:
         reason = _STOP if order == _ORDER_STOP else _RELEASED

@@ -112,7 +112,7 @@ class RecordedRows(NamedTuple):
     plants: Array
 
 
-class SiteViews(NamedTuple):
+class _SiteViews(NamedTuple):
     """State of an arm's process as 64-bit integers, to compare it bit by bit with a log.
 
     A comparison of floating-point numbers would miss differences: 0.0 equals -0.0 although
@@ -140,7 +140,7 @@ class SiteViews(NamedTuple):
     rooms: IntArray
 
 
-class TickRules(NamedTuple):
+class _TickRules(NamedTuple):
     """Properties of an arm's process that stay the same during a run, for the compiled replay.
 
     Attributes:
@@ -189,8 +189,8 @@ def _has_room(
         arrivals: Peer and tick of each arrival, see `RecordedRows.arrivals`.
         links: State of each link, one row per peer.
         pages: Number of pages of each calendar.
-        rules: Properties of the site (the process that runs the arm), a `TickRules`.
-        rooms: See `SiteViews.rooms`; updated.
+        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
+        rooms: See `_SiteViews.rooms`; updated.
     """
     for n in range(first, last):
         peer = arrivals[n, 0]
@@ -221,8 +221,8 @@ def _put_arrivals(
         last: Index after its last arrival.
         arrivals: Peer, tick and sample of each arrival, see `RecordedRows.arrivals`.
         samples: Table of the samples, as words.
-        rules: Properties of the site (the process that runs the arm), a `TickRules`.
-        views: Memory of the site, a `SiteViews`; its arrivals are written.
+        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
+        views: Memory of the site, a `_SiteViews`; its arrivals are written.
 
     Returns:
         The CRC-32 of the arrivals, which the record must have, too.
@@ -264,7 +264,7 @@ def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
         row: Index of the record.
         arrays: Arrays of the site; changed.
         rows: The records, a `RecordedRows`.
-        rules: Properties of the site (the process that runs the arm), a `TickRules`.
+        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
     """
     if rules.hand >= 0:
         hand = arrays.actors[rules.hand]
@@ -297,8 +297,8 @@ def _equals_record(
         crc: CRC-32 of the arrivals of the tick.
         arrays: Arrays of the site after the tick.
         rows: The records, a `RecordedRows`.
-        rules: Properties of the site (the process that runs the arm), a `TickRules`.
-        views: The same memory of the site as words, a `SiteViews`.
+        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
+        views: The same memory of the site as words, a `_SiteViews`.
     """
     s: SiteRow = arrays.site[0]
     # Any different bit makes `difference` nonzero; a single test at the end is fast.
@@ -337,8 +337,8 @@ def _run_recorded_ticks(
     first_tick: int,
     rows: RecordedRows,
     samples: IntArray,
-    rules: TickRules,
-    views: SiteViews,
+    rules: _TickRules,
+    views: _SiteViews,
     arrays: SiteArrays,
     buffers: TickBuffers,
 ) -> tuple[int, bool]:
@@ -410,7 +410,7 @@ class TickRepeater:
         self._parts = parts = site.parts  # the parts that a compiled loop can use
         arrays = site.arrays
         buffers = parts.buffers
-        self._rules = TickRules(
+        self._rules = _TickRules(
             rate_hz=site.rate_hz,
             shared=site.layout.shared,
             reflects=parts.reflects,
@@ -420,7 +420,7 @@ class TickRepeater:
             most_pages=parts.calendar_sizer.most_pages,
             most_ahead=span_ticks(AHEAD_LIMIT_NS, site.rate_hz),
         )
-        self._views = SiteViews(
+        self._views = _SiteViews(
             site=_view_words(arrays.site).reshape(-1),
             links=_view_words(arrays.links).reshape(-1),
             arrivals=_view_words(buffers.arrivals),
@@ -521,8 +521,8 @@ def _list_memory_sources(site: Site) -> IntArray:
     """Finds where an arm's process stores the numbers that the next control period needs.
 
     A record of the log contains them in its field `mem`, unless another field has them. The
-    order is that of `Site.restore_state`, and `SiteViews.memory` describes the three columns of
-    the result.
+    order is that of `Site.restore_state`, and `_SiteViews.memory` describes the three columns
+    of the result.
     """
     sources: list[tuple[int, int, int]] = []
     parts = site.parts

@@ -391,7 +391,7 @@ _ACTIVITIES = {
 
 
 def describe_mode(
-    site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
+    site: str, output: TickRecord, *, glides: bool, law_failure: Exception | None = None
 ) -> str:
     """Writes the sentence with which a site reports a change of its mode in the log.
 

@@ -42,6 +42,7 @@ from ...core import (
 from ...records import Mode
 from .lane_laws import compute_law
 from .lane_rows import LaneRow, RowsInLane, in_lane
+from .lane_stages import put_sent_numbers, use_states
 from .lane_vectors import GROUP, in_group
 
 _DIVERGED = int(Mode.DIVERGED)
@@ -204,37 +205,20 @@ def advance_chain_site(
     """
     groups = (lanes + GROUP - 1) // GROUP
 
-    # 2 release: the state of each peer that is in use
-    for lane in range(lanes):
-        rows = in_lane(links, lane)
-        s = in_lane(site, lane)[0]
-        shared = s.shared
-        for p in range(rows.shape[0]):
-            link = rows[p]
-            sample = used[p, lane, block_row]
-            # The peers of a site are all other sites, in scenario order.
-            peer = p if p < i else p + 1
-            page = pages if sample < 0 else sample & (pages - 1)
-            if s.law == _USER or s.on_stale == _GLIDE:
-                link.new = sample > link.used
-                link.used_ns = t_ns if sample > link.used else link.used_ns
-            link.used = sample
-            for c in range(shared):
-                link.q[c] = states[peer, page, lane, c]
-                link.qd[c] = states[peer, page, lane, shared + c]
-                link.tau_x[c] = states[peer, page, lane, 2 * shared + c]
-
-    for p in range(columns.shape[0]):
-        peer = p if p < i else p + 1
-        for c in range(columns.shape[1]):
-            column = columns[p, c]
-            for lane in range(lanes):
-                sample = used[p, lane, block_row]
-                number = 0.0
-                if sample >= 0 and column >= 0:
-                    first_sent = 3 * in_lane(site, lane)[0].shared
-                    number = states[peer, sample & (pages - 1), lane, first_sent + column]
-                in_lane(received, lane)[p].numbers[c] = number
+    use_states(
+        t_ns=t_ns,
+        lanes=lanes,
+        i=i,
+        block_row=block_row,
+        pages=pages,
+        shared=in_lane(site, 0)[0].shared,
+        site=site,
+        links=links,
+        received=received,
+        states=states,
+        used=used,
+        columns=columns,
+    )
 
     # 3 reference
     for lane in range(lanes):
@@ -317,13 +301,18 @@ def advance_chain_site(
             states[i, page, lane, shared + c] = floats[qd_column + c]
             states[i, page, lane, 2 * shared + c] = floats[tau_x_column + c]
 
-    for c in range(in_lane(site, 0)[0].sent):
-        for lane in range(lanes):
-            s = in_lane(site, lane)[0]
-            number = in_lane(sent, lane)[0].numbers[c]
-            floats = in_lane(record, lane)[record_row].floats
-            floats[first_sent_column(s) + c] = number
-            states[i, k & (pages - 1), lane, 3 * s.shared + c] = number
+    put_sent_numbers(
+        k=k,
+        lanes=lanes,
+        i=i,
+        pages=pages,
+        record_row=record_row,
+        shared=in_lane(site, 0)[0].shared,
+        site=site,
+        record=record,
+        sent=sent,
+        states=states,
+    )
 
     # 8 advance
     h_s = 1.0 / in_lane(site, 0)[0].rate_hz

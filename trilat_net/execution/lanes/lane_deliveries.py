@@ -64,7 +64,7 @@ _CONSTANT = int(DelayKind.CONSTANT)
 _UNIFORM = int(DelayKind.UNIFORM)
 
 
-class DelayNumbers(NamedTuple):
+class _DelayNumbers(NamedTuple):
     """Parameters of a distribution of network delays, for the function `draw_delay_us`.
 
     The delays of successive samples (sent states) are independent. The kind of the distribution
@@ -227,7 +227,7 @@ def _draw_uniform_delays(
         scale: Largest deviation from the mean, us.
         delays_us: Receives the delays, us, shape (count,).
     """
-    numbers = DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
+    numbers = _DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
     for index in range(count):
         drawn_us = draw_delay_us(key, first + index, DELAY, numbers)
         delays_us[index] = clamp_delay_us(drawn_us)
@@ -705,6 +705,39 @@ def use_samples_of_rates(
 
 
 @leaf
+def _select_link(
+    i: int,
+    p: int,
+    links: RowArray,
+    models: RowArray,
+    dues: IntArray,
+    calendars: RowArray,
+    points: Points,
+    channel: ChannelArrays | None,
+) -> LinkArrays:
+    """Returns the arrays of one link out of those of all links of a run.
+
+    Args:
+        i: Index of the receiving site.
+        p: Index of the peer among the peers of this site.
+        links: Rows of the links, shape (N, P).
+        models: Models of the links, shape (N, P, M).
+        dues: Due times, shape (N, P, D).
+        calendars: Calendars of the links, shape (N, P, pages).
+        points: Traces and outages.
+        channel: Numbers that laws receive, or None.
+    """
+    return LinkArrays(
+        state=links[i, p : p + 1],
+        models=models[i, p],
+        dues=dues[i, p],
+        calendar=calendars[i, p],
+        points=points,
+        channel=channel_of(channel_of(channel, i), p),
+    )
+
+
+@leaf
 def use_recorded_samples(
     first: IntArray,
     end: IntArray,
@@ -746,14 +779,7 @@ def use_recorded_samples(
     for i in range(links.shape[0]):
         rate_hz = rates_hz[i]
         for p in range(links.shape[1]):
-            link = LinkArrays(
-                state=links[i, p : p + 1],
-                models=models[i, p],
-                dues=dues[i, p],
-                calendar=calendars[i, p],
-                points=points,
-                channel=channel_of(channel_of(channel, i), p),
-            )
+            link = _select_link(i, p, links, models, dues, calendars, points, channel)
             peer = p if p < i else p + 1
             for k in range(first[i], end[i]):
                 for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
@@ -819,14 +845,7 @@ def repeat_deliveries(
     for i in range(links.shape[0]):
         rate_hz = rates_hz[i]
         for p in range(links.shape[1]):
-            link = LinkArrays(
-                state=links[i, p : p + 1],
-                models=models[i, p],
-                dues=dues[i, p],
-                calendar=calendars[i, p],
-                points=points,
-                channel=channel_of(channel_of(channel, i), p),
-            )
+            link = _select_link(i, p, links, models, dues, calendars, points, channel)
             # The peers of a site are all other sites, in scenario order.
             peer = p if p < i else p + 1
             sample = next_samples[i, p]

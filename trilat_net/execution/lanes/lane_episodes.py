@@ -23,7 +23,6 @@ from ...core import (
     HandRules,
     IntArray,
     SeveralHands,
-    call_address,
     leaf,
     tick_ns,
 )
@@ -31,7 +30,7 @@ from ..fused import FusedRun
 from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
 from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
 from .lane_run import LaneRun, explain_uncompilable, find_words, put_rows, view_rows
-from .lane_stages import EndedRuns, copy_lane, keep_ended_runs
+from .lane_stages import EndedRuns, call_site, copy_lane, keep_ended_runs
 from .lane_structure import RunStructure, find_obstacle, find_structure
 from .run_groups import LEAST_RUNS
 
@@ -183,38 +182,22 @@ def _run_span(
             clock[1, 0, lane] = tick_ns(k, rate_hz)
         _put_actions(actions[block_row], hand_row, columns, actors, runs)
         for i in range(addresses.shape[0]):
-            call_address(
-                addresses[i],
-                (
-                    pointer_to(clock_addresses[0]),
-                    pointer_to(clock_addresses[1]),
-                    lanes,
-                    settled_rad,
-                    i,
-                    block_row,
-                    pages,
-                    0,
-                    0,
-                    pointer_to(tables[i, 0]),
-                    pointer_to(tables[i, 1]),
-                    pointer_to(tables[i, 2]),
-                    pointer_to(tables[i, 3]),
-                    pointer_to(tables[i, 4]),
-                    pointer_to(tables[i, 5]),
-                    pointer_to(tables[i, 6]),
-                    pointer_to(tables[i, 7]),
-                    pointer_to(tables[i, 8]),
-                    pointer_to(tables[i, 9]),
-                    pointer_to(tables[i, 10]),
-                    pointer_to(tables[i, 11]),
-                    pointer_to(tables[i, 12]),
-                    pointer_to(tables[i, 13]),
-                    pointer_to(tables[i, 14]),
-                    states,
-                    used[i],
-                    received_columns[i],
-                    table,
-                ),
+            call_site(
+                address=addresses[i],
+                k=pointer_to(clock_addresses[0]),
+                t_ns=pointer_to(clock_addresses[1]),
+                lanes=lanes,
+                settled_rad=settled_rad,
+                i=i,
+                block_row=block_row,
+                pages=pages,
+                bucket=0,
+                record_row=0,
+                tables=tables[i],
+                states=states,
+                used=used[i],
+                columns=received_columns[i],
+                table=table,
             )
         # The tick that follows.
         for lane in range(LANES):

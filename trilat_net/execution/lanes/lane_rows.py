@@ -126,21 +126,16 @@ class _PartOfTable(LaneTable):
         types.Type.__init__(self, f"{type(self).__name__}({self.fields}, {constants}, {LANES})")
 
 
-class RowsInLane(_PartOfTable):
-    """Numba type of an array of records of one simulation, for example of all links of a site.
+class RowType(types.Type):
+    """Base of the Numba types of a record in lanes, which look up its fields by their names.
 
-    Several runs are simulated side by side (each in one lane). The same numbers of all runs are
-    adjacent in memory, and this type selects those of a single run.
+    Attributes:
+        fields: Fields of the record.
+        constants: The fields that are equal in all lanes, as the only entry.
     """
 
-
-class LaneRow(_PartOfTable):
-    """Numba type of one record of one simulation, whose fields compiled code reads by name.
-
-    Several runs are simulated side by side (each in one lane), with the same numbers of all
-    runs adjacent in memory. The type hides this arrangement, so that the same source code works
-    for a run that is simulated alone.
-    """
+    fields: tuple[LaneField, ...]
+    constants: tuple[Constants, ...]
 
     def find_field(self, name: str) -> LaneField | None:
         """Returns the position and type of a field of the record, such as "q", by its name.
@@ -156,6 +151,23 @@ class LaneRow(_PartOfTable):
         value excludes. Returns None if the field can differ between the runs.
         """
         return dict(self.constants[0]).get(name)
+
+
+class RowsInLane(_PartOfTable):
+    """Numba type of an array of records of one simulation, for example of all links of a site.
+
+    Several runs are simulated side by side (each in one lane). The same numbers of all runs are
+    adjacent in memory, and this type selects those of a single run.
+    """
+
+
+class LaneRow(RowType, _PartOfTable):
+    """Numba type of one record of one simulation, whose fields compiled code reads by name.
+
+    Several runs are simulated side by side (each in one lane), with the same numbers of all
+    runs adjacent in memory. The type hides this arrangement, so that the same source code works
+    for a run that is simulated alone.
+    """
 
 
 class LaneNumbers(types.Type):
@@ -254,6 +266,48 @@ def _find_number(
     return builder.bitcast(pointer, number_type.as_pointer())
 
 
+def make_view(
+    context: Any,
+    builder: Any,
+    array_type: types.Array,
+    data: Any,
+    shape: tuple[int, ...],
+    itemsize: int,
+) -> Any:
+    """Generates LLVM code for an array that shows a field of a row in one lane, or in several.
+
+    Successive elements of the field are `LANES` numbers apart in memory.
+
+    Args:
+        context: Numba's context of the compilation.
+        builder: Appends LLVM instructions.
+        array_type: Numba's type of the array.
+        data: Pointer to the first element, as an LLVM value.
+        shape: Shape of the field.
+        itemsize: Size of an element of the array, bytes.
+    """
+    strides: list[int] = []
+    step = LANES * _WORD
+    for length in reversed(shape):
+        strides.insert(0, step)
+        step *= length
+
+    def pack(numbers: Any) -> Any:
+        constants = [context.get_constant(types.intp, number) for number in numbers]
+        return cgutils.pack_array(builder, constants)
+
+    view = context.make_array(array_type)(context, builder)
+    arrayobj.populate_array(
+        view,
+        data=data,
+        shape=pack(shape),
+        strides=pack(strides),
+        itemsize=context.get_constant(types.intp, itemsize),
+        meminfo=None,
+    )
+    return view._getvalue()
+
+
 @lower_getattr_generic(LaneRow)
 def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
     """Generates LLVM code that reads a field of a record of one simulation, as `row.field`.
@@ -280,26 +334,7 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
         return builder.load(data)
 
     array_type = types.Array(_NUMBA_KINDS[field.kind], len(field.shape), "A")
-    view = context.make_array(array_type)(context, builder)
-    strides: list[int] = []
-    step = LANES * _WORD  # from one number of the lane to the next
-    for length in reversed(field.shape):
-        strides.insert(0, step)
-        step *= length
-
-    def pack(numbers: Any) -> Any:
-        constants = [context.get_constant(types.intp, number) for number in numbers]
-        return cgutils.pack_array(builder, constants)
-
-    arrayobj.populate_array(
-        view,
-        data=data,
-        shape=pack(field.shape),
-        strides=pack(strides),
-        itemsize=context.get_constant(types.intp, _WORD),
-        meminfo=None,
-    )
-    return view._getvalue()
+    return make_view(context, builder, array_type, data, field.shape, _WORD)
 
 
 @lower_setattr_generic(LaneRow)

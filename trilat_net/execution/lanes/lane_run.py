@@ -59,7 +59,7 @@ _STATE_FIELDS = ("q", "qd", "tau_x")
 """Fields of a link's row that contain the sample in use."""
 
 
-class SiteTables(NamedTuple):
+class _SiteTables(NamedTuple):
     """The state of one site (simulated arm with its controller) in several runs side by side.
 
     Each run has a lane, an element of the vector registers. In each array, the numbers of all
@@ -102,7 +102,7 @@ class SiteTables(NamedTuple):
     chain: Any
 
 
-class LaneLayout(NamedTuple):
+class _LaneLayout(NamedTuple):
     """Data types and lengths of the arrays of a run, which its compiled code must know.
 
     Runs with equal layouts can use the same code.
@@ -138,14 +138,14 @@ class LaneLayout(NamedTuple):
     sent: int
 
 
-def find_layout(run: FusedRun) -> LaneLayout:
+def _find_layout(run: FusedRun) -> _LaneLayout:
     """Returns the data types and lengths of all arrays of a run, on which its code depends.
 
     A run without compiled control laws has arrays of length 0 in their place.
     """
     memory = run.memory
     tables = memory.tables
-    return LaneLayout(
+    return _LaneLayout(
         site=tables.site.dtype,
         link=tables.links.dtype,
         actor=tables.actors.dtype,
@@ -162,8 +162,8 @@ def find_layout(run: FusedRun) -> LaneLayout:
     )
 
 
-def list_argument_types(
-    layout: LaneLayout,
+def _list_argument_types(
+    layout: _LaneLayout,
     structure: RunStructure,
     site: SiteStructure,
     clock: types.Type = types.int64,
@@ -189,7 +189,7 @@ def list_argument_types(
         constants = () if any(site.prismatic) else (("prismatic", 0),)
         chain = LaneTable(layout.chain, (constants,) * len(site.prismatic))
     environments = actors[first:] if first >= 0 else ()
-    tables = SiteTables(
+    tables = _SiteTables(
         site=LaneTable(layout.site, (site.constants,)),
         links=LaneTable(layout.link, ((),) * structure.peers),
         actors=LaneTable(layout.actor, actors),
@@ -227,7 +227,7 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
     return LaneTable(np.dtype([("numbers", "f8", (count,))]), ((),) * rows)
 
 
-def choose_code(layout: LaneLayout) -> Callable[..., None]:
+def _choose_code(layout: _LaneLayout) -> Callable[..., None]:
     """Returns the compiled function that advances several simulated runs by one control period.
 
     There is one function for planar arms with two joints, and one for chains of joints from a
@@ -245,16 +245,16 @@ def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -
     Args:
         run: One of the runs.
         structure: The structure that all these runs have, see `find_structure`.
-        clock: Numba's type of the ticks, see `list_argument_types`.
+        clock: Numba's type of the ticks, see `_list_argument_types`.
 
     Raises:
         NumbaError: A law of a user cannot be compiled for several runs at once.
     """
-    layout = find_layout(run)
+    layout = _find_layout(run)
     addresses = []
     for site in structure.sites:
-        arguments = list_argument_types(layout, structure, site, clock)
-        addresses.append(find_lane_address(choose_code(layout), arguments))
+        arguments = _list_argument_types(layout, structure, site, clock)
+        addresses.append(find_lane_address(_choose_code(layout), arguments))
     return np.array(addresses)
 
 
@@ -267,7 +267,7 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
     Args:
         run: The run before its first tick (control period). There must be no obstacle, see
             `find_obstacle`.
-        clock: Type of the ticks, see `list_argument_types`.
+        clock: Type of the ticks, see `_list_argument_types`.
 
     Returns:
         The reason. Empty if there is none.
@@ -289,9 +289,9 @@ def read_assembly(run: FusedRun, i: int) -> str:
         i: Index of the site.
     """
     structure = find_structure(run)
-    layout = find_layout(run)
-    arguments = list_argument_types(layout, structure, structure.sites[i])
-    return read_lane_assembly(choose_code(layout), arguments)
+    layout = _find_layout(run)
+    arguments = _list_argument_types(layout, structure, structure.sites[i])
+    return read_lane_assembly(_choose_code(layout), arguments)
 
 
 @leaf
@@ -323,9 +323,9 @@ def has_lane_code(run: FusedRun) -> bool:
         run: The run. There must be no obstacle, see `find_obstacle`.
     """
     structure = find_structure(run)
-    layout = find_layout(run)
+    layout = _find_layout(run)
     return all(
-        is_lane_code_stored(choose_code(layout), list_argument_types(layout, structure, site))
+        is_lane_code_stored(_choose_code(layout), _list_argument_types(layout, structure, site))
         for site in structure.sites
     )
 
@@ -388,6 +388,25 @@ class _LinksOfRun:
             tables.channel.received[:] = received.reshape(tables.channel.received.shape)
 
 
+def _pack_tables(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
+    """Stores arrays of several runs side by side, as vector instructions require.
+
+    Args:
+        tables_of_runs: The same array of each run.
+
+    Returns:
+        The numbers of all runs, shape (rows, numbers of a row, LANES).
+    """
+    tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
+    rows, row_length = tables_of_lanes[0].shape
+    packed = allocate_words(rows, row_length)
+    # Lanes without a run repeat the first run.
+    packed[:] = tables_of_lanes[0][:, :, None]
+    for lane, numbers in enumerate(tables_of_lanes):
+        packed[:, :, lane] = numbers
+    return packed
+
+
 class LaneRun:
     """Simulates several runs of equal structure together with vector instructions.
 
@@ -402,7 +421,7 @@ class LaneRun:
 
     Attributes:
         runs: The runs that are in the lanes. `advance_to` writes the results into them.
-        clock: Type of the ticks, see `list_argument_types`.
+        clock: Type of the ticks, see `_list_argument_types`.
     """
 
     clock: types.Type = types.int64
@@ -414,7 +433,7 @@ class LaneRun:
         assert all(run.ran_s == 0.0 for run in runs)
         self.runs = list(runs)
         self._structure = structure
-        self._layout = layout = find_layout(runs[0])
+        self._layout = layout = _find_layout(runs[0])
         memories = [run.memory for run in runs]
         tables = [memory.tables for memory in memories]
         first = tables[0]
@@ -438,29 +457,14 @@ class LaneRun:
         self._used = np.zeros((self._sites, structure.peers, LANES, BLOCK_TICKS), np.int64)
         self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
 
-        def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
-            """Stores arrays of several runs side by side, as vector instructions require.
-
-            Returns:
-                The numbers of all runs, shape (rows, numbers of a row, LANES).
-            """
-            tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
-            rows, row_length = tables_of_lanes[0].shape
-            packed = allocate_words(rows, row_length)
-            # Lanes without a run repeat the first run.
-            packed[:] = tables_of_lanes[0][:, :, None]
-            for lane, numbers in enumerate(tables_of_lanes):
-                packed[:, :, lane] = numbers
-            return packed
-
-        self._site = pack([arrays.site for arrays in tables])
-        self._links = pack([arrays.links for arrays in tables])
-        self._actors = pack([arrays.actors for arrays in tables])
+        self._site = _pack_tables([arrays.site for arrays in tables])
+        self._links = _pack_tables([arrays.links for arrays in tables])
+        self._actors = _pack_tables([arrays.actors for arrays in tables])
         # The environments have a table of their own, because arguments must not overlap.
         self._environments = self._actors.copy()
-        self._sums = pack([memory.sums for memory in memories])
-        self._progress = pack([memory.progress for memory in memories])
-        self._ramps = pack([view_rows(arrays.ramps) for arrays in tables])
+        self._sums = _pack_tables([memory.sums for memory in memories])
+        self._progress = _pack_tables([memory.progress for memory in memories])
+        self._ramps = _pack_tables([view_rows(arrays.ramps) for arrays in tables])
         records = allocate_words(self._sites * record_rows, layout.floats)
         self._records = records.reshape(self._sites, record_rows, layout.floats, LANES)
         self._laws = allocate_words(self._sites, layout.law)
@@ -470,9 +474,18 @@ class LaneRun:
         self._code = allocate_words(1, 1)
         self._chain = allocate_words(self._sites, 0)
         if first.chain is not None:
-            self._chain = pack([np.asarray(arrays.chain) for arrays in tables])
+            self._chain = _pack_tables([np.asarray(arrays.chain) for arrays in tables])
         self._put_laws(memories)
-        self._ended = EndedRuns(
+        self._ended = self._allocate_ended()
+        for lane, arrays in enumerate(tables):
+            self._put_first_states(lane, arrays)
+        self._addresses = _find_addresses(runs[0], structure, self.clock)
+        most_sources = len(self._actors) // self._sites
+        self._hands = _find_recorded_hands(memories[0].feed, layout.actor, most_sources)
+
+    def _allocate_ended(self) -> EndedRuns:
+        """Allocates memory for the last states of the runs, none of which has ended yet."""
+        return EndedRuns(
             ticks=np.full(LANES, -1),
             site_ticks=np.zeros((self._sites, LANES), np.int64),
             site_rows=np.zeros_like(self._site),
@@ -482,13 +495,8 @@ class LaneRun:
             progress=np.zeros_like(self._progress),
             laws=np.zeros_like(self._laws),
             sent=np.zeros_like(self._sent),
-            peaks=np.zeros((self._sites, layout.columns, LANES), np.int64),
+            peaks=np.zeros((self._sites, self._layout.columns, LANES), np.int64),
         )
-        for lane, arrays in enumerate(tables):
-            self._put_first_states(lane, arrays)
-        self._addresses = _find_addresses(runs[0], structure, self.clock)
-        most_sources = len(self._actors) // self._sites
-        self._hands = _find_recorded_hands(memories[0].feed, layout.actor, most_sources)
 
     def _put_first_states(self, lane: int, arrays: SiteArrays) -> None:
         """Copies the initial state of each site, as the other sites know it, into a lane.
@@ -532,12 +540,12 @@ class LaneRun:
         """Returns the memory address of each array of each of the N sites, shape (N, 15).
 
         The compiled code of a tick (control period) receives the addresses of these 15 arrays
-        (`SiteTables`).
+        (`_SiteTables`).
         """
         structure = self._structure
         addresses = []
         for i in range(self._sites):
-            rows = SiteTables(
+            rows = _SiteTables(
                 site=_share(self._site, i, self._sites),
                 links=_share(self._links, i, self._sites),
                 actors=_share(self._actors, i, self._sites),
@@ -918,7 +926,7 @@ def _share(table: Words, i: int, sites: int) -> Words:
     return table[i * rows : (i + 1) * rows]
 
 
-def _check_distinct(tables: SiteTables) -> None:
+def _check_distinct(tables: _SiteTables) -> None:
     """Asserts that no two tables overlap: the compiled code of `advance_site` relies on it."""
     filled = [table for table in tables if table.size]
     ranges = sorted((table.ctypes.data, table.ctypes.data + table.nbytes) for table in filled)

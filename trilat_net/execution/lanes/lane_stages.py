@@ -162,6 +162,103 @@ def _advance_stage(
     )
 
 
+@leaf
+def use_states(
+    t_ns: Any,
+    lanes: int,
+    i: int,
+    block_row: int,
+    pages: int,
+    shared: int,
+    site: Any,
+    links: Any,
+    received: Any,
+    states: Array,
+    used: IntArray,
+    columns: IntArray,
+) -> None:
+    """Copies the state of each peer that is in use to the links of an arm: stage 2, release.
+
+    Args:
+        t_ns: Nominal time of the tick, ns since the epoch, see `number_of`.
+        lanes: Number of lanes to compute.
+        i: Index of the site.
+        block_row: Row of the tick in `used`.
+        pages: Number of latest states of each site in `states`, a power of two.
+        shared: Number of coordinates that sites share.
+        site: Row of the site.
+        links: Rows of its links; changed.
+        received: Rows with the numbers that the peers' laws sent; changed.
+        states: The latest states of all sites, see `advance_site`.
+        used: Sample in use by peer, lane and tick of a block; -1: none yet.
+        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
+    """
+    for lane in range(lanes):
+        rows = in_lane(links, lane)
+        s = in_lane(site, lane)[0]
+        for p in range(rows.shape[0]):
+            link = rows[p]
+            lane_ns = number_of(t_ns, lane)
+            sample = used[p, lane, block_row]
+            # The peers of a site are all other sites, in scenario order.
+            peer = p if p < i else p + 1
+            page = pages if sample < 0 else sample & (pages - 1)
+            if s.law == _USER or s.on_stale == _GLIDE:
+                link.new = sample > link.used
+                link.used_ns = lane_ns if sample > link.used else link.used_ns
+            link.used = sample
+            for c in range(shared):
+                link.q[c] = states[peer, page, lane, c]
+                link.qd[c] = states[peer, page, lane, shared + c]
+                link.tau_x[c] = states[peer, page, lane, 2 * shared + c]
+
+    for p in range(columns.shape[0]):
+        peer = p if p < i else p + 1
+        for c in range(columns.shape[1]):
+            column = columns[p, c]
+            for lane in range(lanes):
+                sample = used[p, lane, block_row]
+                number = 0.0
+                if sample >= 0 and column >= 0:
+                    number = states[peer, sample & (pages - 1), lane, 3 * shared + column]
+                in_lane(received, lane)[p].numbers[c] = number
+
+
+@leaf
+def put_sent_numbers(
+    k: Any,
+    lanes: int,
+    i: int,
+    pages: int,
+    record_row: int,
+    shared: int,
+    site: Any,
+    record: Any,
+    sent: Any,
+    states: Array,
+) -> None:
+    """Copies the numbers that the law of an arm sends to its record and its latest state.
+
+    Args:
+        k: The tick, see `number_of`.
+        lanes: Number of lanes to compute.
+        i: Index of the site.
+        pages: Number of latest states of each site in `states`, a power of two.
+        record_row: Row of the tick in `record`.
+        shared: Number of coordinates that sites share.
+        site: Row of the site.
+        record: Rows with the floats of its latest records; one is changed.
+        sent: Row with the numbers that the law sends.
+        states: The latest states of all sites, see `advance_site`; changed.
+    """
+    for c in range(in_lane(site, 0)[0].sent):
+        for lane in range(lanes):
+            number = in_lane(sent, lane)[0].numbers[c]
+            floats = in_lane(record, lane)[record_row].floats
+            floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
+            states[i, number_of(k, lane) & (pages - 1), lane, 3 * shared + c] = number
+
+
 @lane_leaf
 def advance_site(
     k: Any,
@@ -228,36 +325,20 @@ def advance_site(
         columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
-    # 2 release: the state of each peer that is in use
-    for lane in range(lanes):
-        rows = in_lane(links, lane)
-        for p in range(rows.shape[0]):
-            link = rows[p]
-            lane_ns = number_of(t_ns, lane)
-            sample = used[p, lane, block_row]
-            # The peers of a site are all other sites, in scenario order.
-            peer = p if p < i else p + 1
-            page = pages if sample < 0 else sample & (pages - 1)
-            s = in_lane(site, lane)[0]
-            if s.law == _USER or s.on_stale == _GLIDE:
-                link.new = sample > link.used
-                link.used_ns = lane_ns if sample > link.used else link.used_ns
-            link.used = sample
-            for c in range(JOINTS):
-                link.q[c] = states[peer, page, lane, c]
-                link.qd[c] = states[peer, page, lane, JOINTS + c]
-                link.tau_x[c] = states[peer, page, lane, 2 * JOINTS + c]
-
-    for p in range(columns.shape[0]):
-        peer = p if p < i else p + 1
-        for c in range(columns.shape[1]):
-            column = columns[p, c]
-            for lane in range(lanes):
-                sample = used[p, lane, block_row]
-                number = 0.0
-                if sample >= 0 and column >= 0:
-                    number = states[peer, sample & (pages - 1), lane, 3 * JOINTS + column]
-                in_lane(received, lane)[p].numbers[c] = number
+    use_states(
+        t_ns=t_ns,
+        lanes=lanes,
+        i=i,
+        block_row=block_row,
+        pages=pages,
+        shared=JOINTS,
+        site=site,
+        links=links,
+        received=received,
+        states=states,
+        used=used,
+        columns=columns,
+    )
 
     # 3 reference, 4 errors, 5 estimate. The branches of the rule `glide` have loops of their
     # own, because a loop with branches does not use vector instructions.
@@ -325,12 +406,18 @@ def advance_site(
             states[i, page, lane, JOINTS + c] = floats[JOINTS + c]
             states[i, page, lane, 2 * JOINTS + c] = floats[TAU_X_COLUMN + c]
 
-    for c in range(in_lane(site, 0)[0].sent):
-        for lane in range(lanes):
-            number = in_lane(sent, lane)[0].numbers[c]
-            floats = in_lane(record, lane)[record_row].floats
-            floats[first_sent_column(in_lane(site, lane)[0]) + c] = number
-            states[i, number_of(k, lane) & (pages - 1), lane, 3 * JOINTS + c] = number
+    put_sent_numbers(
+        k=k,
+        lanes=lanes,
+        i=i,
+        pages=pages,
+        record_row=record_row,
+        shared=JOINTS,
+        site=site,
+        record=record,
+        sent=sent,
+        states=states,
+    )
 
     # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
     # processor begins with the next lanes while it waits for results of the previous ones.
@@ -578,6 +665,81 @@ def _apply_recorded_hand(
 
 
 @leaf
+def call_site(
+    address: int,
+    k: Any,
+    t_ns: Any,
+    lanes: int,
+    settled_rad: float,
+    i: int,
+    block_row: int,
+    pages: int,
+    bucket: int,
+    record_row: int,
+    tables: IntArray,
+    states: Array,
+    used: IntArray,
+    columns: IntArray,
+    table: Array,
+) -> None:
+    """Calls the compiled code that computes one control period of an arm for several runs.
+
+    The arguments after `address` are those of `advance_site`. Instead of its tables, from
+    `site` to `_chain`, `tables` has their addresses in the same order.
+
+    Args:
+        address: Address of the code of `advance_site` or `advance_chain_site`.
+        k: The tick, of all lanes or as a pointer to those of the lanes.
+        t_ns: Its nominal time, ns since the epoch, in the same form.
+        lanes: Number of lanes to compute.
+        settled_rad: Position error below which an arm counts as settled, rad.
+        i: Index of the site.
+        block_row: Row of the tick in `used`.
+        pages: Number of latest states of each site in `states`.
+        bucket: Row of the tick in the table of peaks.
+        record_row: Row of the tick in the table of records.
+        tables: Addresses of the tables of the site, shape (15,).
+        states: The latest states of all sites.
+        used: Samples in use of the site.
+        columns: Indices of the numbers that its law receives.
+        table: Tables of the operators and environments.
+    """
+    call_address(
+        address,
+        (
+            k,
+            t_ns,
+            lanes,
+            settled_rad,
+            i,
+            block_row,
+            pages,
+            bucket,
+            record_row,
+            pointer_to(tables[0]),
+            pointer_to(tables[1]),
+            pointer_to(tables[2]),
+            pointer_to(tables[3]),
+            pointer_to(tables[4]),
+            pointer_to(tables[5]),
+            pointer_to(tables[6]),
+            pointer_to(tables[7]),
+            pointer_to(tables[8]),
+            pointer_to(tables[9]),
+            pointer_to(tables[10]),
+            pointer_to(tables[11]),
+            pointer_to(tables[12]),
+            pointer_to(tables[13]),
+            pointer_to(tables[14]),
+            states,
+            used,
+            columns,
+            table,
+        ),
+    )
+
+
+@leaf
 def run_block(
     first: IntArray,
     ticks: IntArray,
@@ -654,38 +816,22 @@ def run_block(
             latest[1, i] = k * BUCKETS_PER_S // rates_hz[i]
             latest[2, i] = k & (record_rows - 1)
             _apply_recorded_hand(i, k, lanes, hands, actors)
-            call_address(
-                addresses[i],
-                (
-                    k,
-                    t_ns,
-                    lanes,
-                    settled_rad,
-                    i,
-                    k - first[i],
-                    pages,
-                    latest[1, i],
-                    latest[2, i],
-                    pointer_to(tables[i, 0]),
-                    pointer_to(tables[i, 1]),
-                    pointer_to(tables[i, 2]),
-                    pointer_to(tables[i, 3]),
-                    pointer_to(tables[i, 4]),
-                    pointer_to(tables[i, 5]),
-                    pointer_to(tables[i, 6]),
-                    pointer_to(tables[i, 7]),
-                    pointer_to(tables[i, 8]),
-                    pointer_to(tables[i, 9]),
-                    pointer_to(tables[i, 10]),
-                    pointer_to(tables[i, 11]),
-                    pointer_to(tables[i, 12]),
-                    pointer_to(tables[i, 13]),
-                    pointer_to(tables[i, 14]),
-                    states,
-                    used[i],
-                    columns[i],
-                    table,
-                ),
+            call_site(
+                address=addresses[i],
+                k=k,
+                t_ns=t_ns,
+                lanes=lanes,
+                settled_rad=settled_rad,
+                i=i,
+                block_row=k - first[i],
+                pages=pages,
+                bucket=latest[1, i],
+                record_row=latest[2, i],
+                tables=tables[i],
+                states=states,
+                used=used[i],
+                columns=columns[i],
+                table=table,
             )
             ticks[i] = k + 1
             next_ns[i] = tick_ns(k + 1, rates_hz[i]) if k + 1 < end[i] else NEVER_NS

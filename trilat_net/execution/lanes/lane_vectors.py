@@ -36,10 +36,9 @@ from numba.core.typing.templates import (
     infer_global,
     signature,
 )
-from numba.np import arrayobj
 
 from ...core import choose, holds_anywhere, round_down, set_lane_form, whole
-from .lane_rows import LANES, Constants, LaneField, LaneTable, offset_rows
+from .lane_rows import LANES, Constants, LaneField, LaneTable, RowType, make_view, offset_rows
 
 GROUP = 8
 """Number of runs whose numbers form one value: the doubles of the longest register."""
@@ -335,15 +334,15 @@ class _GroupType(types.Type):
         return type(self).__name__, (f"g{digest[:16]}",)
 
 
-class RowsInGroup(_GroupType):
+class _RowsInGroup(_GroupType):
     """Numba type of an array of records of eight simulations, for SIMD vector instructions.
 
     Eight runs (lanes) are simulated side by side. Indexing the array, for example with the
-    number of a network link, gives a `RowInGroup`: the record of this link in all eight runs.
+    number of a network link, gives a `_RowInGroup`: the record of this link in all eight runs.
     """
 
 
-class RowInGroup(_GroupType):
+class _RowInGroup(RowType, _GroupType):
     """Numba type of one record of eight simulations at once, for SIMD vector instructions.
 
     A record (row) holds for example the state of one arm. Eight runs (lanes) are simulated side
@@ -351,24 +350,9 @@ class RowInGroup(_GroupType):
     (`LaneVector`), one per run.
     """
 
-    def find_field(self, name: str) -> LaneField | None:
-        """Returns the position and type of a field of the record, such as "q", by its name.
 
-        Returns None if the record has no such field.
-        """
-        return next((field for field in self.fields if field.name == name), None)
-
-    def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is the same in all runs, and known to the compiler.
-
-        The compiler then inserts the value into the machine code, and removes branches that the
-        value excludes. Returns None if the field can differ between the runs.
-        """
-        return dict(self.constants[0]).get(name)
-
-
-@register_model(RowsInGroup)
-@register_model(RowInGroup)
+@register_model(_RowsInGroup)
+@register_model(_RowInGroup)
 class _GroupModel(models.PrimitiveModel):
     """Represents rows in eight lanes in machine code by a pointer."""
 
@@ -389,9 +373,9 @@ def _vector_of(field: LaneField) -> LaneVector:
 class _RowAttributes(AttributeTemplate):
     """Tells Numba the type of `row.field` for a row in eight lanes."""
 
-    key = RowInGroup
+    key = _RowInGroup
 
-    def generic_resolve(self, row: RowInGroup, name: str) -> Any:
+    def generic_resolve(self, row: _RowInGroup, name: str) -> Any:
         if row.find_constant(name) is not None:
             return types.int64
         field = row.find_field(name)
@@ -409,9 +393,9 @@ class _RowAttributes(AttributeTemplate):
 class _RowsAttributes(AttributeTemplate):
     """Tells Numba the type of `rows.shape`, which is (count,), for rows in eight lanes."""
 
-    key = RowsInGroup
+    key = _RowsInGroup
 
-    def resolve_shape(self, _rows: RowsInGroup) -> Any:
+    def resolve_shape(self, _rows: _RowsInGroup) -> Any:
         return types.UniTuple(types.intp, 1)
 
 
@@ -421,8 +405,8 @@ def _find_numbers(builder: Any, pointer: Any, field: LaneField) -> Any:
     return builder.bitcast(numbers, _LLVM_KINDS[_vector_of(field).kind].as_pointer())
 
 
-@lower_getattr_generic(RowInGroup)
-def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name: str) -> Any:
+@lower_getattr_generic(_RowInGroup)
+def _read_field(context: Any, builder: Any, row_type: _RowInGroup, row: Any, name: str) -> Any:
     """Generates LLVM code for reading `row.field` of a row in eight lanes (runs) at once.
 
     Numba calls this function when it compiles such an expression. The result is a constant if
@@ -448,29 +432,10 @@ def _read_field(context: Any, builder: Any, row_type: RowInGroup, row: Any, name
         return builder.load(data, align=_WORD)
 
     array_type = types.Array(_vector_of(field), len(field.shape), "A", aligned=False)
-    view = context.make_array(array_type)(context, builder)
-    strides: list[int] = []
-    step = LANES * _WORD  # from one number of a run to the next
-    for length in reversed(field.shape):
-        strides.insert(0, step)
-        step *= length
-
-    def pack(numbers: Any) -> Any:
-        constants = [context.get_constant(types.intp, number) for number in numbers]
-        return cgutils.pack_array(builder, constants)
-
-    arrayobj.populate_array(
-        view,
-        data=data,
-        shape=pack(field.shape),
-        strides=pack(strides),
-        itemsize=context.get_constant(types.intp, GROUP * _WORD),
-        meminfo=None,
-    )
-    return view._getvalue()
+    return make_view(context, builder, array_type, data, field.shape, GROUP * _WORD)
 
 
-@lower_setattr_generic(RowInGroup)
+@lower_setattr_generic(_RowInGroup)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
     """Generates LLVM code for writing a vector to `row.field`."""
     row_type, value_type = sig.args
@@ -479,8 +444,8 @@ def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> 
     builder.store(value, _find_numbers(builder, args[0], field), align=_WORD)
 
 
-@lower_getattr_generic(RowsInGroup)
-def _read_shape(context: Any, builder: Any, rows: RowsInGroup, _value: Any, _name: str) -> Any:
+@lower_getattr_generic(_RowsInGroup)
+def _read_shape(context: Any, builder: Any, rows: _RowsInGroup, _value: Any, _name: str) -> Any:
     """Generates LLVM code for `rows.shape` of rows in eight lanes, which is a constant."""
     count = context.get_constant(types.intp, len(rows.constants))
     return context.make_tuple(builder, types.UniTuple(types.intp, 1), [count])
@@ -492,14 +457,14 @@ class _RowsItem(AbstractTemplate):
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
-        if not isinstance(rows, RowsInGroup) or not isinstance(index, types.Integer):
+        if not isinstance(rows, _RowsInGroup) or not isinstance(index, types.Integer):
             return None
         if len(set(rows.constants)) > 1:
             return None
-        return signature(RowInGroup(rows, rows.constants[:1]), rows, types.intp)
+        return signature(_RowInGroup(rows, rows.constants[:1]), rows, types.intp)
 
 
-@lower_builtin(operator.getitem, RowsInGroup, types.Integer)
+@lower_builtin(operator.getitem, _RowsInGroup, types.Integer)
 def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Generates LLVM code for `rows[index]`."""
     row_bytes = ir.Constant(args[1].type, sig.args[0].row_length * LANES * _WORD)
@@ -511,7 +476,7 @@ def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
 def _in_group(_context: Any, table: Any, _group: Any) -> Any:
     """Generates LLVM code for the rows of eight adjacent runs (lanes) in a common array."""
     assert isinstance(table, LaneTable)
-    rows_type = RowsInGroup(table, table.constants)
+    rows_type = _RowsInGroup(table, table.constants)
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         offset = builder.mul(args[1], ir.Constant(args[1].type, GROUP * _WORD))

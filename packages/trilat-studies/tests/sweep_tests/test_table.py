@@ -4,7 +4,7 @@ import csv
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,16 @@ from trilat_studies.sweep import (
     run_sweep,
     sweep_cell,
 )
+from trilat_studies.sweep.result_table import ResultTable
 from trilat_studies.sweep.sweep_cell import RUN_CLASSES, CellRun, diff_lines
-from trilat_studies.sweep.sweep_plan import plan_sweep
+from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import (
     GRID_POINTS_FILE,
     GridPoint,
     SweepResults,
-    build_result_rows,
+    build_cell_rows,
     collect_grid_points,
-    encode_results,
+    iterate_cells,
     reproduction_duration_s,
 )
 
@@ -34,6 +35,13 @@ from trilat_net.work.intervals import wilson_interval
 from .quick import DELAYS, Judge, outcome_of, plan_quick_sweep
 
 ORDERS = "link.order=newest,in_order"
+
+
+def encode_runs(plan: SweepPlan, runs: Iterable[CellRun]) -> str:
+    """Returns the table of finished runs as text, as a sweep writes it."""
+    cells = iterate_cells(plan, {(run.cell, run.seed): run for run in runs})
+    rows = (row for cell_runs in cells for row in build_cell_rows(plan, cell_runs))
+    return "".join(ResultTable(plan).encode(rows))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +122,7 @@ def test_the_order_of_finished_runs_changes_no_byte(
     with prepare_sweep_folder(results.plan, path).journal() as journal:
         entries = list(journal.done.values())
     for order in (entries, entries[::-1]):
-        table = encode_results(results.plan, build_result_rows(results.plan, order))
+        table = encode_runs(results.plan, order)
         assert table.encode() == (path / "results.csv").read_bytes()
 
 
@@ -176,7 +184,9 @@ def test_a_very_long_scenario_is_read_back(
     plan = plan_quick_sweep(tmp_path, over=[DELAYS])
     rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
     rows[1] = {**rows[1], "scenario": '# "letters", and\r\n' + "x" * 300_000}
-    (tmp_path / "o" / "results.csv").write_text(encode_results(plan, rows), newline="")
+    (tmp_path / "o" / "results.csv").write_text(
+        "".join(ResultTable(plan).encode(rows)), newline=""
+    )
     assert read_results(tmp_path / "o").rows == rows
 
 
@@ -194,7 +204,7 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
         parts = diff_lines(text, base)
         entries.append(CellRun(number, 1, False, "p_d", digest, parts, outcome_of(text)))
 
-    table = encode_results(sweep, build_result_rows(sweep, entries))
+    table = encode_runs(sweep, entries)
     assert len(entries) == 10_000
     assert len(table) < 10e6
 

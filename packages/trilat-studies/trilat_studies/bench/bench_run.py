@@ -196,7 +196,7 @@ LANE_RUNS = 16
 """Number of runs that a worker computes side by side. All their records are in memory."""
 
 
-def run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
+def _run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
     """Executes several runs of the benchmark, side by side where that is possible.
 
     Args:
@@ -1002,6 +1002,6 @@ def _run_pending(
             done=len(items) - len(pending),
             total=len(items),
             show=progress,
-            together=run_bench_tasks if in_lanes else None,
+            together=_run_bench_tasks if in_lanes else None,
             together_count=LANE_RUNS if in_lanes else 1,
         )

@@ -682,7 +682,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
     if plane.refused:
         handles.append(Patch(label=CellClass.REFUSED.value, facecolor=_EMPTY_COLOUR))
     if plane.halvings:
-        handles.append(Patch(label=describe_refined_cells(plane), visible=False))
+        handles.append(Patch(label=_describe_refined_cells(plane), visible=False))
 
     # Panels may share a line, which has one entry.
     line_of_label = {}
@@ -800,7 +800,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
     plane = chart.plane
     if plane.halvings:
         notes.append(
-            f"{describe_refined_cells(plane)}, along the edge; the others are drawn "
+            f"{_describe_refined_cells(plane)}, along the edge; the others are drawn "
             "like their neighbours, and the table has the columns of the coarse grid"
         )
     if plane.refused:
@@ -815,7 +815,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
     return notes
 
 
-def describe_refined_cells(plane: MapPlane) -> str:
+def _describe_refined_cells(plane: MapPlane) -> str:
     """Returns how many parameter combinations ran, as in "1243 of 40401 cells ran".
 
     A refined sweep simulates only those near an edge of stability.

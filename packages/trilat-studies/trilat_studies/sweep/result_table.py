@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, overload
 
 from trilat_net.errors import UsageError
+from trilat_net.work import encode_csv
 
 from .sweep_cell import CellResult, apply_diff, diff_lines
 from .sweep_plan import SweepPlan
@@ -48,15 +49,9 @@ def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> It
         rows: The rows, as values by column.
         columns: The columns.
     """
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    yield stream.getvalue()
+    yield encode_csv([], columns)
     for row in rows:
-        stream.seek(0)
-        stream.truncate()
-        writer.writerow(row)
-        yield stream.getvalue()
+        yield encode_csv([row], columns, header=False)
 
 
 class ResultTable:

@@ -35,7 +35,6 @@ from trilat_net.work import MeanInterval, wilson_interval
 from ..run_commands import format_command, set_options
 from .result_table import (
     ResultRow,
-    ResultTable,
     StoredRows,
     format_table_cell,
     iterate_csv,
@@ -124,20 +123,6 @@ class SweepResults(Result):
             row: Row of the run.
         """
         return msgspec.convert(row, CellResult)
-
-
-def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
-    """Returns the results of a parameter sweep as table rows, one per simulation.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        entries: The runs, in any order.
-
-    Returns:
-        One row per run, ordered by cell and then by seed.
-    """
-    done = {(entry.cell, entry.seed): entry for entry in entries}
-    return [row for runs in iterate_cells(plan, done) for row in build_cell_rows(plan, runs)]
 
 
 def iterate_cells(
@@ -248,16 +233,6 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     extended_s = plan.base.duration_s * 2.0**outcome.extended
     planned_s = min(plan.longest_s, extended_s)
     return max(outcome.ran_s, planned_s)
-
-
-def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
-    """Encodes the results of a parameter sweep as CSV text, one line per simulation.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        rows: The runs, one mapping from columns to values per run.
-    """
-    return "".join(ResultTable(plan).encode(rows))
 
 
 def read_results(path: Path) -> SweepResults:

@@ -352,7 +352,7 @@ def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
     )
 
 
-def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
+def _run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
     """Executes several simulations of a sweep, side by side where that is possible.
 
     Args:
@@ -722,7 +722,7 @@ class _SweepWork:
             for cell in cells:
                 runs = self._list_runs(cell)
                 runs_before += len(runs)
-                sides[cell] = find_side(plan, runs)
+                sides[cell] = _find_side(plan, runs)
 
     def _choose_lanes(self, cells: int) -> bool:
         """Returns True if runs are to be computed side by side, and compiles their code.
@@ -804,13 +804,13 @@ class _SweepWork:
             done=len(done),
             total=total,
             show=self._progress,
-            together=run_cells if is_side_by_side else None,
+            together=_run_cells if is_side_by_side else None,
             together_count=LANE_RUNS if is_side_by_side else 1,
             note=self._tally.note,
         )
 
 
-def find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
+def _find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
     """Returns whether a parameter combination lies on the stable side of an edge.
 
     The side is stable, unstable or undecided, by the majority of its runs. It is not known if
