@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,12 @@ def test_a_diverging_run_exits_1(tmp_path: Path) -> None:
         "sim", "paper", "--set", "limits.qd_limit_rad_s=0.5", "-o", "d.mcap", cwd=tmp_path
     )
     done.refuses("diverged", "qd_limit_rad_s", code=1)
+    (lasted,) = re.findall(
+        r"d.mcap: (\S+) s of m1, m2, s, of (?:\S+) s that were planned", done.out
+    )
+    assert f"at {lasted} s" in done.err
     log = open_log(tmp_path / "d.mcap")
+    assert 0.0 < float(lasted) < log.scenario.duration_s
     assert log.complete
     assert "diverged" in {event.kind for event in log.events}
     assert any(log[name].states[-1].mode == "diverged" for name in log.sites)
