@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +14,6 @@ from trilat_net.core.links.delay import DelayKind, LinkModel
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import (
     Arrival,
-    CoreChange,
     TickInput,
     TickRecord,
     first_tick_at,
@@ -204,23 +202,6 @@ def test_an_ancient_sample_counts_as_lost(name: str) -> None:
 # Single kinds.
 
 
-def test_newest_first_shortens_ages_unlike_order() -> None:
-    """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 ms and more."""
-
-    def mean_age(in_order: int) -> float:
-        model = LinkModel(
-            kind=DelayKind.UNIFORM, location=200_000.0, scale=50_000.0, in_order=in_order
-        )
-        outputs = stepped(
-            linked(1000, 1000, [model]),
-            (TickInput(k, [sample(k - 1)] if k else []) for k in range(5000)),
-        )
-        return float(np.mean([o.tick - o.used[0] for o in outputs[1000:]]))
-
-    assert mean_age(0) == pytest.approx(162, abs=3)
-    assert mean_age(1) == pytest.approx(240, abs=5)
-
-
 @given(
     came=st.lists(st.integers(0, 30), min_size=30, max_size=30),
     rates=st.sampled_from([(1000, 1000), (400, 900)]),
@@ -257,16 +238,6 @@ def test_measured_links_may_have_play_out_buffers() -> None:
     assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
 
 
-def test_copies_with_earlier_delay_make_samples_earlier() -> None:
-    alone, twice = (
-        linked(1000, 1000, [KINDS["copies"]._replace(duplicate=p)]) for p in (0.0, 1.0)
-    )
-    pairs = [(twice.release_tick(0, m), alone.release_tick(0, m)) for m in range(300)]
-    assert all(a is not None and b is not None and a <= b for a, b in pairs)
-    assert any(a != b for a, b in pairs)
-    assert (twice.counts()[0].copies, alone.counts()[0].copies) == (300, 0)
-
-
 def test_a_cut_link_ages_and_heals() -> None:
     """`used` stands still, never decreases, and is back to nominal with the first fresh sample."""
     model = LinkModel(location=20_000.0)
@@ -279,18 +250,3 @@ def test_a_cut_link_ages_and_heals() -> None:
     assert used[120:220] == [99] * 100
     assert used[220:] == list(range(200, 280))
     assert site.counts()[0].lost == 100
-
-
-# Changes of a link while it runs.
-
-
-def test_commands_hold_for_later_stamps_only() -> None:
-    site = linked(1000, 1000, [LinkModel(location=5_000.0)])
-    change = CoreChange("slower", 0, LinkModel(from_ns=30_000_000, location=20_000.0))
-    used = []
-    for k in range(80):
-        commands = [change] if k == 10 else []
-        used.append(site.step(TickInput(k, [sample(k - 1)] if k else [], commands)).used[0])
-    assert used[:35] == [max(k - 5, -1) for k in range(35)]
-    assert used[35:50] == [29] * 15
-    assert used[50:] == list(range(30, 60))

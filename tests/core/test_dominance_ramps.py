@@ -136,14 +136,6 @@ def test_references_follow_changing_shares() -> None:
     assert np.abs(central[inside - 1] - qd[inside]).max() < 1e-3
 
 
-def test_a_command_equals_the_scripted_ramp() -> None:
-    ramp = DominanceRamp(S, 2 * S, (0.1, 0.9))
-    commanded = run_site(site(), {700: [CoreChange("shares", ramp=ramp)]})
-    scripted = run_site(site((ramp,)), {})
-    assert [o._replace(cmd=[]) for o in commanded] == scripted
-    assert commanded[700].cmd == ["shares"]
-
-
 def test_earlier_commands_precede_planned_ramps() -> None:
     """Later ramps of the scenario still take place."""
     planned, sooner = DominanceRamp(2 * S, 2 * S, (0.0, 1.0)), DominanceRamp(S, S, (0.5, 0.5))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
@@ -77,51 +77,6 @@ def followed(
 # The modes.
 
 
-@pytest.mark.parametrize(
-    ("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)]
-)
-def test_cuts_lead_to_hold_and_return(action: StaleAction, mode: Mode) -> None:
-    """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
-    outputs = cut(RULE._replace(action=action))
-    assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
-
-
-def test_the_rule_use_continues() -> None:
-    assert runs_of(cut(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
-
-
-def test_staleness_during_a_return_is_held() -> None:
-    ticks = [
-        TickInput(
-            k,
-            [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])]
-            if k
-            else [],
-        )
-        for k in range(200)
-    ]
-    outputs = stepped(site(RULE._replace(return_ns=50 * MS)), ticks)
-    assert runs_of(outputs) == [
-        (Mode.RUN, 0),
-        (Mode.HOLD, 70),
-        (Mode.RETURN, 95),
-        (Mode.HOLD, 111),
-    ]
-    assert outputs[111].q_des == outputs[110].q_des
-    assert outputs[110].q_des != outputs[70].q_des
-
-
-def test_an_unheard_peer_has_the_runs_age() -> None:
-    outputs = stepped(site(RULE), [TickInput(k) for k in range(40)])
-    assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
-
-
-def test_peers_without_share_may_be_stale() -> None:
-    ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
-    assert runs_of(stepped(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
-    assert runs_of(stepped(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
-
-
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     """A diverged record holds no reference."""
@@ -144,6 +99,19 @@ arrivals = st.lists(
 ).map(lambda parts: [heard for a, b, n in parts for heard in [(a, b)] * n])
 
 
+BOTH, ONE, NONE = (True, True), (True, False), (False, False)
+CUT = [*[BOTH] * 51, *[ONE] * 40, *[BOTH] * 109]
+"""The second peer's samples from 50 to 90 are lost: the last one in use comes at tick 54."""
+CUT_AGAIN = [*[BOTH] * 51, *[ONE] * 40, BOTH, *[ONE] * 108]
+
+
+@example(CUT, StaleAction.HOLD, 20, 30, (0.5, 0.5))
+@example(CUT, StaleAction.BRAKE, 20, 30, (0.5, 0.5))
+@example(CUT, StaleAction.USE, 20, 30, (0.5, 0.5))
+@example(CUT_AGAIN, StaleAction.HOLD, 20, 50, (0.5, 0.5))
+@example([NONE] * 40, StaleAction.HOLD, 20, 30, (0.5, 0.5))
+@example([ONE] * 100, StaleAction.HOLD, 20, 30, (1.0, 0.0))
+@example([ONE] * 100, StaleAction.HOLD, 20, 30, (0.9, 0.1))
 @settings(max_examples=60)
 @given(
     heard=arrivals,

@@ -36,22 +36,6 @@ def test_own_paper_law_gives_equal_bits(name: str) -> None:
         for a, b in zip(ours[site].states, theirs[site].states, strict=True):
             # but for what a law from outside remembers
             assert numbers(a)[:-1] == numbers(b)[:-1]
-    verdict = verify(theirs)
-    assert verdict.whole_run
-    assert verdict.identical == verdict.records == 3 * TICKS
-    twins = compare_with_virtual(theirs)
-    assert twins.fed.identical == twins.plain.identical == 3 * TICKS
-
-
-@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> None:
-    """As much can be judged as of a shipped law."""
-    verdict = verify(without_records({"s": range(50, 61)}, record_own_law(), session))
-    assert verdict.gaps == [("s", 50, 60)]
-    assert verdict.agreed
-    ours = verify(without_records({"s": range(50, 61)}, recorded("paper", SHORT), session))
-    assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
-    assert verdict.identical > 3 * TICKS - 50
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])

@@ -66,20 +66,6 @@ def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
     }
 
 
-@pytest.mark.long
-def test_waiting_sessions_answer_pings_without_joining(stage: Stage) -> None:
-    session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
-    waiting = session.site("s")
-    waiting.prints("waiting for")
-    to = connections(session.endpoints)
-    seen = trilat("ping", "--session", "t", "--count", "10", *to, cwd=stage.folder).succeeds()
-    assert "session t waits for its members" in seen
-    assert "the same clock" in seen
-    assert "between the sites" not in seen
-    session.site("m")
-    session.ends_well()
-
-
 def test_unanswered_pings_say_where_they_looked(stage: Stage) -> None:
     done = trilat("ping", "--session", "nobody-here", "--timeout", "0.5", cwd=stage.folder)
     done.refuses(

@@ -55,16 +55,24 @@ def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
 
 
 def test_ctrl_c_ends_everything_and_finishes_file(stage: Stage) -> None:
-    running = demo(stage)
+    """A demo bears the name of its scenario, so that `tn.hand` finds the session while it runs."""
+    running = stage.start(
+        "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
+    )
     log_file = recording(stage)
     children = running.children()
+    with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
+        hand.move(*hand.pose)
+    running.prints("; late ")
     running.signal(signal.SIGINT)
     assert running.code() == 130
     assert all(gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete
-    assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
+    assert {event.member for event in log.events if event.kind == "end"} == {"m1", "m2", "s"}
     assert verify(log).passed
+    assert "session play; Ctrl-C ends it" in running.text()
+    assert re.search(r"; torque \d+\.\d\d N m; age .*; late ", running.text())
     assert "run.mcap holds the records so far" in running.text()
 
 
@@ -86,21 +94,6 @@ def test_signals_before_sessions_leave_no_log(number: int, when: str, stage: Sta
     assert running.code() == 128 + number
     assert all(gone(pid) for pid in children)
     assert not (stage.folder / "out" / "run.mcap").exists()
-
-
-def test_demos_bear_their_scenarios_name_and_errors(stage: Stage) -> None:
-    """So `tn.hand("play", "m1")` finds it, as sites that are started one by one."""
-    running = stage.start(
-        "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
-    )
-    recording(stage)
-    with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
-        hand.move(*hand.pose)
-    running.prints("; late ")
-    running.signal(signal.SIGINT)
-    assert running.code() == 130
-    assert "session play; Ctrl-C ends it" in running.text()
-    assert re.search(r"; torque \d+\.\d\d N m; age .*; late ", running.text())
 
 
 @pytest.mark.long

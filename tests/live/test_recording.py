@@ -12,7 +12,7 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import TALKING, Process, Session, Stage, executed_again, whole
+from .processes import Process, Session, Stage, executed_again, whole
 
 S = 1_000_000_000
 
@@ -64,11 +64,8 @@ def test_frozen_recorders_finally_have_every_record(stage: Stage) -> None:
     assert recorder.text().count(" from its memory") == 2
 
 
-@pytest.mark.parametrize("law", [(), pytest.param(TALKING, marks=pytest.mark.long)])
-def test_a_killed_recorders_successor_has_all_records(
-    law: tuple[str, ...], stage: Stage
-) -> None:
-    session = Session(stage, "two_sites", ("m", "s"), "--duration", "50", *law)
+def test_a_killed_recorders_successor_has_all_records(stage: Stage) -> None:
+    session = Session(stage, "two_sites", ("m", "s"), "--duration", "50")
     session.all()
     session.recording()
     killed = session.processes["recorder"]

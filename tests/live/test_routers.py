@@ -10,7 +10,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.net.member_keys import create_keys
 from trilat_net.net.zenoh_config import OPERATOR, RECORDER, ROUTER
 
-from .processes import PAPER, Process, Session, Stage, connections, executed_again
+from .processes import Process, Session, Stage, connections, executed_again
 
 SITES = ("m", "s")
 
@@ -43,22 +43,6 @@ class Keyed(Routed):
 
     def network(self, name: str) -> list[str]:
         return ["--keys", str(self.stage.folder / "keys" / name)]
-
-
-@pytest.mark.long
-def test_sites_with_keys_that_meet_without_a_router(stage: Stage) -> None:
-    session = Session(stage, "paper", PAPER, "--duration", "3")
-    create_keys(stage.folder / "keys", [*PAPER, RECORDER], [], 1)
-    session.endpoints = [place.replace("tcp", "tls") for place in session.endpoints]
-    session.recorder_endpoint = session.recorder_endpoint.replace("tcp", "tls")
-    for name in (RECORDER, *PAPER):
-        keys = ("--keys", str(stage.folder / "keys" / name))
-        _ = (
-            session.recorder(*keys)
-            if name == RECORDER
-            else session.site(name, "--needs-recorder", *keys)
-        )
-    session.is_reproduced()
 
 
 @pytest.mark.long

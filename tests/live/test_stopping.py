@@ -102,24 +102,6 @@ def test_every_arm_stops_from_everywhere_and_returns(scenario: str, stage: Stage
     executed_again(open_log(stage.folder / "out" / "run.mcap"))
 
 
-@needs_browser
-@pytest.mark.long
-def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
-    running = live(stage, "play")
-    modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
-    with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && " + modes("run"))
-        for stop in (lambda: page.click("#stop"), lambda: page.keyboard.press("Escape")):
-            stop()
-            shows(page, modes("stopped"))
-            if "TRILAT_PICTURES" in os.environ:
-                page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stop.png")
-            run(stage, "enable", "--session", page.evaluate("trilat.hello.session"))
-            shows(page, modes("run"))
-    running.signal(signal.SIGINT)
-    running.prints("checking the log")
-
-
 def is_asked(first: Page, second: Page) -> bool:
     """Lets a page ask whether it may take part while the other holds an arm; false if that lost it before."""
     if not first.evaluate("trilat.frame.holds.includes('m1')"):

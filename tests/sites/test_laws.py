@@ -1,10 +1,13 @@
 """A law from outside in a live session: the same bits; a failing law ends the session in order."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sites.site_parts import warm_up
+from tests.control_laws.law_settings import LAWS
+from tests.energy_runs import FOLLOWER
 from trilat_net.errors import LawFailed
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -38,6 +41,25 @@ def test_law_messages_equal_those_of_virtual_time(tmp_path: Path) -> None:
     assert in_log(log) == in_virtual_time(log.scenario)
     assert verify(log).identical == 900
     assert log["m1"].sent["target[s]"].any()
+
+
+ENERGY_LAWS: dict[str, tuple[str, dict[str, Any]]] = {
+    "wave": ("two_sites", {f"sites.s.control.{key}": FOLLOWER[key] for key in FOLLOWER}),
+    "tdpa": ("two_sites", {f"sites.s.control.{key}": FOLLOWER[key] for key in FOLLOWER}),
+    "tanks": ("two_sites", {}),
+}
+"""Laws that keep account of energy."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", [*LAWS, *ENERGY_LAWS])
+def test_every_plugged_law_has_live_bits(law: str, tmp_path: Path) -> None:
+    name, settings = {**LAWS, **ENERGY_LAWS}[law]
+    digital = {"scheme": "digital"} if law in ENERGY_LAWS else {}
+    keys = {"link.delay_ms": 20.0, "control.law": law, **digital, **settings}
+    log, _ = lived(tmp_path, name, duration_s=0.3, **keys)
+    assert in_log(log) == in_virtual_time(log.scenario)
+    assert verify(log).identical == 300 * len(log.sites)
 
 
 @pytest.mark.parametrize("how", ["nan", "raises"])

@@ -91,12 +91,3 @@ def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Bala
         name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
     )
     return balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))
-
-
-def order(name: str, scheme: str, rate_hz: int) -> float:
-    """Returns the order of the balance's error from half of a rate to that rate."""
-    return float(
-        np.log2(
-            booked(name, scheme, rate_hz // 2).residual / booked(name, scheme, rate_hz).residual
-        )
-    )
