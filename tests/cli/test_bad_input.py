@@ -22,21 +22,6 @@ from .running import trilat
 
 ARM6 = Path(str(SHIPPED_FOLDER)) / "arm6.urdf"
 
-OVERRIDES = {
-    "control.Kq=5": ("control.Kq", "Kp"),
-    "control.Kp=nan": ("Kp", "finite"),
-    'control.Kp="text"': ("Kp",),
-    "limits.tau_limit_nm=0": ("tau_limit_nm",),
-    "no_equals_sign": ("no_equals_sign", "="),
-    "control.Kp=": ("control.Kp",),
-}
-
-
-@pytest.mark.parametrize("override", OVERRIDES)
-def test_an_invalid_override_is_named(override: str, tmp_path: Path) -> None:
-    done = trilat("scenario", "check", "paper", "--set", override, cwd=tmp_path)
-    done.refuses(*OVERRIDES[override])
-
 
 FILES = {
     "nothing": (b"", ("is missing",)),
