@@ -127,13 +127,6 @@ class Torques:
 """
 
 
-@pytest.mark.parametrize("written", ["torques.py", "torques"])
-def test_a_file_as_law_suggests_its_class(written: str, tmp_path: Path) -> None:
-    (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
-    arguments = ("sim", "two_sites", "--set", f"control.law={written}")
-    trilat(*arguments, cwd=tmp_path).refuses("write torques:Torques")
-
-
 def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
     arguments = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")

@@ -2,8 +2,10 @@
 
 import os
 import shlex
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 
@@ -14,26 +16,39 @@ from tests.refusals.corpus import Case
 class CommandCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Command lines that are refused with the same message, and leave no file behind."""
 
-    commands: list[str]
+    commands: tuple[str, ...]
     """Command lines without the name of the program."""
     files: dict[str, str] = msgspec.field(default_factory=dict)
     """Texts of files in the folder of the command, by name."""
     hex: dict[str, str] = msgspec.field(default_factory=dict)
     """Contents of other files, in hexadecimal digits."""
     copies: dict[str, str] = msgspec.field(default_factory=dict)
-    """Names of inputs that the part's test makes, such as logs, by the name of the file."""
+    """Names of inputs that the part's test prepares, such as logs, by the name of the copy."""
     folders: tuple[str, ...] = ()
+    """Names of empty folders."""
     pipes: tuple[str, ...] = ()
+    """Names of pipes."""
 
     def check_commands(
-        self, folder: Path, inputs: Mapping[str, Callable[[], bytes]] | None = None
+        self, folder: Path, inputs: Mapping[str, Path] = MappingProxyType({})
     ) -> None:
-        """Asserts that each command of the case is refused in one line and changes no file.
+        """Asserts that each command is refused in one line on stderr, and writes no file.
 
         Args:
             folder: An empty folder, in which the commands run.
-            inputs: Functions that return the contents of the inputs of `copies`.
+            inputs: Files and folders to copy, by the names that cases give them.
         """
+        self._write_files(folder, inputs)
+        before = list_contents(folder)
+        assert self.commands, self.name
+        for command in self.commands:
+            done = trilat(*shlex.split(command), cwd=folder)
+            done.refuses(code=self.exit_code)
+            assert done.err[:-1].isprintable(), done
+            self.check_message(done.err.removesuffix("\n"), done.code)
+            assert list_contents(folder) == before, command
+
+    def _write_files(self, folder: Path, inputs: Mapping[str, Path]) -> None:
         for name in self.folders:
             (folder / name).mkdir()
         for name in self.pipes:
@@ -43,16 +58,10 @@ class CommandCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
         for name, digits in self.hex.items():
             (folder / name).write_bytes(bytes.fromhex(digits))
         for name, key in self.copies.items():
-            (folder / name).write_bytes((inputs or {})[key]())
-        before = list_contents(folder)
-        assert self.commands, self.name
-        for command in self.commands:
-            done = trilat(*shlex.split(command), cwd=folder)
-            done.refuses(code=self.exit_code)
-            assert done.err[:-1].isprintable(), done
-            self.check_message(done.err.removesuffix("\n"), done.code)
-            assert done.out == "", done
-            assert list_contents(folder) == before, command
+            if inputs[key].is_dir():
+                shutil.copytree(inputs[key], folder / name)
+            else:
+                shutil.copy(inputs[key], folder / name)
 
 
 def list_contents(folder: Path) -> dict[str, bytes | None]:
