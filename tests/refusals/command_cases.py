@@ -38,7 +38,7 @@ class CommandCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
             folder: An empty folder, in which the commands run.
             inputs: Files and folders to copy, by the names that cases give them.
         """
-        self._write_files(folder, inputs)
+        self.write_files(folder, inputs)
         before = list_contents(folder)
         assert self.commands, self.name
         for command in self.commands:
@@ -48,7 +48,8 @@ class CommandCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
             self.check_message(done.err.removesuffix("\n"), done.code)
             assert list_contents(folder) == before, command
 
-    def _write_files(self, folder: Path, inputs: Mapping[str, Path]) -> None:
+    def write_files(self, folder: Path, inputs: Mapping[str, Path]) -> None:
+        """Writes and copies the files of the case into a folder."""
         for name in self.folders:
             (folder / name).mkdir()
         for name in self.pipes:

@@ -39,6 +39,8 @@ class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Key, option, file or other place that the message names. Empty if there is no such place."""
     words: tuple[str, ...]
     """Further texts that the message contains."""
+    absent: tuple[str, ...] = ()
+    """Texts that the message must not contain, such as a secret."""
     exit_code: int = 2
     """Code with which a command ends after this refusal."""
 
@@ -48,6 +50,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         assert len(message.splitlines()) == 1, message
         missing = [text for text in (self.path, *self.words) if text not in message]
         assert missing == [], message
+        assert [text for text in self.absent if text in message] == [], message
 
 
 CaseKind = TypeVar("CaseKind", bound=Case)
