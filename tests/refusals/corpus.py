@@ -28,6 +28,8 @@ import msgspec
 import pytest
 
 FOLDER = Path(__file__).parent
+INPUTS = FOLDER / "inputs"
+"""Scenarios and robots that cases name, beside the shipped ones."""
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -4,11 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.chains import six_joints
 from tests.log_editing import edited, recorded
 from tests.refusals.command_cases import CommandCase
-from tests.refusals.corpus import parametrize_cases
-from tests.task_arms import planar_task
+from tests.refusals.corpus import INPUTS, parametrize_cases
 
 
 @pytest.fixture(scope="module")
@@ -23,12 +21,11 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "log of version 99": edited(log, record=lambda record: {**record, "v": 99}),
         "garbage": b"garbage" * 100,
         "zeros": bytes(10_000),
-        "six": six_joints(1.0).encode(),
-        "planar_task": planar_task().encode(),
     }
     for name, content in contents.items():
         (folder / name).write_bytes(content)
-    return {name: folder / name for name in contents}
+    scenarios = {path.stem: path for path in INPUTS.glob("*.toml")}
+    return {name: folder / name for name in contents} | scenarios
 
 
 @parametrize_cases("commands.toml", CommandCase)

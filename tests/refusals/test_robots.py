@@ -2,16 +2,13 @@
 
 import pytest
 
-from tests.refusals.corpus import Case, parametrize_cases
-from tests.scenario.robot_texts import GRIPPER, TWO
+from tests.refusals.corpus import INPUTS, Case, parametrize_cases
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario.urdf import read_urdf
 
-ROBOTS = {"two": TWO, "gripper": GRIPPER}
-
 
 class RobotCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A URDF: a text, or one of `ROBOTS` with a part replaced. The path is the link or joint."""
+    """A URDF: a text, or a robot of the folder `inputs` with a part replaced."""
 
     robot: str = ""
     text: str = ""
@@ -25,7 +22,7 @@ class RobotCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Returns the text of the URDF."""
         if not self.robot:
             return self.text
-        text = ROBOTS[self.robot]
+        text = (INPUTS / f"{self.robot}.urdf").read_text(encoding="utf-8")
         assert self.replace in text, self.name
         return text.replace(self.replace, self.by, 1) if self.replace else text
 

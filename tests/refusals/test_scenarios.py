@@ -7,29 +7,17 @@ from typing import Any
 import msgspec
 import pytest
 
-from tests.chains import six_joints, two_arms
 from tests.cli.running import trilat
-from tests.refusals.corpus import Case, parametrize_cases, read_cases
-from tests.task_arms import planar_task
+from tests.refusals.corpus import INPUTS, Case, parametrize_cases, read_cases
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, list_shipped, load_scenario, parse_scenario
-
-ROBOTS = Path(__file__).parents[1] / "scenario" / "robots"
-BASES = {
-    "six": six_joints(20.0),
-    "planar_task": planar_task(),
-    "finger": two_arms("finger_inertia.urdf", [0.0, 0.0]).replace(
-        "[arm]", '[arm]\ntip = "lower"'
-    ),
-}
-"""Scenarios with arms of other kinds than the shipped ones have, by the name in the corpus."""
 
 
 class ScenarioCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A scenario with a wrong key. The path of the case is that of the error, in full."""
 
     scenario: str = ""
-    """A shipped scenario or one of `BASES`."""
+    """A shipped scenario, or one of the folder `inputs`."""
     text: str = ""
     """The scenario as a TOML text, in place of a name."""
     set: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -46,8 +34,9 @@ class ScenarioCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
         for name, text in self.files.items():
             (folder / name).write_text(text, encoding="utf-8")
         changes = self.set or self.options
-        if self.scenario in BASES:
-            return parse_scenario(BASES[self.scenario], "", changes, ROBOTS)
+        file = INPUTS / f"{self.scenario}.toml"
+        if file.exists():
+            return load_scenario(file, changes)
         if self.scenario:
             return load_scenario(self.scenario, changes)
         return parse_scenario(self.text, "", changes, folder)

@@ -12,11 +12,56 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.chain_references import ARMS, PATH, Array, chain_references, to_chain
-from tests.scenario.robot_texts import GRIPPER, LIMIT, TWO, joint, link, robot
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario.urdf import CONSISTENCY, UrdfChain, UrdfPayload, read_urdf
 
 ARM6, ARM7 = ((ARMS / f"arm{n}.urdf").read_text() for n in (6, 7))
+BODY = (
+    '<inertial><origin xyz="0.1 0 0"/><mass value="2"/>'
+    '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/></inertial>'
+)
+LIMIT = '<limit lower="-1" upper="2" effort="30" velocity="4"/>'
+
+
+def link(name: str, body: str = BODY) -> str:
+    return f'<link name="{name}">{body}</link>'
+
+
+def joint(
+    name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT
+) -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="0 0 0.5"/><parent link="{parent}"/>'
+        f'<child link="{child}"/><axis xyz="0 0 1"/>{inside}</joint>'
+    )
+
+
+def robot(*elements: str) -> str:
+    return f'<robot name="r">{"".join(elements)}</robot>'
+
+
+TWO = robot(
+    link("base", ""),
+    joint("one", "base", "upper"),
+    link("upper"),
+    joint("two", "upper", "lower"),
+    link("lower"),
+)
+GRIPPER = robot(
+    link("base", ""),
+    joint("one", "base", "upper"),
+    link("upper"),
+    joint("mount", "upper", "camera", "fixed"),
+    link("camera"),
+    joint("two", "upper", "palm"),
+    link("palm"),
+    joint("left", "palm", "finger", "prismatic"),
+    link("finger"),
+    joint("right", "palm", "thumb", "prismatic", f'{LIMIT}<mimic joint="left"/>'),
+    link("thumb"),
+    joint("hand", "palm", "tcp", "fixed"),
+    link("tcp", ""),
+)
 
 
 def refusal(text: str, **ends: str) -> str:
