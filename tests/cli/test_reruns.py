@@ -3,8 +3,6 @@
 import json
 from pathlib import Path
 
-import pytest
-
 import trilat_net
 from tests.log_editing import edited
 from trilat_net.log.log_reader import open_log
@@ -108,30 +106,3 @@ def test_a_log_differing_from_its_records_fails(log_file: Path, short_log: bytes
     done = trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent)
     assert done.code == 1, done
     assert "tick 300" in done.out
-
-
-@pytest.mark.parametrize(
-    ("options", "facts"),
-    [
-        ((), ("--replace", "--closed-loop")),
-        (("--replace", "x"), ("no site 'x'", "m1, m2, s")),
-        (("--replace", "s", "--set", "rate_hz=500"), ("rate_hz", "--closed-loop")),
-        (
-            ("--replace", "s", "-o", "run.mcap", "--force"),
-            ("run.mcap", "the log that is being read"),
-        ),
-        (("--replace", "s", "-o", "no/such/a.mcap"), ("a.mcap",)),
-    ],
-    ids=" ".join,
-)
-def test_bad_input_is_one_sentence(
-    options: tuple[str, ...], facts: tuple[str, ...], log_file: Path
-) -> None:
-    before = log_file.read_bytes()
-    trilat("rerun", log_file, *options, cwd=log_file.parent).refuses(*facts)
-    assert log_file.read_bytes() == before
-
-
-def test_logs_of_later_versions_are_bad_input(log_file: Path, short_log: bytes) -> None:
-    log_file.write_bytes(edited(short_log, record=lambda r: {**r, "v": 99}))
-    trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent).refuses("version 99")

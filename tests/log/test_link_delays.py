@@ -11,7 +11,6 @@ import pytest
 from tests.log_editing import edited
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at, tick_ns
-from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork
 from trilat_net.log.log_reader import read_link_delays
@@ -157,22 +156,6 @@ def test_links_without_arrivals_have_no_delays(data: bytes, path: Path) -> None:
     path.write_bytes(edited(data, record=silent))
     with pytest.raises(ValueError, match="no sample arrived over m1->s"):
         read_link_delays(path, "m1->s")
-
-
-@pytest.mark.parametrize("content", [b"", b"t_s,delay_ms\n0,1\n", b"\x89MCAP0\r\n"])
-def test_invalid_logs_are_refused_with_their_key(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "run.mcap").write_bytes(content)
-    with pytest.raises(ScenarioError) as error:
-        load_scenario("paper", {"link": {"model": "trace", "file": str(tmp_path / "run.mcap")}})
-    assert error.value.path == "link.file"
-
-
-def test_missing_logs_are_refused_with_their_key(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="No such file") as error:
-        load_scenario(
-            "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}}
-        )
-    assert error.value.path == "links.m1->s.file"
 
 
 def test_losses_at_both_ends_of_a_log_count(data: bytes, path: Path) -> None:

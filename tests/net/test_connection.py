@@ -73,53 +73,6 @@ def test_clients_of_routers_listen_nowhere() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (
-            {"listen": [A], "own": file(listen={"endpoints": [B]})},
-            "listen/endpoints are also given by listen",
-        ),
-        ({"routers": [A], "listen": [B]}, "router: a client of a router does not listen"),
-        ({"routers": [A], "connect": [B]}, "router: a client connects only to a router"),
-        (
-            {"routers": [A], "own": file(listen={"endpoints": [B]})},
-            "router: a client .* does not listen",
-        ),
-        (
-            {"routers": [A], "own": file(mode="peer")},
-            'mine.json5: mode "peer" contradicts router',
-        ),
-        (
-            {"own": file(mode="client")},
-            'mine.json5: mode "client": there is no router to connect to',
-        ),
-        (
-            {"own": file(mode="client"), "listen": [A]},
-            'mine.json5: mode "client": a client .* does not listen',
-        ),
-        (
-            {"own": file(mode="router")},
-            'mine.json5: mode "router" can be used only with `trilat router`',
-        ),
-        *(
-            ({"routers": [endpoint]}, "router: an endpoint must have a form such as tcp")
-            for endpoint in (
-                "",
-                "nonsense",
-                "tcp/",
-                "tcp/host",
-                "carrier-pigeon/1:2",
-                "192.0.2.1:7447",
-            )
-        ),
-    ],
-)
-def test_contradictions_are_refused(arguments: dict[str, object], problem: str) -> None:
-    with pytest.raises(UsageError, match=problem):
-        member(**arguments)
-
-
-@pytest.mark.parametrize(
     "endpoint",
     [
         A,

@@ -2,7 +2,6 @@
 to the tip.
 """
 
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -250,58 +249,10 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
     assert "link 'finger': the scenario leaves its mass out" in chain.notes
 
 
-@pytest.mark.parametrize(
-    ("links", "path", "phrase"),
-    [
-        ({"fingr": {"mass_kg": 1.0}}, "links.fingr", "did you mean 'finger'"),
-        ({"base": {"mass_kg": 1.0}}, "links.base", "moved by no joint"),
-        (
-            {"finger": {}},
-            "links.finger",
-            "is empty: give at least one of mass_kg, com_m, inertia_kg_m2",
-        ),
-        ({"finger": 3}, "links.finger", "must be a table"),
-        (3, "links", "must be a table"),
-        ({"finger": {"mass": 1.0}}, "links.finger.mass", "did you mean 'mass_kg'"),
-        ({"finger": {"mass_kg": -1.0}}, "links.finger.mass_kg", ">= 0"),
-        ({"finger": {"mass_kg": "x"}}, "links.finger.mass_kg", "expected a number"),
-        ({"finger": {"com_m": [1.0, 2.0]}}, "links.finger.com_m", "length >= 3"),
-        ({"finger": {"com_m": [1.0, "x", 0.0]}}, "links.finger.com_m[1]", "expected a number"),
-        ({"finger": {"inertia_kg_m2": [1.0] * 3}}, "links.finger.inertia_kg_m2", "length >= 6"),
-        (
-            {"finger": {"inertia_kg_m2": [1.0, 0.0, 1.0, 0.0, 0.0, 3.0]}},
-            "links.finger.inertia_kg_m2",
-            "sum of the other two",
-        ),
-        (
-            {"upper": {"inertia_kg_m2": [-1.0, 0.0, 1.0, 0.0, 0.0, 1.0]}},
-            "links.upper.inertia_kg_m2",
-            "must be positive",
-        ),
-        (
-            {"finger": {"mass_kg": 0.0, "com_m": [0.1, 0.0, 0.0]}},
-            "links.finger.com_m",
-            "without mass",
-        ),
-        ({"finger": {"mass_kg": math.inf}}, "arm.links.finger.mass_kg", "finite"),
-    ],
-)
-def test_wrong_inertias_are_refused_at_their_key(links: Any, path: str, phrase: str) -> None:
-    with pytest.raises(ScenarioError) as refused:
-        of_arm(FINGER, {"tip": "lower", "links": links})
-    assert refused.value.path.endswith(path)
-    assert phrase in refused.value.problem
-
-
 def test_links_without_mass_in_files_need_one() -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(SHAPES, {"links": {"yaw": {"com_m": [0.0, 0.0, 0.1]}}})
     assert refused.value.path == "sites.m.arm.links.yaw.mass_kg"
-
-
-def test_a_planar_arm_has_no_links_to_mend() -> None:
-    with pytest.raises(ScenarioError, match="belongs to an arm with a urdf"):
-        load_scenario("free", {"arm.links.upper.mass_kg": 1.0})
 
 
 # The text of a scenario

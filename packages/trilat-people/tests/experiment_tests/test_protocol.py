@@ -11,13 +11,11 @@ from trilat_people.experiment.protocol import (
     Protocol,
     list_orders,
     plan_experiment,
-    read_protocol,
 )
 from trilat_people.experiment.questionnaires import Questionnaire, find_form
 from trilat_people.experiment.trial_run import ExperimentTrial
 
 import trilat_net as tn
-from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 
 LIVE = {"sites.m1.hands": [{"kind": "live"}], "sites.m2.hands": [{"kind": "live"}]}
@@ -108,120 +106,6 @@ def test_the_digest_covers_the_plan() -> None:
     assert plan_experiment(make_protocol()).digest == first
     assert plan_experiment(make_protocol(seed=2)).digest != first
     assert plan_experiment(make_protocol(set={**LIVE, "rate_hz": 500})).digest != first
-
-
-@pytest.mark.parametrize(
-    ("keys", "problem"),
-    [
-        (
-            {"participants": 3},
-            "a williams design of 2 conditions has 2 orders: the number of participants",
-        ),
-        (
-            {"users": ["m1", "m2"], "participants": 5},
-            "5 participants cannot form pairs: the number of participants must be even",
-        ),
-        ({"users": ["m1", "m2", "s"]}, "users must be one or two sites, not m1, m2, s"),
-        (
-            {"users": ["m3"]},
-            "condition near: .*the scenario has no site m3; its sites are m1, m2, s",
-        ),
-        ({"users": ["s"]}, "has no live hand, so nobody can hold this arm"),
-        ({"participants": ["A", "A"]}, "two participants have the same pseudonym"),
-        ({"force_limit_n": {"P9": 5.0}}, "force_limit_n: there is no participant P9"),
-        (
-            {"force_limit_n": {"P1": 50.0}},
-            "condition near: .*50 N exceeds the limit of the live hand at m1, which is 40 N",
-        ),
-        ({"catch": {"condition": "nowhere"}}, "catch.condition: there is no condition nowhere"),
-        (
-            {"questionnaires": [{"name": "tlx"}, {"name": "tlx"}]},
-            "two questionnaires have the same name",
-        ),
-        (
-            {"questionnaires": [{"name": "mine"}]},
-            "mine has no items; the built-in questionnaires are tlx, sus, agency",
-        ),
-        (
-            {"questionnaires": [{"name": "sus", "items": {"a": "A?"}}]},
-            "give your questionnaire another name",
-        ),
-        (
-            {"questionnaires": [{"name": "mine", "items": {"a": "A?"}, "most": 1}]},
-            "the scale must have 2 to 101 numbers",
-        ),
-        (
-            {"foreperiod_s": [2.0, 1.0]},
-            "foreperiod_s must go from the shorter to the longer time",
-        ),
-        (
-            {"task": {"kind": "reach", "handover_s": 2.0}},
-            "a training, a handover and .* need two users",
-        ),
-        (
-            {"task": {"kind": "track", "apart_m": 0.1}},
-            "a task with two targets need two users",
-        ),
-        (
-            {"training": {"lead": {"near": [1.0, 0.0]}}},
-            "training.lead: must have a pair .* of near, far",
-        ),
-        (
-            {
-                "users": ["m1", "m2"],
-                "training": {"lead": {"near": [1.0, 0.0], "far": [1.0, 0.0]}},
-                "catch": {"condition": "far"},
-            },
-            "catch trials, a training and a staircase exclude each other",
-        ),
-        (
-            {
-                "users": ["m1", "m2"],
-                "task": {"kind": "reach", "handover_s": 2.0},
-                "set": {**LIVE, "dominance.s": {"m1": 1.0}},
-            },
-            "dominance.s.*both users must have a share above 0",
-        ),
-        (
-            {"task": {"kind": "contact"}},
-            "sites.s.environment.*the slave has no wall to press against",
-        ),
-        (
-            {"conditions": {"a": {"link.delay_ms": -1}, "b": {"control.K": 1}}},
-            "condition a: .*; condition b: ",
-        ),
-    ],
-)
-def test_all_mistakes_are_named_before_the_start(keys: dict[str, Any], problem: str) -> None:
-    with pytest.raises(UsageError, match=problem):
-        plan_experiment(make_protocol(**keys))
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        (
-            "name = 3",
-            "Expected `str`, got `int` - at `\\$.name`; the keys of a protocol are name, scenario",
-        ),
-        (
-            "name = 'a'\nscenario = 'paper'\nconditions = {}\ntrails = 3",
-            "unknown field `trails`",
-        ),
-        ("name =", "is not valid TOML"),
-        (
-            "name = 'a'\nscenario = 'paper'\nconditions = {}\nparticipants = ['../x']",
-            "matching regex",
-        ),
-    ],
-)
-def test_file_that_is_no_protocol_is_refused(text: str, problem: str, tmp_path: Path) -> None:
-    file = tmp_path / "one.toml"
-    file.write_text(text, encoding="utf-8")
-    with pytest.raises(UsageError, match=problem):
-        read_protocol(file)
-    with pytest.raises(UsageError, match="cannot be read"):
-        read_protocol(tmp_path / "none.toml")
 
 
 def test_template_is_a_protocol(tmp_path: Path) -> None:

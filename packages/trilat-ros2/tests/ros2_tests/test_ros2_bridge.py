@@ -232,39 +232,6 @@ def test_topics_have_the_names_in_a_file(tmp_path: Path) -> None:
     assert TopicTable.read("crisp").find("play", "s", "target_pose") == "play/s/target_pose"
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("joint_state = 'a'", "there is no topic 'joint_state'.*joint_states"),
-        ("joint_states = 'a b'", "joint_states 'a b' is not a valid ROS 2 name"),
-        ("joint_states = true", "joint_states must be a string in quotes, not True"),
-        ("joint_states", "is not a valid TOML file"),
-        ("joint_states = 'a'\nreference = 'a'", "two topics have the same name"),
-        (
-            "robot_commands = '/commands'",
-            "a name that begins with / can be used for one site only",
-        ),
-        ("[sites.s]\nmode = '/a'\n[sites.m]\nmode = '/a'", "two topics have the same name"),
-        ("sites = 1", "is not a valid TOML file of names: Expected `object`"),
-        (
-            "[sites.s]\nsafe = ['a']",
-            "is not a valid TOML file of names: Expected `float`, got `str`",
-        ),
-        ("[sites.s]\njoint = ['a']", "there is no topic 'joint'"),
-        (
-            None,
-            "--names must be crisp, crtk or the path of a file, but .* cannot be read: No such file",
-        ),
-    ],
-)
-def test_invalid_names_are_refused(tmp_path: Path, text: str | None, said: str) -> None:
-    file = tmp_path / "names.toml"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(UsageError, match=said.replace("--names", "names")):
-        TopicTable.read(str(file))
-
-
 @pytest.mark.parametrize("site", ["m", "nobody"])
 def test_a_site_without_external_arm_takes_no_robot(tmp_path: Path, site: str) -> None:
     (tmp_path / "names.toml").write_text(

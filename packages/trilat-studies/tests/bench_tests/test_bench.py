@@ -701,26 +701,6 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
     assert find_stale([other]) == [f"p_d (level, {tuned.round_trip_ms} ms)"]
 
 
-@pytest.mark.parametrize(
-    ("more", "phrase"),
-    [
-        ({"study": "smal"}, "no study 'smal' is available; did you mean 'small'"),
-        ({"laws": ["p_dd"]}, "no law 'p_dd' is available; did you mean"),
-        ({"tasks": ["handover"]}, "no task 'handover' is available"),
-        ({"links": ["rtt9"]}, "no link 'rtt9' is available; did you mean"),
-        ({"seeds": 0}, "seeds must be a number from 1 to 1000, not 0"),
-        (
-            {"study": "full", "laws": ["smith"], "tasks": ["handover"]},
-            "cannot run in handover",
-        ),
-    ],
-)
-def test_impossible_requests_are_refused(more: dict[str, Any], phrase: str) -> None:
-    with pytest.raises(UsageError) as refused:
-        plan_small_suite(**more)
-    assert phrase in str(refused.value)
-
-
 @pytest.mark.long
 def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path) -> None:
     """Finished runs are kept if cells are added, and other programs or files are refused."""

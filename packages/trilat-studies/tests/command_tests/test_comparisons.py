@@ -125,35 +125,6 @@ def test_search_reports_time_and_procedure_and_writes_folder(logs: Path) -> None
     )
 
 
-@pytest.mark.parametrize(
-    ("arguments", "facts"),
-    [
-        ([], ["name at least two logs", "--tune free"]),
-        (["a.mcap"], ["name at least two logs"]),
-        (["a.mcap", "no.mcap"], ["no.mcap"]),
-        (["a.mcap", "none.mcap"], ["none.mcap", "cannot be read"]),
-        (
-            ["a.mcap", "b.mcap", "--budget", "3"],
-            ["--budget can be used only with --tune SCENARIO"],
-        ),
-        (["a.mcap", "b.mcap", "--force"], ["--force can be used only with --tune SCENARIO"]),
-        (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
-        (["--tune", "free", "--all"], ["leave it out with --tune"]),
-        (["--tune", "fre"], ["no scenario of that name", "free"]),
-        (
-            ["--tune", "free", "--law", "adaptve"],
-            ["no law 'adaptve'", "did you mean 'adaptive'"],
-        ),
-        (["--tune", "free", "--budget", "0"], ["--budget", "not 0"]),
-        (["--tune", "training"], ["keep only one of the operators"]),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(
-    logs: Path, arguments: list[str], facts: list[str]
-) -> None:
-    trilat("compare", *arguments, cwd=logs).refuses(*facts)
-
-
 @pytest.mark.long
 def test_a_shipped_law_is_called_by_its_name(tmp_path: Path) -> None:
     """Messages about a shipped law name it, and do not call it a user's own law."""

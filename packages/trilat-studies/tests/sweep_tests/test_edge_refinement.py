@@ -23,7 +23,6 @@ from trilat_studies.sweep.sweep_plan import SweepPlan, parse_axis, plan_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 from trilat_studies.sweep.sweep_run import open_sweep_folder
 
-from trilat_net.errors import UsageError
 from trilat_net.scenario import parse_scenario
 
 from .quick import outcome_of
@@ -111,21 +110,6 @@ def test_a_cell_has_the_side_of_most_runs() -> None:
     assert choose_side(stable=1, decided=2) == UNDECIDED
     assert choose_side(stable=2, decided=3) == STABLE
     assert choose_side(stable=1, decided=3) == UNSTABLE
-
-
-@pytest.mark.parametrize(
-    ("over", "refine"),
-    [
-        (AXES, -1),
-        (AXES, 99),
-        (("control.law=p_d,adaptive",), 2),
-        ((), 1),
-        (("link.delay_ms=0:160:1e-6", AXES[1]), 2),
-    ],
-)
-def test_a_sweep_that_cannot_be_refined_is_refused(over: tuple[str, ...], refine: int) -> None:
-    with pytest.raises(UsageError, match="refine"):
-        plan_sweep("p_d_margin", over=over, refine=refine)
 
 
 def judge_by_line(text: str, longest_s: float) -> CellResult:

@@ -125,8 +125,6 @@ def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="another judge: verdict in the folder, twins now"):
         prepare_sweep_folder(longest, tmp_path / "o")
     assert (twins.longest_s, verdicts.longest_s) == (0.5, 4.0)
-    with pytest.raises(UsageError, match="verdict, twins, linear, not 'luck'"):
-        plan_quick_sweep(tmp_path, judge="luck")
 
 
 def test_the_command_of_a_map_names_its_judge(tmp_path: Path) -> None:

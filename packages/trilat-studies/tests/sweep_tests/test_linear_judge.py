@@ -18,7 +18,6 @@ from trilat_studies.sweep.stability_map import (
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 
 from trilat_net.analysis.theory import iterate_linear_edges
-from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 
 from .quick import plan_quick_sweep
@@ -76,8 +75,3 @@ def test_cells_without_linear_form_say_so(tmp_path: Path) -> None:
     for row in results.rows:
         assert row["verdict"] == CellClass.UNDECIDED
         assert row["reasons"].startswith("no linear analysis: ")
-
-
-def test_metrics_need_runs() -> None:
-    with pytest.raises(UsageError, match="judge linear makes none"):
-        plan_sweep("p_d_margin", over=AXES, judge="linear", metrics=["rms_error_rad"])

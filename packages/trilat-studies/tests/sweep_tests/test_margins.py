@@ -24,7 +24,6 @@ from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 
 from tests.json_outline import is_documented
 from trilat_net.analysis.run_end import EndBehaviour
-from trilat_net.errors import UsageError
 from trilat_net.scenario import parse_scenario
 
 WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
@@ -156,19 +155,9 @@ def test_the_facts_are_json_and_name_the_command() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    "text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
-)
-def test_an_invalid_range_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"along must have the form KEY=FROM:TO"):
-        parse_search_range(text)
-
-
 def test_a_range_is_read_as_written() -> None:
     assert parse_search_range("control.d=0.2:3") == WITHIN
     assert format_range_axis(WITHIN) == "control.d=0.2,3"
-    with pytest.raises(UsageError, match="fraction of the value at the edge"):
-        parse_search_range("control.d=0.2:3", 0.0)
 
 
 @given(st.floats(0.25, 2.95), st.booleans(), st.sampled_from([0.05, 0.005, 1e-4]))

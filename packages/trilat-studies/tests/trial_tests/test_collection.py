@@ -26,7 +26,6 @@ from trilat_studies.measure_run import (
 import trilat_net
 from tests.log_editing import edited, opened, recorded, without
 from trilat_net.core.arms.two_link_arm import end_effector_jacobian
-from trilat_net.errors import ScenarioError
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import ExpectWindow, window_quantities
@@ -421,22 +420,3 @@ def test_any_metric_may_be_expected() -> None:
     assert [outcomes[f"metrics.{key}"].held for key in expectations] == [False, True, False]
     assert outcomes["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
     assert "nothing is learnt" in outcomes["metrics.theta_error_last"].measured
-
-
-@pytest.mark.parametrize(
-    ("metrics", "said"),
-    [
-        (
-            {"chater_nm": [0, 1]},
-            "expect.metrics.chater_nm: there is no metric 'chater_nm'; did you mean 'chatter_nm'",
-        ),
-        (
-            {"chatter_nm": [2, 1]},
-            r"expect.metrics.chatter_nm: must be \[least, most\], but is \[2, 1\]",
-        ),
-        ({"chatter_nm": 1}, "expect.metrics"),
-    ],
-)
-def test_an_invalid_expected_metric_is_refused(metrics: dict[str, Any], said: str) -> None:
-    with pytest.raises(ScenarioError, match=said):
-        trilat_net.trials("free", set={"expect": {"metrics": metrics}})

@@ -296,40 +296,6 @@ def test_the_command_draws_and_prints(one_joint: Path, tmp_path: Path) -> None:
     assert (tmp_path / "gains.png").read_bytes().startswith(b"\x89PNG")
 
 
-REFUSED = {
-    "no such file": (("--arm", "none.urdf"), "none.urdf cannot be read"),
-    "no delay": (
-        ("--delay", "soon"),
-        "--delay must be a time such as 40ms, a log such as measured:run.mcap",
-    ),
-    "too long a delay": (("--delay", "20s"), "delay_ms"),
-    "no such log": (("--delay", "measured:none.mcap"), "none.mcap"),
-    "a trace without points": (("--delay", "empty.csv"), "has no points"),
-    "a law without stiffness": (
-        ("--law", "adaptive"),
-        "--law must be one of p_d, pd_d, saturated_pd",
-    ),
-    "no such law": (("--law", "pid"), "--law must be one of p_d, pd_d, saturated_pd"),
-    "no such tip": (("--tip", "hand"), "there is no link 'hand'"),
-    "four sites": (("--sites", "4"), "--sites must be 2 or 3, not 4"),
-    "no rate": (("--rate", "0"), "rate_hz"),
-    "no margin": (("--margin", "0.5"), "margin must be from 1 to 100, not 0.5"),
-    "half of gravity": (("--set", "control.gravity=0.5"), "gravity must be exact here"),
-}
-
-
-@pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_is_refused_with_the_valid_choices(
-    kind: str, one_joint: Path, tmp_path: Path
-) -> None:
-    more, fact = REFUSED[kind]
-    (tmp_path / "empty.csv").write_text("t_s,delay_ms\n", encoding="utf-8")
-    arguments = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
-    trilat(
-        "tune", *(word for pair in arguments.items() for word in pair), cwd=tmp_path
-    ).refuses(fact)
-
-
 def test_python_names_its_arguments(one_joint: Path) -> None:
     with pytest.raises(TrilatError, match=r"^margin must be from 1 to 100"):
         tune_arm(one_joint, 40, margin=0.5)
