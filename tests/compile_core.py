@@ -16,8 +16,7 @@ from pathlib import Path
 
 import trilat_net
 from sites.site_parts import warm_up
-from tests.chains import six_joints
-from tests.task_arms import planar_task
+from tests.scenario.builders import planar_task_text, six_joint_text
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.errors import count_nouns
 from trilat_net.execution.fused import FusedRun
@@ -31,7 +30,7 @@ SHIPPED = ("paper", "six_joints", "seven_joints", "unlike_arms")
 
 def read_part(name: str) -> Scenario:
     """The scenario of a part, of a moment."""
-    texts = {"six joints": six_joints, "task space": planar_task}
+    texts = {"six joints": six_joint_text, "task space": planar_task_text}
     if name in texts:
         return parse_scenario(texts[name](0.05))
     return load_scenario(name, {"duration_s": 0.05})

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.execution.builders import sample_records
 from tests.unit_arm import CLAMP, H50, hand, unit_scenario
-from tests.virtual_runs import sampled
 from trilat_net.scenario import Scenario
 
 CONSTANT = {"model": "constant", "delay_ms": 200.0}
@@ -52,7 +52,7 @@ def ticked(scenario: Scenario, every: int = 1) -> dict[str, Any]:
     """
     rate_hz = next(iter(scenario.sites.values())).rate_hz
     ticks = np.arange(every, round(scenario.duration_s * rate_hz) + 1, every)
-    rows = sampled(scenario, ticks / rate_hz)
+    rows = sample_records(scenario, ticks / rate_hz)
     return {
         name: _name_columns(scenario, name, site)
         for name, site in zip(scenario.names, rows, strict=True)

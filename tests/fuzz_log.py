@@ -15,6 +15,8 @@ from pathlib import Path
 
 import atheris  # type: ignore[import-not-found]
 
+from tests.log.builders import edit_log_bytes, make_log_bytes
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # what Numba compiles cannot be instrumented
@@ -24,12 +26,11 @@ with atheris.instrument_imports(
     include=["trilat_net.log", "trilat_net.execution", "trilat_net.app.play", "mcap"]
 ):
     from tests.log.hostility import mangled, read_by_all
-    from tests.log_editing import edited, recorded
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
 LOGS = (
-    edited(recorded("paper", SHORT), chunk_bytes=4096),
-    recorded("jitter", {"duration_s": 0.04}),
+    edit_log_bytes(make_log_bytes("paper", SHORT), chunk_bytes=4096),
+    make_log_bytes("jitter", {"duration_s": 0.04}),
 )
 MEMORY_MB = 512
 

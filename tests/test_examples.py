@@ -18,7 +18,7 @@ import pytest
 from trilat_ros2.ros2_bridge import refuse_other_robots
 
 import trilat_net
-from tests.log_editing import recorded
+from tests.log.builders import make_log_bytes
 from tests.net.waiting import until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
@@ -48,7 +48,7 @@ def test_a_look_into_a_log(
 ) -> None:
     if not polars:
         monkeypatch.setitem(sys.modules, "polars", None)
-    (tmp_path / "run.mcap").write_bytes(recorded("paper"))
+    (tmp_path / "run.mcap").write_bytes(make_log_bytes("paper"))
     monkeypatch.setattr(sys, "argv", [str(LOOK), "run.mcap"] if polars else [str(LOOK)])
     runpy.run_path(str(LOOK), run_name="__main__")
     plt.close("all")

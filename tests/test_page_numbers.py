@@ -27,12 +27,13 @@ from trilat_studies.tuning.search_space import (
 
 import trilat_net
 from tests.analysis.ages_in_use import in_order, newest_wins
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run
 from tests.cli.running import trilat
+from tests.execution.builders import run_fused, sample_records
+from tests.scenario.builders import make_overrides
 from tests.theory import delay_equations, energy
 from tests.theory.figures_of_runs import measured, value
 from tests.theory.loops import RODS
-from tests.virtual_runs import sampled
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
 from trilat_net.analysis.theory import (
     analyse_linear_loop,
@@ -71,10 +72,6 @@ Pose = tuple[float, float]
 Numbers = Iterable[float | None]
 Make = Callable[[], Numbers | str]
 Changes = dict[str, Any]
-
-
-def keys(changes: Changes) -> Changes:
-    return {key.replace("__", "."): one for key, one in changes.items()}
 
 
 # -- the linear loop
@@ -137,7 +134,7 @@ def common_motion() -> tuple[float, float, float]:
 
 
 def ports(name: str, **changes: Any) -> PortAnalysis:
-    scenario = load_scenario(name, keys(changes))
+    scenario = load_scenario(name, make_overrides(**changes))
     return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
 
@@ -193,15 +190,13 @@ def stable_with_any(delay_ms: float, d: float) -> Numbers:
 
 
 def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
-    scenario = load_scenario(name, keys(changes))
-    fused_run = FusedRun(scenario)
-    fused_run.advance_to(duration_s or scenario.duration_s)
-    return fused_run
+    scenario = load_scenario(name, make_overrides(**changes))
+    return run_fused(scenario, duration_s)
 
 
 def rms_of_free(delay_ms: float) -> float:
     """Returns the RMS of e over 20 s, of all joints and sites together, rad."""
-    records = sampled(
+    records = sample_records(
         load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02)
     )
     return float(np.sqrt(((records[..., :2] - records[..., 4:6]) ** 2).mean()))
@@ -211,14 +206,16 @@ def measure_windows(
     name: str, quantity: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
     """Returns quantities of windows of a run, window by window."""
-    values = measured(name, keys(changes), *windows)
+    values = measured(name, make_overrides(**changes), *windows)
     return [value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
 
 
 def age(**changes: Any) -> float:
     """Returns the mean age of the samples in use in `jitter`, ms."""
     return float(
-        np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()])
+        np.mean(
+            [one.mean_ms for one in measured("jitter", make_overrides(**changes)).ages.values()]
+        )
     )
 
 
@@ -237,7 +234,7 @@ def pi() -> Any:
 
 def lyapunov(ones: bool = False, **changes: Any) -> EnergyBalance:
     return compute_energy_balance(
-        runs.run("lyapunov", keys(changes)).energies, paper_weights=ones
+        make_run("lyapunov", make_overrides(**changes)).energies, paper_weights=ones
     )
 
 
@@ -247,7 +244,7 @@ def rise(V: Any) -> Numbers:
 
 def energy_of_healing() -> Numbers:
     """Returns the energy that the links give to the slave of `outage` as they heal, J."""
-    balance = runs.run("outage").balance
+    balance = make_run("outage").balance
     healed = slice(*np.searchsorted(balance.t_s, (6.19, 6.21)))
     return (float(np.ptp(balance.work[f"{peer}->s"][healed])) for peer in ("m1", "m2"))
 
@@ -435,7 +432,7 @@ PAGES: dict[str, dict[str, Make]] = {
     },
     "docs/reference/stability.md": {
         "ever more for 200 s, to {} rad/s": lambda: [
-            fused("free", 200.0, **keys(DIGITAL)).maxima[0][-2400:, 1].max()
+            fused("free", 200.0, **make_overrides(**DIGITAL)).maxima[0][-2400:, 1].max()
         ],
     },
     "docs/data/map-p_d-edges.csv": {
@@ -627,7 +624,9 @@ LIVE_CELLS = read_table("map-p_d-live.csv")
 
 
 def class_of(longest_s: float, **changes: Any) -> CellClass:
-    return classify_cell(load_scenario("p_d_margin", keys(changes)).text, longest_s).verdict
+    return classify_cell(
+        load_scenario("p_d_margin", make_overrides(**changes)).text, longest_s
+    ).verdict
 
 
 @pytest.mark.long

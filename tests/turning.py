@@ -1,6 +1,5 @@
 """Motions through singular orientations, with SciPy's rotations as the truth, and logs that have them."""
 
-import io
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -8,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.log_editing import Record, edited, opened
+from tests.log.builders import Record, edit_log_bytes, open_bytes, simulate_bytes
 from trilat_net.core.step.vectors import Array
-from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -104,9 +102,7 @@ def load_case() -> Scenario:
 
 @cache
 def _simulate() -> bytes:
-    stream = io.BytesIO()
-    write_virtual_log(load_case(), stream)
-    return stream.getvalue()
+    return simulate_bytes(load_case())
 
 
 def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
@@ -127,4 +123,4 @@ def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
             fields[field] = [*fields[field][:3], *vector[k].tolist()]
         return {**fields, "q": motions[site].q[k].tolist()}
 
-    return opened(edited(_simulate(), record=record)), motions
+    return open_bytes(edit_log_bytes(_simulate(), record=record)), motions

@@ -7,8 +7,8 @@ with one gain for both joints keeps that line: x is q1, and q2 = q1 / 2.
 from collections.abc import Mapping
 from typing import Any
 
+from tests.execution.builders import Array, sample_records
 from tests.transmission import VARIANTS
-from tests.virtual_runs import Array, sampled
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -103,7 +103,7 @@ def unit_scenario(
 
 def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
     """Returns, per time, the records before it, of a compiled run: by field shape (N, 2)."""
-    rows = sampled(scenario, times_s)
+    rows = sample_records(scenario, times_s)
     columns = next(iter(scenario.names))
     fields = scenario.layout(columns).columns()
     return [{name: rows[:, k, fields[name]] for name in fields} for k in range(len(times_s))]

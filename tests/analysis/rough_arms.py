@@ -6,11 +6,11 @@ from functools import cache
 from importlib import resources
 
 import trilat_net
-from tests.chains import six_joints
+from tests.scenario.builders import six_joint_text
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
-ROUGH = f"""{six_joints(4.0, 50.0, "rough.urdf")}
+ROUGH = f"""{six_joint_text(4.0, 50.0, "rough.urdf")}
 [[sites.m1.hands]]
 kind = "tip_spring"
 to_m = [-0.4, -0.2, 0.1]

@@ -14,6 +14,8 @@ from scipy import stats
 
 import trilat_net
 from tests.analysis.ages_in_use import in_order, newest_wins
+from tests.analysis.builders import drive_run, make_busy_run, make_short_log
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.link_summary import (
     bin_ages,
     compute_statistics,
@@ -28,8 +30,6 @@ from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario import sample_uses as module
 from trilat_net.scenario.sample_uses import first_ticks
 
-from . import logs
-
 PERIOD_MS = 1.0
 
 
@@ -39,7 +39,7 @@ def uses(log):
 
 @cache
 def busy():
-    return uses(logs.busy().log)
+    return uses(make_busy_run().log)
 
 
 def counted(run, link):
@@ -52,7 +52,7 @@ def counted(run, link):
 
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
 def test_counts_equal_those_of_the_link(link):
-    counts, core = busy()[link].counts, counted(logs.busy(), link)
+    counts, core = busy()[link].counts, counted(make_busy_run(), link)
     assert counts.arrived + counts.duplicate == core.accepted
     assert (counts.lost, counts.late, counts.duplicate) == (
         core.lost,
@@ -66,7 +66,7 @@ def test_counts_equal_those_of_the_link(link):
 
 
 def test_superseded_samples_are_never_in_use():
-    log = logs.busy().log
+    log = make_busy_run().log
     for peer, site in [("b", "a"), ("c", "a"), ("c", "b")]:
         release = predict_delivery(log, peer, site, log.scenario.ticks(peer)).release(
             log[site].rate_hz
@@ -85,7 +85,7 @@ def test_superseded_samples_are_never_in_use():
 def test_lost_and_doubled_samples_are_counted():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
-    run = logs.drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
+    run = drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
     link_uses = uses(run.log)
     lossy = link_uses["m2->m1"]
     assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
@@ -107,8 +107,8 @@ def test_lost_and_doubled_samples_are_counted():
 
 
 def test_samples_of_missing_records_have_no_fate():
-    log = logs.rewritten(
-        logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
+    log = rewrite_log(
+        make_short_log("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
     )
     link_uses = uses(log)
     for link in ("m1->m2", "s->m2"):
@@ -121,7 +121,7 @@ def test_samples_of_missing_records_have_no_fate():
 
 def test_a_link_cut_until_the_end_loses_everything():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
-    run = logs.drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
+    run = drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
     cut = uses(run.log)["m2->m1"]
     assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
     assert cut.silence_ms == 1000.0 - (99 * 5.0 + 20.0)
@@ -129,22 +129,22 @@ def test_a_link_cut_until_the_end_loses_everything():
 
 def test_late_samples_equal_those_of_the_core():
     """Every sample of a link takes longer than the link's delay."""
-    log = logs.simulated("free")
+    log = make_short_log("free")
     hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
     assert hurried != log.scenario.text
-    run = logs.drive_run(parse_scenario(hurried))
+    run = drive_run(parse_scenario(hurried))
     for use in summarise_links(run.log):
         assert use.counts.late == counted(run, use.name).late
 
 
 def test_only_out_of_range_stamps_are_refused():
     def hostile(state):
-        return logs.replaced(
+        return replace_fields(
             state,
             rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx,
         )
 
-    link_uses = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
+    link_uses = uses(rewrite_log(make_short_log("paper"), change=hostile))
     assert [use.counts.refused for use in link_uses.values()] == [1] * 6
     assert [use.counts.sent for use in link_uses.values()] == [400] * 6
 
@@ -154,7 +154,7 @@ def test_false_tick_numbers_cost_no_memory():
 
     def far(state):
         return (
-            logs.replaced(state, tick=2**39)
+            replace_fields(state, tick=2**39)
             if (state.site, state.tick) == ("m2", 399)
             else state
         )
@@ -162,14 +162,14 @@ def test_false_tick_numbers_cost_no_memory():
     with pytest.raises(
         LogError, match="m2 has a record of tick 549755813888, but the scenario has only 400"
     ):
-        uses(logs.rewritten(logs.simulated("paper"), change=far))
+        uses(rewrite_log(make_short_log("paper"), change=far))
 
 
 # -- ages
 
 
 def test_effective_delay_without_jitter_is_the_stated():
-    for use in summarise_links(logs.simulated("paper")):
+    for use in summarise_links(make_short_log("paper")):
         assert use.plain
         assert use.one_way_us is None
         assert use.age_ms == compute_statistics([200.0])
@@ -181,7 +181,7 @@ def test_effective_delay_without_jitter_is_the_stated():
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
 def test_recorded_ages_follow_from_fates_of_samples(link):
     peer, site = link.split("->")
-    log, part = logs.busy().log, logs.busy().log[site]
+    log, part = make_busy_run().log, make_busy_run().log[site]
     fate = predict_delivery(log, peer, site, log.scenario.ticks(peer))
     release = fate.release(part.rate_hz)
     usable = np.full(len(part), -1)
@@ -303,7 +303,7 @@ def test_histogram_counts_ticks_in_few_round_bins():
     for use in busy().values():
         bins = use.ages
         assert sum(bins.ticks) == pytest.approx(
-            (6.0 - use.first_use_s) * logs.busy().log[use.site].rate_hz
+            (6.0 - use.first_use_s) * make_busy_run().log[use.site].rate_hz
         )
         assert len(bins.ticks) <= 50
         assert bins.first_ms <= use.age_ms.min
@@ -321,7 +321,7 @@ def test_one_age_gives_one_bin():
 
 
 def test_an_empty_log_has_no_link_statistics():
-    log = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
+    log = rewrite_log(make_short_log("paper"), keep=lambda _: False, finished=False)
     for use in summarise_links(log):
         assert use.stated[0].link.delay_ms == 200.0
         assert use.plain
@@ -332,14 +332,14 @@ def test_an_empty_log_has_no_link_statistics():
 
 def test_measured_delays_equal_those_in_the_records():
     def timed(state):
-        return logs.replaced(
+        return replace_fields(
             state, rx=[[j, tick, 100 * (j + 1) + tick] for j, tick, _ in state.rx]
         )
 
-    log = logs.rewritten(logs.simulated("paper"), change=timed, driver="live")
+    log = rewrite_log(make_short_log("paper"), change=timed, driver="live")
     use = uses(log)["m2->m1"]
     assert (use.one_way_us.min, use.one_way_us.max) == (100.0, 100.0 + 398)
-    old = logs.rewritten(log, change=lambda s: logs.replaced(s, v=1), driver="live")
+    old = rewrite_log(log, change=lambda s: replace_fields(s, v=1), driver="live")
     # before version 2 it was the age of the stamp
     assert uses(old)["m2->m1"].one_way_us is None
 
@@ -350,7 +350,7 @@ LINKS = [(peer, site) for site in "abc" for peer in "abc" if peer != site]
 
 def decided(peer: str, site: str) -> Site:
     """Returns the site of the core, given every change at the tick at which it was applied."""
-    log = logs.busy().log
+    log = make_busy_run().log
     core = Site(log.scenario.setup(site))
     index = log[site].peers.index(peer)
     for tick, commands in log.commands(site).items():
@@ -362,7 +362,7 @@ def decided(peer: str, site: str) -> Site:
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
 def test_fates_equal_those_of_the_cores_link(peer, site):
-    log, core = logs.busy().log, decided(peer, site)
+    log, core = make_busy_run().log, decided(peer, site)
     delivery_ticks = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
     index = log[site].peers.index(peer)
     expected = [core.release_tick(index, sample) for sample in range(COUNT)]
@@ -371,7 +371,7 @@ def test_fates_equal_those_of_the_cores_link(peer, site):
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
 def test_fates_are_independent_of_the_sample_count(peer, site, monkeypatch):
-    log = logs.busy().log
+    log = make_busy_run().log
     whole = predict_delivery(log, peer, site, COUNT)
     monkeypatch.setattr(module, "_BLOCK", 64)
     part = predict_delivery(log, peer, site, 500)
@@ -382,7 +382,7 @@ def test_fates_are_independent_of_the_sample_count(peer, site, monkeypatch):
 
 
 def test_order_and_playout_follow_the_drawn_delays():
-    log = logs.busy().log
+    log = make_busy_run().log
     for peer, site in LINKS:
         fate = predict_delivery(log, peer, site, COUNT)
         assert ((fate.drawn_ns == LOST) == fate.lost).all()
@@ -394,7 +394,7 @@ def test_order_and_playout_follow_the_drawn_delays():
 
 
 def test_lost_samples_equal_those_of_the_link():
-    log = logs.busy().log
+    log = make_busy_run().log
     cut = predict_delivery(log, "a", "b", COUNT)
     in_outage = (cut.stamp_ns >= 2 * 10**9) & (cut.stamp_ns < 3 * 10**9)
     assert (cut.lost == in_outage).all()

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import make_diverged_log
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.run_end import (
     NO_BUCKETS,
     EndBehaviour,
@@ -34,9 +35,9 @@ def moving(e: Callable[[float], float], qd: Callable[[float], float]) -> Log:
 
     def changed(state):
         t_s = state.t_ns * 1e-9
-        return logs.replaced(state, q=[e(t_s), 0.0], q_des=[0.0, 0.0], qd=[qd(t_s), 0.0])
+        return replace_fields(state, q=[e(t_s), 0.0], q_des=[0.0, 0.0], qd=[qd(t_s), 0.0])
 
-    return logs.rewritten(still(), change=changed)
+    return rewrite_log(still(), change=changed)
 
 
 def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]:
@@ -121,14 +122,14 @@ def test_wall_hammering_shows_only_in_longer_records() -> None:
 
 def test_a_site_without_records_leaves_it_undecided() -> None:
     run_end = RunEnd.of_log(
-        logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
+        rewrite_log(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
     )
     assert run_end.behaviour is EndBehaviour.UNDECIDED
     assert run_end.text == "undecided: no record of s"
 
 
 def test_only_times_recorded_by_all_sites_count() -> None:
-    torn = logs.rewritten(
+    torn = rewrite_log(
         moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300)
     )
     assert RunEnd.of_log(torn).behaviour is EndBehaviour.UNDECIDED
@@ -144,13 +145,13 @@ def test_a_late_jump_is_undecided() -> None:
 def test_short_runs_are_undecided_and_stopped_ones_diverged() -> None:
     short = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 50})
     assert RunEnd.of_log(short).behaviour is EndBehaviour.UNDECIDED
-    stopped = RunEnd.of_log(logs.diverged())
+    stopped = RunEnd.of_log(make_diverged_log())
     assert stopped.behaviour is EndBehaviour.DIVERGED
-    assert stopped.text == f"diverged: {logs.diverged().describe_divergence()}"
+    assert stopped.text == f"diverged: {make_diverged_log().describe_divergence()}"
 
 
 def test_a_log_without_records_is_undecided() -> None:
-    empty = logs.rewritten(still(), lambda _: False)
+    empty = rewrite_log(still(), lambda _: False)
     assert RunEnd.of_log(empty).behaviour is EndBehaviour.UNDECIDED
 
 
@@ -161,9 +162,9 @@ def test_a_decaying_joint_hides_no_growing_one() -> None:
         t_s = state.t_ns * 1e-9
         small = swing(0.2, 1e-4)(t_s) if state.site == "s" else 0.0
         wide = swing(-0.3)(t_s)
-        return logs.replaced(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
+        return replace_fields(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
 
-    run_end = RunEnd.of_log(logs.rewritten(still(), change=changed))
+    run_end = RunEnd.of_log(rewrite_log(still(), change=changed))
     assert (run_end.behaviour, run_end.where) == (EndBehaviour.GROWS, "s joint 2")
     assert run_end.stability is Stability.NOT_STABLE
 
@@ -184,9 +185,9 @@ def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stabilit
 
     def changed(state):
         x = swing(0.2)(state.t_ns * 1e-9)
-        return logs.replaced(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
+        return replace_fields(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
 
-    run_end = RunEnd.of_log(logs.rewritten(log, change=changed))
+    run_end = RunEnd.of_log(rewrite_log(log, change=changed))
     assert run_end.behaviour is EndBehaviour.GROWS
     assert run_end.stability is stability
 
@@ -209,11 +210,11 @@ def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stabilit
 def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, says) -> None:
     def changed(state):
         q = [angle if state.site == "s" else 0.0, 0.0]
-        return logs.replaced(
+        return replace_fields(
             state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0]
         )
 
-    run_end = RunEnd.of_log(logs.rewritten(still(), change=changed))
+    run_end = RunEnd.of_log(rewrite_log(still(), change=changed))
     assert run_end.stability is stability
     assert says in run_end.text
 
@@ -223,8 +224,8 @@ def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, say
     [([-1.5, 0.05], "m, s hang: the arms fell"), ([2.5, 0.0], "away from every start pose")],
 )
 def test_hanging_or_thrown_arms_are_not_stable(pose: list[float], says: str) -> None:
-    change = lambda s: logs.replaced(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
-    run_end = RunEnd.of_log(logs.rewritten(still(), change=change))
+    change = lambda s: replace_fields(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
+    run_end = RunEnd.of_log(rewrite_log(still(), change=change))
     assert run_end.stability is Stability.OPEN
     assert says in run_end.text
 
@@ -239,9 +240,9 @@ def test_a_driven_joint_does_not_oscillate(wide: float, motion: EndBehaviour) ->
         t_s = state.t_ns * 1e-9
         steady = swing(0.0, 0.05)(t_s) if state.site == "s" else 0.0
         falls = swing(-0.1, wide)(t_s)
-        return logs.replaced(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
+        return replace_fields(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
 
-    assert RunEnd.of_log(logs.rewritten(still(), change=changed)).behaviour is motion
+    assert RunEnd.of_log(rewrite_log(still(), change=changed)).behaviour is motion
 
 
 RATE_HZ, SPAN_S = 50, 40.0

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run
 from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.torque_sources import (
@@ -63,7 +63,7 @@ def test_every_torque_equals_the_cores(
 
 
 def test_hand_and_environment_torques_sum_to_the_record() -> None:
-    log = runs.run("rich").log
+    log = make_run("rich").log
     for site, track in align_records(log).items():
         by = attribute_torque(track, log.scenario)
         np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
@@ -74,7 +74,7 @@ def test_hand_and_environment_torques_sum_to_the_record() -> None:
 
 
 def test_an_unscripted_hand_has_no_script() -> None:
-    log = runs.run("rich").log
+    log = make_run("rich").log
     track = align_records(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
     assert attribute_torque(other, log.scenario).script is None

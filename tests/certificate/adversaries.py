@@ -27,6 +27,8 @@ import numpy as np
 from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net
+from tests.execution.builders import run_fused
+from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.premises import find_missing_functionals
 from trilat_net.analysis.judge import judge_virtual_run
 from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
@@ -128,9 +130,9 @@ def _load(
     name: str, overrides: Mapping[str, Any] | None = None, /, **more: Any
 ) -> Callable[[], Scenario]:
     """Makes a shipped scenario with changes, at the speed limit for which its verdict was judged."""
-    changes = {key.replace("__", "."): value for key, value in more.items()}
     limit = {"limits.qd_limit_rad_s": 100.0}
-    return lambda: load_scenario(name, {**limit, **(overrides or {}), **changes})
+    changes = {**limit, **(overrides or {}), **make_overrides(**more)}
+    return lambda: load_scenario(name, changes)
 
 
 PUSH = [{"kind": "recorded", "points": [[0.0, 3.0, 0.0], [1e3, 3.0, 0.0]]}]
@@ -660,8 +662,7 @@ def find_wide_truth(scenario: Scenario) -> Truth:
         extend_scenario(scenario, LONGER * scenario.duration_s),
         scenario.duration_s,
     )
-    run = FusedRun(whole)
-    run.advance_to(LONGER * ends_s)
+    run = run_fused(whole, LONGER * ends_s)
     if run.diverged_s is not None:
         return Truth(True, None, False)
     early, late = (_largest_speed(run, end_s) for end_s in (ends_s, LONGER * ends_s))
@@ -778,8 +779,7 @@ def say_of_run(scenario: Scenario) -> str:
     """
     if not find_missing_functionals(scenario):
         return say_of(trilat_net.simulate(scenario))
-    run = FusedRun(scenario)
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario)
     return str(judge_virtual_run(scenario, run).decision.stability)
 
 

@@ -17,14 +17,13 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from tests.execution.builders import make_log_with_commands, run_fused
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import list_effective_commands
-from trilat_net.execution.fused import FusedRun
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario
 
-from ..virtual_runs import simulate_with_commands
 from .sampled_loops import SampledLoop, burst, constant, sine
 
 PAIR = ((0.0, 1.0), (1.0, 0.0))
@@ -356,7 +355,7 @@ IDLE_COMMANDS = [
 def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
     scenario = case.loop.write_scenario(case.duration_s, case.apart_rad, case.law)
-    log = simulate_with_commands(scenario, "b", *case.commands)
+    log = make_log_with_commands(scenario, "b", *case.commands)
     assert len(log.changes("b")) == len(case.commands)
     assert list_effective_commands(log) == []
     certificate = tn.certify(log)
@@ -372,7 +371,7 @@ def test_effective_commands_decide_by_later_roots() -> None:
         (-0.02976, 0.0222), abs=1e-5
     )
     scenario = stable.write_scenario(16.0, -0.02)
-    log = simulate_with_commands(scenario, "b", (6.0, set_delay(300.0)))
+    log = make_log_with_commands(scenario, "b", (6.0, set_delay(300.0)))
     assert_roots_decide(tn.certify(log), rate_per_s)
 
 
@@ -495,8 +494,7 @@ def lasts(scenario: Scenario) -> bool:
     Args:
         scenario: The run, which has the length that shows the truth.
     """
-    run = FusedRun(scenario)
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario)
     if run.diverged_s is not None:
         return True
     joints = run.buckets[0].shape[1] // 3

@@ -12,9 +12,8 @@ from unittest import mock
 import pytest
 from rich.table import Table
 
-from tests.chains import six_joints
-from tests.log_editing import edited, recorded
-from tests.task_arms import planar_task
+from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.scenario.builders import planar_task_text, six_joint_text
 from trilat_net.presentation.terminal_output import TextConsole, print_json, print_line
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
 
@@ -151,7 +150,7 @@ TAKERS = [
 
 def write_arms(kind: str, folder: Path) -> list[str]:
     text, changes, _ = ARMS[kind]
-    written = {"planar": planar_task()}.get(text, six_joints(1.0))
+    written = {"planar": planar_task_text()}.get(text, six_joint_text(1.0))
     (folder / "arms.toml").write_text(
         written.replace("arm6.urdf", "heavy.urdf") if text == "heavy" else written
     )
@@ -176,7 +175,9 @@ def write_arms(kind: str, folder: Path) -> list[str]:
 )
 def test_a_log_without_records_is_refused(command: str, tmp_path: Path) -> None:
     """Nothing is judged, measured or written if no site has a record."""
-    (tmp_path / "run.mcap").write_bytes(edited(recorded("paper"), record=lambda _: None))
+    (tmp_path / "run.mcap").write_bytes(
+        edit_log_bytes(make_log_bytes("paper"), record=lambda _: None)
+    )
     trilat(*command.split(), "run.mcap", cwd=tmp_path).refuses(
         "run.mcap: no site has a record in this log, so that there is nothing to judge"
     )

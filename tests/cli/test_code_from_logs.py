@@ -18,7 +18,7 @@ import typer
 
 import trilat_net as tn
 from tests.cli.running import COMMAND, PLAIN, shorten, trilat
-from tests.log_editing import edited, opened
+from tests.log.builders import edit_log_bytes, open_bytes
 from trilat_net.app.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
 from trilat_net.own_code.code_consent import list_imported_code
@@ -109,9 +109,11 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for source in (LAW, FILES["not a law"]["mylaws.py"])
     )
     log = (folder / "run.mcap").read_bytes()
-    text = opened(log).scenario_text.replace(before, now)
+    text = open_bytes(log).scenario_text.replace(before, now)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
-    (folder / "not a law.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    (folder / "not a law.mcap").write_bytes(
+        edit_log_bytes(log, scenario=lambda _: text, session=named)
+    )
     return folder
 
 
@@ -186,9 +188,11 @@ def test_looking_for_a_module_runs_no_code(code: str, log_folder: Path) -> None:
         (log_folder / name).parent.mkdir(parents=True)
         (log_folder / name).write_text(WITNESS)
     log = (log_folder / "run.mcap").read_bytes()
-    text = opened(log).scenario_text.replace("mylaws:Spring", code)
+    text = open_bytes(log).scenario_text.replace("mylaws:Spring", code)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
-    (log_folder / "run.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    (log_folder / "run.mcap").write_bytes(
+        edit_log_bytes(log, scenario=lambda _: text, session=named)
+    )
     done = subprocess.run(
         [*COMMAND, "verify", "run.mcap"], cwd=log_folder, capture_output=True, text=True
     )

@@ -10,7 +10,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
-from tests.execution.logs import external_log
+from tests.execution.builders import make_external_arm_bytes
 from trilat_net.log.log_reader import open_log
 
 LAWS = Path(__file__).parents[1] / "laws.py"
@@ -247,7 +247,7 @@ def test_failing_laws_in_reruns_are_one_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
 def test_external_arms_cannot_be_executed_again(how: list[str], tmp_path: Path) -> None:
-    (tmp_path / "outside.mcap").write_bytes(external_log())
+    (tmp_path / "outside.mcap").write_bytes(make_external_arm_bytes())
     trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses(
         "sites.s.plant", "as in --replace m"
     )

@@ -10,8 +10,8 @@ from typing import Any
 import msgpack
 import pytest
 
+from tests.log.builders import edit_log_bytes, make_log_bytes
 from tests.log.dealt import split
-from tests.log_editing import edited, recorded
 from tests.log_surgery import repacked, taken_apart
 from trilat_net.log.log_reader import open_log
 from trilat_net.presentation import page
@@ -27,7 +27,7 @@ COMMANDS = ("log check", "verify", "certify", "report", "log recover")
 
 
 def whole() -> bytes:
-    return recorded("free", RUN)
+    return make_log_bytes("free", RUN)
 
 
 def torn() -> bytes:
@@ -53,7 +53,7 @@ def sparse() -> bytes:
 def spliced() -> bytes:
     """Returns two runs over a gap, under the starts of the first."""
     first = taken_apart(whole()).without_chain()
-    other = taken_apart(recorded("free", {**RUN, "control.Kd": 3.5}))
+    other = taken_apart(make_log_bytes("free", {**RUN, "control.Kd": 3.5}))
     topics = first.topics()
     boots = {m.channel: m for m in first.messages if topics[m.channel].endswith("/state")}
     first.messages = [m for m in first.messages if m.channel not in boots or m.sequence < 1500]
@@ -65,7 +65,7 @@ def spliced() -> bytes:
 
 
 def older() -> bytes:
-    return edited(whole())
+    return edit_log_bytes(whole())
 
 
 def forged() -> bytes:
@@ -74,7 +74,7 @@ def forged() -> bytes:
     """
     claims = {"driver": "rerun", "rerun_executed": "s"}
     zeroed = {"tau": [0.0, 0.0]}
-    return edited(
+    return edit_log_bytes(
         whole(), record=lambda r: r if r["site"] == "s" else {**r, **zeroed}, session=claims
     )
 
@@ -86,7 +86,9 @@ def changed() -> bytes:
 
 
 def newer() -> bytes:
-    return edited(whole(), record=lambda r: {**r, "v": 9}, session={"schema_version": "9"})
+    return edit_log_bytes(
+        whole(), record=lambda r: {**r, "v": 9}, session={"schema_version": "9"}
+    )
 
 
 MADE: dict[str, Callable[[], bytes]] = {

@@ -9,7 +9,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import simulated, trilat
-from tests.execution.logs import without_records
+from tests.execution.builders import make_log_without
 from trilat_net.app.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
 from trilat_net.execution.fused import explain_not_repeatable
@@ -102,7 +102,7 @@ def test_a_forbidden_law_has_no_twin(folder: Path) -> None:
 
 
 def test_unexecutable_logs_have_no_twin() -> None:
-    lost, log = without_records({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
+    lost, log = make_log_without({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
     with pytest.raises(NotRepeatable, match="records of m1 are missing"):
         tn.twin(lost)
     with pytest.raises(

@@ -5,18 +5,16 @@ energy of x: the level is 0.125 J for 0.1, filling 40 for 50. The laws that acco
 their observed energies under delays that vary; drivers agree; verify.
 """
 
-import io
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.energy_runs import JITTER, LAWS, MOBILE, draw_energy_run, least_energy, pair, ticked
-from tests.log_editing import opened
+from tests.execution.builders import make_trajectories, sample_records
+from tests.log.builders import open_bytes, simulate_bytes
 from tests.unit_arm import H50, hand, unit_scenario
-from tests.virtual_runs import sampled, trajectories
 from trilat_net.analysis.judge import list_law_proofs
-from trilat_net.execution import virtual
 from trilat_net.execution.verification import verify
 from trilat_net.scenario.describe import describe_law_conditions
 
@@ -114,17 +112,14 @@ def test_drawn_runs_never_have_negative_energy(law: str, seeds: range) -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_compiled_and_stepped_runs_agree_and_verify(law: str) -> None:
     scenario = pair(LAWS[law], clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0})
-    run, last = trajectories(scenario), sampled(scenario, (1.6,))[:, -1]
+    run, last = make_trajectories(scenario), sample_records(scenario, (1.6,))[:, -1]
     for n, name in enumerate(scenario.names):
         columns, site = scenario.layout(name).columns(), run.sites[name]
         assert np.abs(site.tau[-1]).max() > 0.0
         for field in ("q", "qd", "tau", "tau_x", "ch"):
             assert last[n, columns[field]].tolist() == getattr(site, field)[-1].tolist()
-    stream = io.BytesIO()
-    virtual.write_virtual_log(
-        pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE), stream
-    )
-    verdict = verify(opened(stream.getvalue()))
+    scenario = pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE)
+    verdict = verify(open_bytes(simulate_bytes(scenario)))
     assert verdict.passed
     assert verdict.identical == verdict.records == 600
 

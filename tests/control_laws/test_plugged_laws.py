@@ -7,8 +7,8 @@ import pytest
 
 from tests.control_laws.law_settings import LAWS
 from tests.core.guarded_runs import RATE_NM_S, largest_step, ordered
-from tests.log_editing import opened, recorded
-from tests.virtual_runs import sampled, trajectories
+from tests.execution.builders import make_trajectories, sample_records
+from tests.log.builders import make_log
 from trilat_net.core.plug.compiled_law import is_compiled
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -41,8 +41,8 @@ def test_checking_scenarios_states_the_laws_condition(law: str) -> None:
 @pytest.mark.parametrize("law", LONG)
 def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = scenario(law)
-    ticks = trajectories(chosen)
-    fused = sampled(chosen, (0.12,))[:, 0]
+    ticks = make_trajectories(chosen)
+    fused = sample_records(chosen, (0.12,))[:, 0]
     names = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
     columns = chosen.layout(chosen.names[0]).columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
@@ -50,14 +50,14 @@ def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPat
     kind = chosen.sites[chosen.names[0]].control.kind
     if is_compiled(kind):  # others are in the kernel
         monkeypatch.setattr(kind, "is_compiled", False)
-        plain = trajectories(chosen)
+        plain = make_trajectories(chosen)
         for name in names:
             assert (plain.stack(name) == ticks.stack(name)).all()
 
 
 @pytest.mark.parametrize("law", LONG)
 def test_logs_of_plugged_laws_can_be_reexecuted(law: str) -> None:
-    log = opened(recorded(LAWS[law][0], overrides(law)))
+    log = make_log(LAWS[law][0], overrides(law))
     verdict = verify(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records

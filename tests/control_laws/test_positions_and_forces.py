@@ -1,14 +1,14 @@
 """The four- and the six-channel law against their loops in the frequency domain, and runs in time."""
 
 import csv
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.log_editing import opened
+from tests.execution.builders import make_trajectories
+from tests.log.builders import open_bytes, simulate_bytes
 from tests.transmission import (
     PAIR,
     TABLE,
@@ -18,12 +18,10 @@ from tests.transmission import (
     transmitted,
 )
 from tests.unit_arm import DRIVE, WALL, last_rows, two_sites, unit_scenario
-from tests.virtual_runs import trajectories
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.laws.six_channel import complementary_shares, complementary_weights
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -210,15 +208,16 @@ def test_shares_without_a_single_factor_are_reported() -> None:
 
 def test_two_sites_cannot_share_by_one_factor() -> None:
     with pytest.raises(ScenarioError, match="is for 3 sites"):
-        trajectories(unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01))
+        make_trajectories(
+            unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01)
+        )
 
 
 @pytest.mark.long
 def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     """`trilat metrics` of a log of 26 s: stretches of 4 s, driven at 1 Hz alone."""
-    stream = io.BytesIO()
-    write_virtual_log(two_sites("without qdd", 0.001, duration_s=26.0), stream)
-    responses = compute_log_metrics(opened(stream.getvalue())).responses
+    log = open_bytes(simulate_bytes(two_sites("without qdd", 0.001, duration_s=26.0)))
+    responses = compute_log_metrics(log).responses
     felt = next(
         response
         for response in responses

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.energy_runs import CONSTANT, JITTER, pair, ticked
+from tests.execution.builders import make_trajectories
 from tests.unit_arm import CLAMP, hand, unit_scenario
-from tests.virtual_runs import trajectories
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.wave import Wave
 from trilat_net.scenario import Scenario
@@ -259,7 +259,7 @@ def test_own_law_gives_the_same_last_digits(monkeypatch: pytest.MonkeyPatch) -> 
     """examples/wave_law.py."""
     monkeypatch.chdir(Path(__file__).parents[2] / "examples")
     ours, theirs = (
-        trajectories(
+        make_trajectories(
             pair(
                 {"law": law}, clamped=False, duration_s=1.3, link={**CONSTANT, "delay_ms": 50.0}
             )

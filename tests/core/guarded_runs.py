@@ -1,15 +1,14 @@
 """Two arms under the rule `glide`: their limits, orders at ticks, and the reasons in a log."""
 
 import functools
-import io
 from typing import Any
 
 import numpy as np
 
+from tests.log.builders import open_bytes, simulate_bytes
 from trilat_net.core.step.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
-from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
-from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import RESTING_MODES
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
@@ -86,10 +85,7 @@ def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 
         site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
         for site, of_site in orders.items()
     }
-    stream = io.BytesIO()
-    virtual.write_virtual_log(scenario, stream, commands=commands)
-    stream.seek(0)
-    return open_log(stream)
+    return open_bytes(simulate_bytes(scenario, commands=commands))
 
 
 def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
+from tests.core.builders import (
+    LINK_NAME,
+    SEEDS,
+    Ints,
+    compute_due_ns,
+    draw_delays_us,
+    make_channel,
+)
 from tests.core.philox_reference import philox_in_integers
 from trilat_net.core.links.delay import (
     MAX_DELAY_US,
@@ -162,7 +169,7 @@ def holds_its_moments(
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
 def test_mean_and_deviation_over_a_million_draws(link: LinkBase, law: Any, seed: int) -> None:  # noqa: ARG001
-    holds_its_moments(link, delays_us(link, seed, COUNT))
+    holds_its_moments(link, draw_delays_us(link, seed, COUNT))
 
 
 def test_a_uniform_delay_worked_out_by_hand() -> None:
@@ -171,7 +178,10 @@ def test_a_uniform_delay_worked_out_by_hand() -> None:
     draws = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
     units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in draws]
     expected = [math.floor(200_000 + 150_000 * (2 * u - 1) + 0.5) for u in units]
-    assert delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist() == expected
+    assert (
+        draw_delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist()
+        == expected
+    )
 
 
 @pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
@@ -181,7 +191,7 @@ def test_the_closed_forms_are_scipys(link: LinkBase, law: Any) -> None:
 
 @pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
 def test_the_distribution_is_the_stated_one(link: LinkBase, law: Any) -> None:
-    delays = delays_us(link, 5, 200_000)
+    delays = draw_delays_us(link, 5, 200_000)
     assert likely(delays, law)
     assert abs(np.corrcoef(delays[:-1], delays[1:])[0, 1]) < SIGMAS / math.sqrt(len(delays))
 
@@ -192,7 +202,7 @@ def test_correlated_delays_have_their_moments_and_correlations(
     link: CorrelatedDelay, seed: int
 ) -> None:
     """Variances of the estimates of an AR(1) sequence: Bartlett 1946."""
-    delays = delays_us(link, seed, COUNT)
+    delays = draw_delays_us(link, seed, COUNT)
     c = link.correlation
     holds_its_moments(link, delays, (1 + c) / (1 - c), (1 + c**2) / (1 - c**2))
     x = (delays - delays.mean()) / delays.std()
@@ -208,7 +218,7 @@ def test_correlated_delays_cut_at_zero_have_their_moments(seed: int) -> None:
     before the cut.
     """
     link = CorrelatedDelay(delay_ms=10, deviation_ms=15, correlation=0.8)
-    delays = delays_us(link, seed, COUNT)
+    delays = draw_delays_us(link, seed, COUNT)
     assert np.mean(delays == 0) == pytest.approx(stats.norm.cdf(-10 / 15), abs=0.01)
     holds_its_moments(link, delays, 1.8 / 0.2, 1.64 / 0.36)
 
@@ -228,8 +238,8 @@ def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms:
 def test_a_sine_over_whole_periods() -> None:
     """Its mean, its deviation and its values, without any randomness."""
     link = SineDelay(delay_ms=120, amplitude_ms=80, period_s=2.5, phase_rad=0.4)
-    delays = delays_us(link, 1, COUNT)
-    assert (delays == delays_us(link, 2, COUNT)).all()
+    delays = draw_delays_us(link, 1, COUNT)
+    assert (delays == draw_delays_us(link, 2, COUNT)).all()
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, abs=5e-4)
     assert delays.std() / 1e3 == pytest.approx(link.moments().deviation_ms, abs=5e-4)
     t_s = np.arange(COUNT) / 1000
@@ -245,7 +255,7 @@ ROWS = [(0.0, 10.0), (0.5, 40.25), (0.75, 0.0), (1.0, 7.5)]
 @pytest.mark.long
 def test_looped_traces_have_moments_of_one_pass() -> None:
     link = TraceDelay(trace=format_trace(ROWS), at_end="loop")
-    delays = delays_us(link, 1, 1250 * 800)
+    delays = draw_delays_us(link, 1, 1250 * 800)
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, rel=1e-12)
     assert delays.std() / 1e3 == pytest.approx(link.moments().deviation_ms, rel=1e-12)
 
@@ -262,7 +272,7 @@ def test_a_trace_holds_its_last_points_delay(
     t_us = np.cumsum([0, *gaps_us])
     # others around it
     points = np.array([(7, 7), *zip(t_us, delays, strict=False), (9, 9)], dtype=np.int64)
-    rows = np.zeros(1, dtype=channel([LinkModel()]).models.dtype)
+    rows = np.zeros(1, dtype=make_channel([LinkModel()]).models.dtype)
     rows[0] = tuple(
         LinkModel(kind=DelayKind.TRACE, at_end=at_end, trace_first=1, trace_count=len(t_us))
     )
@@ -276,7 +286,9 @@ def test_a_trace_holds_its_last_points_delay(
 def test_a_trace_may_lose_samples() -> None:
     link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
     points = parse_trace(link.trace)
-    due_ns = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
+    due_ns = compute_due_ns(
+        make_channel([link.to_core_model()._replace(trace_count=3)], points=points), 8
+    )
     assert due_ns.tolist() == [
         5_000_000,
         6_000_000,

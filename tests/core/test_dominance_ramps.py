@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.core.sites import setup, stepped
+from tests.core.builders import make_site_setup, step_site
 from trilat_net.core.links.dominance import apply_ramps, fold_ramps
 from trilat_net.core.links.link import link_dtype
 from trilat_net.core.step.site_setup import LinkSetup
@@ -109,7 +109,7 @@ def test_the_derivative_is_the_finite_difference(first: Row, ramps: Ramps, t_ns:
 def site(ramps: tuple[DominanceRamp, ...] = ()) -> Site:
     """Returns a site that follows a peer at rest at (1, -1) and one that moves at (0.5, 0) rad/s."""
     links = (LinkSetup("a", 0.9, 1000, (1.0, -1.0)), LinkSetup("b", 0.1, 1000, (0.0, 0.0)))
-    return Site(setup()._replace(links=links, ramps=ramps))
+    return Site(make_site_setup()._replace(links=links, ramps=ramps))
 
 
 def moving(k: int) -> Arrival:
@@ -117,7 +117,7 @@ def moving(k: int) -> Arrival:
 
 
 def run_site(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
-    return stepped(
+    return step_site(
         made, [TickInput(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)]
     )
 

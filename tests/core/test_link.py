@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.core.sites import one_link, sample, stepped
-from tests.virtual_runs import run
+from tests.core.builders import make_arrival, make_site_with_delay, step_site
+from tests.execution.builders import make_shipped_trajectories
 from trilat_net.core.links.link import calendar_pages
 from trilat_net.core.step.ticks import TickInput
 
@@ -55,7 +55,9 @@ class SampleList:
 def test_samples_are_released_when_due_after_stamp(
     rate_hz: int, peer_rate_hz: int, delay_us: int, tick: int
 ) -> None:
-    released = one_link(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(0, tick)
+    released = make_site_with_delay(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(
+        0, tick
+    )
     assert released is not None
     model = SampleList(rate_hz, peer_rate_hz, delay_us * 1000)
     assert model.due(tick, released)
@@ -63,9 +65,13 @@ def test_samples_are_released_when_due_after_stamp(
 
 
 def test_no_delay_means_one_period() -> None:
-    site = one_link(1000, 1000, 0)
-    outputs = stepped(
-        site, [TickInput(0), *(TickInput(k, [sample(k - 1), sample(k)]) for k in range(1, 6))]
+    site = make_site_with_delay(1000, 1000, 0)
+    outputs = step_site(
+        site,
+        [
+            TickInput(0),
+            *(TickInput(k, [make_arrival(k - 1), make_arrival(k)]) for k in range(1, 6)),
+        ],
     )
     assert [o.used for o in outputs] == [[-1], [0], [1], [2], [3], [4]]
 
@@ -81,18 +87,18 @@ def test_the_newest_due_sample_is_in_use(
 ) -> None:
     """Any order, late samples, duplicates, and stamps of the future, all against the list."""
     rates_and_delay = (rate_hz, peer_rate_hz, delay_us * 1000)
-    site, model = one_link(*rates_and_delay), SampleList(*rates_and_delay)
+    site, model = make_site_with_delay(*rates_and_delay), SampleList(*rates_and_delay)
     arrivals = st.lists(st.integers(-1, 40), max_size=6)
     for k in range(25):
         arrival_list = data.draw(arrivals)
         for tick in arrival_list:
             model.take(k, tick)
-        output = site.step(TickInput(k, [sample(tick) for tick in arrival_list]))
+        output = site.step(TickInput(k, [make_arrival(tick) for tick in arrival_list]))
         used = model.used(k)
         assert output.used == [used]
         if used >= 0:
-            assert output.q_des == list(sample(used).q)
-            assert output.qd_des == list(sample(used).qd)
+            assert output.q_des == list(make_arrival(used).q)
+            assert output.qd_des == list(make_arrival(used).qd)
     counts = site.counts()[0]
     assert (counts.accepted, counts.late) == (model.accepted, model.late)
     assert (counts.duplicate, counts.refused) == (model.duplicate, model.refused)
@@ -100,9 +106,9 @@ def test_the_newest_due_sample_is_in_use(
 
 @pytest.mark.parametrize("peer_rate_hz", [1, 1000, 20_000])
 def test_stamps_ten_seconds_ahead_are_refused(peer_rate_hz: int) -> None:
-    site = one_link(1000, peer_rate_hz, 0)
+    site = make_site_with_delay(1000, peer_rate_hz, 0)
     limit = 10 * peer_rate_hz
-    site.step(TickInput(0, [sample(limit), sample(limit + 1)]))
+    site.step(TickInput(0, [make_arrival(limit), make_arrival(limit + 1)]))
     assert site.counts()[0].refused == 1
 
 
@@ -115,9 +121,9 @@ def test_calendars_have_pages_for_all_waiting_samples(rate_hz: int) -> None:
 
 
 def test_early_samples_leave_nearer_ones_alone() -> None:
-    site = one_link(1000, 1000, 10_000_000_000)
-    first = [sample(m) for m in range(0, 10_001, 50)]
-    outputs = stepped(site, [TickInput(0, first), *(TickInput(k) for k in range(1, 20_001))])
+    site = make_site_with_delay(1000, 1000, 10_000_000_000)
+    first = [make_arrival(m) for m in range(0, 10_001, 50)]
+    outputs = step_site(site, [TickInput(0, first), *(TickInput(k) for k in range(1, 20_001))])
     assert [o.used[0] for o in outputs] == [
         -1 if k < 10_000 else 50 * ((k - 10_000) // 50) for k in range(20_001)
     ]
@@ -128,7 +134,7 @@ def test_early_samples_leave_nearer_ones_alone() -> None:
 
 def bookkeeping_holds(delay_ms: float) -> bool:
     """Asserts that the record of tick k used tick k - 200 of each peer, and that peer's state, exactly."""
-    records = run("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
+    records = make_shipped_trajectories("paper", {"link.delay_ms": delay_ms, "duration_s": 2.0})
     expected = np.maximum(np.arange(2000) - 200, -1)
     for name, site in records.sites.items():
         peers = [records.sites[p] for p in records.scenario.peers(name)]
@@ -152,7 +158,7 @@ def test_the_check_fails_for_one_tick_less(delay_ms: float) -> None:
 
 
 def test_each_link_of_asymmetric_has_its_own_delay() -> None:
-    records = run("asymmetric", {"duration_s": 1.0})
+    records = make_shipped_trajectories("asymmetric", {"duration_s": 1.0})
     for name, site in records.sites.items():
         for j, peer in enumerate(records.scenario.peers(name)):
             slip = round(records.scenario.links[f"{peer}->{name}"].delay_ms)
@@ -163,7 +169,7 @@ def test_each_link_of_asymmetric_has_its_own_delay() -> None:
 
 
 def test_a_peer_first_rests_at_its_start() -> None:
-    records = run("free", {"duration_s": 1.0})
+    records = make_shipped_trajectories("free", {"duration_s": 1.0})
     starts = {name: np.array(spec.q0_rad) for name, spec in records.scenario.sites.items()}
     for name, site in records.sites.items():
         a, b = (starts[p] for p in records.scenario.peers(name))

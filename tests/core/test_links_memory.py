@@ -6,10 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.chains import six_joints
-from tests.core.kinds import KINDS
-from tests.core.sites import linked, one_link, sample, stepped
-from tests.task_arms import planar_task
+from tests.core.builders import (
+    KINDS,
+    make_arrival,
+    make_site_with_delay,
+    make_site_with_link,
+    step_site,
+)
+from tests.scenario.builders import planar_task_text, six_joint_text
 from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.links.link import AHEAD_LIMIT_S, calendar_pages
 from trilat_net.core.step.site_arrays import (
@@ -40,8 +44,8 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "gamma": ("paper", {"link.model": "gamma", "link.deviation_ms": 20.0}),
     "normal": ("paper", {"link.model": "normal", "link.deviation_ms": 20.0}),
     "uniform": ("paper", {"link.model": "uniform", "link.half_width_ms": 50.0}),
-    "six joints": (six_joints(1.0), {}),
-    "a place": (planar_task(1.0), {}),
+    "six joints": (six_joint_text(1.0), {}),
+    "a place": (planar_task_text(1.0), {}),
     "a law that sends": ("paper", {"control.law": "tests.channel_law:Talking"}),
 }
 
@@ -84,8 +88,8 @@ ORDERS = st.one_of(
 def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataObject) -> None:
     """Senders up to ten seconds ahead and late by as much, out of order and twice, delays that change."""
     grown, widest = (
-        linked(*rates, [LinkModel(location=1_000.0)]),
-        linked(*rates, [LinkModel(location=1_000.0)]),
+        make_site_with_link(*rates, [LinkModel(location=1_000.0)]),
+        make_site_with_link(*rates, [LinkModel(location=1_000.0)]),
     )
     widest = wide(widest, calendar_pages(rates[0]))
     first = grown._arrays.calendars.shape[1]
@@ -103,10 +107,10 @@ def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataOb
         if model is not None:
             from_ns = (now + rates[0] // 10) * 10**9 // rates[0]
             orders = [CoreChange("order", 0, model._replace(from_ns=from_ns))]
-        tick = TickInput(now, [sample(max(own_tick + m, 0)) for m in ahead], orders)
+        tick = TickInput(now, [make_arrival(max(own_tick + m, 0)) for m in ahead], orders)
         assert grown.step(tick) == widest.step(tick)
         idly = [TickInput(now + n) for n in range(1, idle)]
-        assert stepped(grown, idly) == stepped(widest, idly)
+        assert step_site(grown, idly) == step_site(widest, idly)
         assert grown.counts() == widest.counts()
         now += idle
     assert first <= grown._arrays.calendars.shape[1] <= calendar_pages(rates[0])
@@ -114,13 +118,13 @@ def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataOb
 
 def test_growing_delays_lose_no_sample() -> None:
     """From 1 ms to ten seconds: every sent sample comes into use when it is due."""
-    site = one_link(1000, 1000, 1_000_000)
+    site = make_site_with_delay(1000, 1000, 1_000_000)
     order = CoreChange("longer", 0, LinkModel(from_ns=1_000_000_000, location=9_999_000.0))
     ticks = (
-        TickInput(k, [sample(k - 1)] if k else [], [order] if k == 800 else [])
+        TickInput(k, [make_arrival(k - 1)] if k else [], [order] if k == 800 else [])
         for k in range(13_000)
     )
-    used = [record.used[0] for record in stepped(site, ticks)]
+    used = [record.used[0] for record in step_site(site, ticks)]
     assert used[1000:10_999] == [999] * 9999
     assert used[10_999:] == list(range(1000, 3001))
     assert site.counts()[0].lost == site.counts()[0].refused == 0
@@ -135,11 +139,13 @@ def test_samples_on_their_way_survive_the_widening() -> None:
     small, large = Site(setups[0]), wide(Site(setups[1]), 1 << 15)
     for k in range(400):
         arrivals = [
-            sample(k - 1, peer)._replace(tau_x=(0.1 * k, 0.0), ch=(0.1 * k + peer, 1.0, 2.0))
+            make_arrival(k - 1, peer)._replace(
+                tau_x=(0.1 * k, 0.0), ch=(0.1 * k + peer, 1.0, 2.0)
+            )
             for peer in (0, 1)
         ]
         if k == 50:
-            arrivals.append(sample(5000)._replace(tau_x=(9.0, 9.0), ch=(1.0, 2.0, 3.0)))
+            arrivals.append(make_arrival(5000)._replace(tau_x=(9.0, 9.0), ch=(1.0, 2.0, 3.0)))
         tick = TickInput(k, arrivals if k else [])
         assert small.step(tick) == large.step(tick)
     assert small._arrays.calendars.shape[1] == 8192
@@ -194,13 +200,16 @@ def test_limited_links_count_what_they_refuse() -> None:
     """A site with less memory refuses stamps from further ahead; all others come into use."""
     setup = load_scenario("paper").setup("m1")
     assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
-    free, tight = one_link(1000, 1000, 1_000_000), one_link(1000, 1000, 1_000_000)
+    free, tight = (
+        make_site_with_delay(1000, 1000, 1_000_000),
+        make_site_with_delay(1000, 1000, 1_000_000),
+    )
     tight._sizer.most_pages = 1024
-    ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
+    ahead = TickInput(0, [make_arrival(m) for m in (0, 500, 900, 1100, 5000)])
     for site in (free, tight):
         used = [
             record.used[0]
-            for record in stepped(site, [ahead, *(TickInput(k) for k in range(1, 1000))])
+            for record in step_site(site, [ahead, *(TickInput(k) for k in range(1, 1000))])
         ]
         assert used[-1] == 900
     assert free.counts()[0].refused == 0

@@ -8,7 +8,7 @@ import pytest
 
 import trilat_net
 from tests.core.guarded_runs import reasons
-from tests.virtual_runs import sampled, trajectories
+from tests.execution.builders import make_trajectories, sample_records
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
@@ -82,7 +82,7 @@ def test_degraded_runs_verify_and_close_their_energies() -> None:
     assert verify(log).identical == 18_000
     assert compare_with_virtual(log).fed.identical == 18_000
     plan = scenario("m1->s", "m1->m2")
-    ticks, fused = trajectories(plan), sampled(plan, (6.0,))[:, 0]
+    ticks, fused = make_trajectories(plan), sample_records(plan, (6.0,))[:, 0]
     columns = plan.layout("s").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(

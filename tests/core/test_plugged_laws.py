@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net
+from tests.execution.builders import run_fused
 from trilat_net.core.plug.law_channel import LawChannel, SentVector, join_received
 from trilat_net.core.plug.user_law import LawVector
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 
 ROOT = Path(__file__).parents[2]
@@ -292,8 +292,7 @@ def test_chain_laws_have_equal_bits_everywhere() -> None:
     a, b = (run_by_hand(scenario, 30) for scenario in scenarios)
     assert a == b
     for scenario in scenarios:
-        fused = FusedRun(scenario)
-        fused.advance_to(0.03)
+        fused = run_fused(scenario, 0.03)
         for name, row in zip(scenario.names, fused.records, strict=True):
             fields = scenario.layout(name).columns()
             assert row.tolist() == [

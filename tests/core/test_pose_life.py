@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 import trilat_net
+from tests.core.builders import POSE, make_task_arrays
 from tests.core.guarded_runs import largest_step, ordered
-from tests.core.task_sites import POSE, build
-from tests.task_arms import posed_arms
+from tests.scenario.builders import posed_task_text
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
@@ -38,7 +38,7 @@ def drive(
     In other ticks their reference stays constant, as a sample in use does. The arm stands at
     its reference, and comes to rest within 0.1 s.
     """
-    arrays = build(POSE)
+    arrays = make_task_arrays(POSE)
     s: Row = arrays.site[0]
     link: Row = arrays.links[0]
     s.on_stale, s.stale_ns, s.align_speed, s.align_limit = (
@@ -130,7 +130,7 @@ def test_silent_peers_never_make_orientations_jump() -> None:
 @pytest.mark.long
 def test_limits_on_turns_are_never_bypassed() -> None:
     """1.8 rad about an axis askew, of which no coordinate is above 1.1 rad."""
-    arrays = build(POSE)
+    arrays = make_task_arrays(POSE)
     s: Row = arrays.site[0]
     link: Row = arrays.links[0]
     s.on_stale, s.stale_ns, s.align_speed, s.align_limit = (
@@ -159,7 +159,7 @@ outages_s = [[2.0, 4.0]]"""
 @functools.cache
 def posed() -> Log:
     """Returns three arms that agree on a pose; no site hears another from 2.04 to 4.04 s."""
-    text = posed_arms(5.0).replace("[link]", GLIDES)
+    text = posed_task_text(5.0).replace("[link]", GLIDES)
     far = "posture_rad = [1.2, -0.3, -0.9, -1.6, -0.3, 1.4, 0.25] }"
     text = text.replace(
         "posture_rate_1_s = 0.6, scale = 1.1 }", f"posture_rate_1_s = 0.6, {far}"
@@ -193,7 +193,7 @@ def test_held_arms_return_from_free_motion() -> None:
     """In the motion in which its end effector stays, the arm returns at 3/s, less the damping
     of its law.
     """
-    text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
+    text = posed_task_text(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
     text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
     text = text.replace("Gamma = 1.0\n", "").replace(
         "posture_rate_1_s = 0.6", "posture_rate_1_s = 0.0"
@@ -255,7 +255,7 @@ def test_energies_close_over_a_task_space_hold() -> None:
 
 @pytest.mark.long
 def test_equal_arms_stop_and_return_smoothly() -> None:
-    text = posed_arms(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
+    text = posed_task_text(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
     scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
     orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}
     log = ordered(scenario, orders)

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.chains import robot_files
 from tests.core.chain_references import (
     Arm,
     Array,
@@ -22,6 +21,7 @@ from tests.core.chain_references import (
     to_chain,
     torque_for,
 )
+from tests.scenario.builders import find_robot_files
 from trilat_net.core.arms.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
@@ -163,7 +163,7 @@ def read_robot(file: str) -> str:
     """Returns the text of a file; a joint with the name of a link is renamed, as Pinocchio has
     one list of frames.
     """
-    root = ElementTree.parse(robot_files()[file]).getroot()
+    root = ElementTree.parse(find_robot_files()[file]).getroot()
     links = {link.get("name") for link in root.findall("link")}
     for joint in root.findall("joint"):
         for element, key in (
@@ -185,7 +185,7 @@ def parsed_model(text: str, chain: UrdfChain) -> pin.Model:
 
 def test_every_file_is_in_the_list() -> None:
     listed = {file for file, *_ in parse_chains()} | REFUSED.keys() | NO_CHAIN_OF_TWO
-    assert listed == robot_files().keys()
+    assert listed == find_robot_files().keys()
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_every_file_is_in_the_list() -> None:
 )
 def test_files_without_chain_are_refused(file: str, tip: str, reason: str) -> None:
     with pytest.raises(ScenarioError) as caught:
-        read_urdf(robot_files()[file].read_text(), tip=tip)
+        read_urdf(find_robot_files()[file].read_text(), tip=tip)
     assert reason in str(caught.value)
 
 

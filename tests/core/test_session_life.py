@@ -9,7 +9,7 @@ import pytest
 
 import trilat_net
 from tests.core.guarded_runs import TEXT
-from tests.virtual_runs import sampled, trajectories
+from tests.execution.builders import make_trajectories, sample_records
 from trilat_net.core.life.session_life import MIN_ALIGN_NS
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import (
@@ -108,7 +108,7 @@ def test_sites_beyond_their_limit_wait_and_say_so() -> None:
 
 def test_every_driver_gives_the_same_bits() -> None:
     scenario = glide(3.0)
-    ticks, fused = trajectories(scenario), sampled(scenario, (3.0,))[:, 0]
+    ticks, fused = make_trajectories(scenario), sample_records(scenario, (3.0,))[:, 0]
     columns = scenario.layout("m").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(

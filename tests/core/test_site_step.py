@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.core.builders import VECTORS, describe_bits, make_arrival, make_site_setup, step_site
 from tests.core.compiled import run_program
-from tests.core.sites import VECTORS, bits, sample, setup, stepped
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
@@ -40,8 +40,12 @@ arrivals = st.lists(
 )
 def test_equal_ticks_give_equal_bits(came: list[list[Arrival]], scheme: str) -> None:
     ticks = [TickInput(k, c) for k, c in enumerate(came)]
-    one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
-    assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
+    one, other = (
+        Site(make_site_setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2)
+    )
+    assert [describe_bits(o) for o in step_site(one, ticks)] == [
+        describe_bits(o) for o in step_site(other, ticks)
+    ]
 
 
 def test_records_hold_their_ticks_state_and_inputs() -> None:
@@ -51,11 +55,13 @@ def test_records_hold_their_ticks_state_and_inputs() -> None:
     (8).
     """
     site = Site(
-        setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4])
+        make_site_setup(
+            "m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4]
+        )
     )
     first = site.step(TickInput(0))
     assert (first.q, first.qd, first.t_ns) == ([0.3, -0.1], [0.2, 0.4], 0)
-    outputs = stepped(site, [TickInput(k) for k in range(1, 3501)])
+    outputs = step_site(site, [TickInput(k) for k in range(1, 3501)])
     assert outputs[-1].tau_x == pytest.approx([-10.0, -10.0])
     assert outputs[10].tau_x == [0.0, 0.0]
     assert "-" not in str(outputs[10].tau_x)
@@ -80,18 +86,23 @@ def test_uncompiled_runs_have_the_same_bits() -> None:
 @pytest.mark.parametrize("k", [1, 2, 21, 150])
 def test_two_records_resume_the_same_bits(scheme: str, k: int) -> None:
     """Every record is a key-frame: records k-2 and k-1 and the waiting samples of the links."""
-    built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
+    built = make_site_setup("m1", "free", scheme=scheme, link__delay_ms=20)
     ticks = [
-        TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)
+        TickInput(n, [make_arrival(n - 1, peer) for peer in (0, 1)] if n else [])
+        for n in range(200)
     ]
-    whole = stepped(Site(built), ticks)
+    whole = step_site(Site(built), ticks)
     site = Site(built)
     before, last = whole[max(0, k - 2)], whole[k - 1]
-    in_use = [sample(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
-    waiting = [sample(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)]
+    in_use = [make_arrival(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
+    waiting = [
+        make_arrival(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)
+    ]
     site.restore_links(k, in_use, waiting)
     site.restore_state(before, last)
-    assert [bits(o) for o in stepped(site, ticks[k:])] == [bits(o) for o in whole[k:]]
+    assert [describe_bits(o) for o in step_site(site, ticks[k:])] == [
+        describe_bits(o) for o in whole[k:]
+    ]
 
 
 @pytest.mark.parametrize("name", ["asymmetric", "paper", "two_sites"])
@@ -139,15 +150,15 @@ def test_no_code_depends_on_three_sites() -> None:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 def test_the_torque_limit_is_applied(scheme: str) -> None:
-    site = Site(setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
-    torques = [o.tau for o in stepped(site, [TickInput(k) for k in range(400)])]
+    site = Site(make_site_setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
+    torques = [o.tau for o in step_site(site, [TickInput(k) for k in range(400)])]
     assert max(abs(t) for tau in torques for t in tau) == 2.0
     assert site.step(TickInput(400)).mode is Mode.RUN
 
 
 def test_sites_beyond_their_speed_limit_diverge_once() -> None:
-    site = Site(setup("m1", "free", limits__qd_limit_rad_s=0.5))
-    outputs = stepped(site, [TickInput(k) for k in range(400)])
+    site = Site(make_site_setup("m1", "free", limits__qd_limit_rad_s=0.5))
+    outputs = step_site(site, [TickInput(k) for k in range(400)])
     k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert max(map(abs, outputs[k].qd)) > 0.5 >= max(map(abs, outputs[k - 1].qd))
     assert all(
@@ -176,7 +187,9 @@ def test_no_record_is_ever_infinite(
     came: list[tuple[float, float, float, float]], Lambda: float, scheme: str
 ) -> None:
     """For any finite numbers of a peer, and any gains."""
-    site = Site(setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0))
+    site = Site(
+        make_site_setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0)
+    )
     for k, numbers in enumerate([None, *came, None, None]):
         numbers_of_tick = (
             [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
@@ -206,10 +219,10 @@ def test_absurd_scenarios_are_refused_or_stop_finite(key: str, scheme: str) -> N
 
 
 def test_too_many_arrivals_in_a_tick_are_refused() -> None:
-    site = Site(setup())
-    site.step(TickInput(0, [sample(n) for n in range(MAX_ARRIVALS)]))
+    site = Site(make_site_setup())
+    site.step(TickInput(0, [make_arrival(n) for n in range(MAX_ARRIVALS)]))
     with pytest.raises(ValueError, match="4096"):
-        site.step(TickInput(1, [sample(n) for n in range(MAX_ARRIVALS + 1)]))
+        site.step(TickInput(1, [make_arrival(n) for n in range(MAX_ARRIVALS + 1)]))
 
 
 def test_arrival_checksums_cover_their_bytes() -> None:
@@ -222,4 +235,6 @@ def test_arrival_checksums_cover_their_bytes() -> None:
     packed = b"".join(
         struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in arrivals_made
     )
-    assert Site(setup()).step(TickInput(0, arrivals_made)).rx_crc == zlib.crc32(packed)
+    assert Site(make_site_setup()).step(TickInput(0, arrivals_made)).rx_crc == zlib.crc32(
+        packed
+    )

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.sites import setup, stepped
-from tests.virtual_runs import trajectories
+from tests.core.builders import make_site_setup, step_site
+from tests.execution.builders import make_trajectories
 from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.step.site_setup import LinkSetup, StaleAction, StaleRule
 from trilat_net.core.step.site_step import Site
@@ -27,7 +27,9 @@ def site(
         LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(LinkModel(location=5_000.0),))
         for n, (name, share) in enumerate(zip("ab", shares, strict=True))
     )
-    return Site(setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s))
+    return Site(
+        make_site_setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s)
+    )
 
 
 def peer_state(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -50,7 +52,7 @@ def cut_ticks(count: int = 200) -> list[TickInput]:
 
 def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
     """Returns the records of a site during that cut."""
-    return stepped(site(rule), cut_ticks(count))
+    return step_site(site(rule), cut_ticks(count))
 
 
 def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
@@ -100,7 +102,7 @@ def test_staleness_during_a_return_is_held() -> None:
         )
         for k in range(200)
     ]
-    outputs = stepped(site(RULE._replace(return_ns=50 * MS)), ticks)
+    outputs = step_site(site(RULE._replace(return_ns=50 * MS)), ticks)
     assert runs_of(outputs) == [
         (Mode.RUN, 0),
         (Mode.HOLD, 70),
@@ -112,21 +114,21 @@ def test_staleness_during_a_return_is_held() -> None:
 
 
 def test_an_unheard_peer_has_the_runs_age() -> None:
-    outputs = stepped(site(RULE), [TickInput(k) for k in range(40)])
+    outputs = step_site(site(RULE), [TickInput(k) for k in range(40)])
     assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
 
 
 def test_peers_without_share_may_be_stale() -> None:
     ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
-    assert runs_of(stepped(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
-    assert runs_of(stepped(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
+    assert runs_of(step_site(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
+    assert runs_of(step_site(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
 
 
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     """A diverged record holds no reference."""
     stale_site = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
-    outputs = stepped(
+    outputs = step_site(
         stale_site,
         [
             TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else [])
@@ -231,7 +233,7 @@ def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
     ]
     stale_site.restore_links(k, in_use, [moving(j, m) for j, m in heard])
     stale_site.restore_state(whole[k - 2], last)
-    assert stepped(stale_site, cut_ticks()[k:]) == whole[k:]
+    assert step_site(stale_site, cut_ticks()[k:]) == whole[k:]
 
 
 # What it is good for.
@@ -242,7 +244,7 @@ def test_ramped_returns_remove_kicks_after_outages() -> None:
     """Scenario `outage`: the slave is cut off while its master moves, and all samples arrive at once."""
 
     def kick(action: str) -> float:
-        runs_made = trajectories(load_scenario("outage", {"on_stale.action": action}))
+        runs_made = make_trajectories(load_scenario("outage", {"on_stale.action": action}))
         healed = runs_made.sites["s"].t_s >= runs_made.scenario.links["m1->s"].outages_s[0][1]
         return float(np.abs(runs_made.sites["s"].qd[healed]).max())
 

@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.core.task_sites import PLACE, POSE, build
+from tests.core.builders import PLACE, POSE, make_task_arrays
 from trilat_net.core.arms.chain import place_joints
 from trilat_net.core.arms.rotation import (
     angular_velocity,
@@ -39,7 +39,7 @@ def place_row(arrays: SiteArrays, q: Array, qd: Array) -> Row:
 
 def draw(seed: int) -> tuple[SiteArrays, Array, Array]:
     rng = np.random.default_rng(seed)
-    arrays = build(POSE if seed % 2 else PLACE)
+    arrays = make_task_arrays(POSE if seed % 2 else PLACE)
     q = arrays.site[0].q + rng.normal(0.0, 0.2, 7)
     return arrays, q, rng.normal(0.0, 0.5, 7)
 
@@ -111,7 +111,7 @@ def test_reference_acceleration_differentiates_reference_velocity(
     task: TaskSetup,
 ) -> None:
     """Along a motion whose reference stands still: v shortly before and after, and a between them."""
-    arrays = build(task)
+    arrays = make_task_arrays(task)
     q, h = np.array(arrays.site[0].q), 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
     x = np.array(place_row(arrays, q, qd).x)
@@ -130,8 +130,8 @@ def test_reference_acceleration_differentiates_reference_velocity(
 
 
 def test_damping_begins_below_its_singular_value() -> None:
-    arrays = build(PLACE._replace(singular_value=1e-6))
-    straight = build(PLACE._replace(singular_value=0.5))
+    arrays = make_task_arrays(PLACE._replace(singular_value=1e-6))
+    straight = make_task_arrays(PLACE._replace(singular_value=0.5))
     q, qd = np.array(arrays.site[0].q), np.zeros(7)
     for one, damped in ((arrays, False), (straight, True)):
         s = place_row(one, q, qd)
@@ -154,7 +154,7 @@ def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
 
 
 def test_free_axes_get_no_torque() -> None:
-    arrays = build(PLACE._replace(axes=(1.0, 0.0, 1.0)))
+    arrays = make_task_arrays(PLACE._replace(axes=(1.0, 0.0, 1.0)))
     s = place_row(arrays, np.array(arrays.site[0].q), np.zeros(7))
     s.q_des = np.array(s.x) + np.array([0.0, 0.3, 0.0])
     update_task_errors(s)

@@ -1,12 +1,11 @@
 """Runs over a network that scatters samples: early, late, out of order, twice, or never."""
 
-import io
 import itertools
 from collections.abc import Collection, Mapping
 
 from hypothesis import strategies as st
 
-from trilat_net.execution import virtual
+from tests.log.builders import simulate_bytes
 from trilat_net.execution.virtual_network import RecordedNetwork
 from trilat_net.scenario import load_scenario
 
@@ -51,6 +50,4 @@ def delivered(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> by
         if (receiver, peer, tick) not in lost:
             arrives = tick + delays.get((receiver, peer, tick), 1)
             at[receiver].setdefault(arrives, []).append([peer, tick, 0])
-    stream = io.BytesIO()
-    virtual.write_virtual_log(SCENARIO, stream, RecordedNetwork(at, PEERS))
-    return stream.getvalue()
+    return simulate_bytes(SCENARIO, RecordedNetwork(at, PEERS))

@@ -9,9 +9,15 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from tests.execution.builders import make_log_without
 from tests.execution.deliveries import SITES, TICKS, delivered
-from tests.execution.logs import without_records
-from tests.log_editing import edited, opened, recorded, without
+from tests.log.builders import (
+    drop_records,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    open_bytes,
+)
 from tests.log_surgery import Pieces, Stored, repacked, taken_apart
 from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
@@ -41,7 +47,7 @@ def pieces(*, chained: bool, other: bool = False) -> Pieces:
 def is_refused(data: bytes, *, chained: bool) -> bool:
     """True if a log does not pass as whole and identical; a log with a chain, by the chain alone."""
     try:
-        log = opened(data)
+        log = open_bytes(data)
         if chained:
             return not judge_integrity(log).passed
         return not LogCheckReport.of_log(log, virtual=False).passed
@@ -51,10 +57,10 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
 
 def test_rewriting_without_changes_keeps_the_file() -> None:
     assert taken_apart(run()).bytes() == run()
-    log = opened(run())
+    log = open_bytes(run())
     assert judge_integrity(log).state is DigestState.INTACT
     assert LogCheckReport.of_log(log, virtual=True).passed
-    old = opened(pieces(chained=False).bytes())
+    old = open_bytes(pieces(chained=False).bytes())
     assert judge_integrity(old).state is DigestState.ABSENT
     assert LogCheckReport.of_log(old, virtual=True).passed
 
@@ -208,13 +214,13 @@ def test_two_runs_over_a_gap_are_refused() -> None:
         m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
     ]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
-    integrity = judge_integrity(opened(taken.bytes()))
+    integrity = judge_integrity(open_bytes(taken.bytes()))
     assert integrity.state is DigestState.CHANGED
     assert "were removed or added" in integrity.text
 
 
 def test_sparse_logs_fail_with_the_judged_share() -> None:
-    log = without_records({"m1": range(2, 100)})
+    log = make_log_without({"m1": range(2, 100)})
     verdict = verify(log)
     assert verdict.agreed
     assert not verdict.passed
@@ -226,16 +232,17 @@ def test_sparse_logs_fail_with_the_judged_share() -> None:
 
 
 def test_torn_logs_pass_no_more_than_asked() -> None:
-    data = edited(recorded("paper"), chunk_bytes=2048)
-    log = opened(data[: len(data) // 2])
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
+    log = open_bytes(data[: len(data) // 2])
     assert not verify(log).passed
     share = verify(log).coverage.share
     assert 0.1 < share < 0.9
     assert verify(log, min_coverage=share).passed
     assert not verify(log, min_coverage=share + 1e-6).passed
-    whole = recorded("paper")
+    whole = make_log_bytes("paper")
     assert (
-        judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is DigestState.OPEN
+        judge_integrity(open_bytes(whole[: whole.index(b"trilat.chain")])).state
+        is DigestState.OPEN
     )
 
 
@@ -244,9 +251,9 @@ def test_foreign_records_are_found_without_execution() -> None:
 
     def record(r: dict) -> dict | None:
         changed = {**r, "boot": 1} if (r["site"], r["tick"]) == ("s", 45) else r
-        return without("s", {43, 44})(changed)
+        return drop_records("s", {43, 44})(changed)
 
-    first = verify(opened(edited(recorded("paper"), record=record))).first
+    first = verify(open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))).first
     assert first is not None
     assert first[:3] == ("s", 45, "boot")
 
@@ -256,29 +263,29 @@ def test_a_claimed_rerun_is_executed_whole() -> None:
         return r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}
 
     claims = {"rerun_executed": "s", "rerun_mode": "open loop"}
-    data = edited(recorded("paper"), record=zeroed, session=claims)
-    assert not verify(opened(data)).agreed
-    worse = verify(opened(edited(data, session={**claims, "driver": "rerun"})))
+    data = edit_log_bytes(make_log_bytes("paper"), record=zeroed, session=claims)
+    assert not verify(open_bytes(data)).agreed
+    worse = verify(open_bytes(edit_log_bytes(data, session={**claims, "driver": "rerun"})))
     assert worse.agreed  # its m1 and m2 met samples that are not in it
     assert worse.coverage.share == 0.0
     assert not worse.passed
 
 
 def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(recorded("free"))
+    (tmp_path / "run.mcap").write_bytes(make_log_bytes("free"))
     log_path = tmp_path / "again.mcap"
     rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(log_path)
     verdict = verify(open_log(log_path))
     assert verdict.passed
     assert verdict.identical == 3 * TICKS
-    forged = edited(
+    forged = edit_log_bytes(
         log_path.read_bytes(),
         record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r,
     )
     log_path.write_bytes(forged)
     assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
-    (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")
+    (tmp_path / "run.mcap").write_bytes(make_log_bytes("free") + b"x")
     alone = LogCheckReport.of_log(open_log(log_path), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)
@@ -286,7 +293,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
 
 def test_lost_samples_excuse_virtual_time_afterwards() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
-    log = opened(delivered({}, lost))
+    log = open_bytes(delivered({}, lost))
     report = LogCheckReport.of_log(log, virtual=True)
     assert report.passed, report.findings
     assert (
@@ -299,13 +306,13 @@ def test_lost_samples_excuse_virtual_time_afterwards() -> None:
         return {**r, "tau": [r["tau"][0], r["tau"][1] + 1e-12]} if r["tick"] == 30 else r
 
     changed = LogCheckReport.of_log(
-        opened(edited(delivered({}, lost), record=record)), virtual=True
+        open_bytes(edit_log_bytes(delivered({}, lost), record=record)), virtual=True
     )
     assert not changed.findings[-1].passed
 
 
 def test_gaps_pass_with_possible_arrivals() -> None:
-    lines = LogCheckReport.of_log(without_records({"m2": [50, 51]}), virtual=True).findings
+    lines = LogCheckReport.of_log(make_log_without({"m2": [50, 51]}), virtual=True).findings
     fed = next(line for line in lines if "fed" in line.check)
     assert fed.passed, fed
 
@@ -321,10 +328,10 @@ def test_coverage_is_the_least_of_all_sites() -> None:
 
 
 def test_lost_sites_end_where_last_seen() -> None:
-    whole = opened(recorded("paper"))
+    whole = make_log("paper")
     assert {whole.expected_ticks(site) for site in SITES} == {TICKS}
-    data = edited(recorded("paper"), chunk_bytes=2048)
-    torn = opened(data[: len(data) // 2])
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
+    torn = open_bytes(data[: len(data) // 2])
     assert {torn.expected_ticks(site) for site in SITES} == {TICKS}  # nobody tells more
     last = int(torn["s"].tick[-1])
     torn.events.append(Event(member="m1", boot=1, t_ns=1, n=9, kind="lost", text="", about="s"))

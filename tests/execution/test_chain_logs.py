@@ -1,18 +1,17 @@
 """Logs of arms of six joints: every record has the same bits when executed again and in virtual time."""
 
-import io
 import math
 from functools import cache
 
 import numpy as np
 import pytest
 
-from tests.chains import six_joints
-from tests.log_editing import Record, edited, opened
+from tests.log.builders import Record, edit_log_bytes, open_bytes, simulate_bytes
+from tests.scenario.builders import six_joint_text
 from trilat_net.core.arms.chain import LINK_PARAMETERS
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify
-from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
+from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario.scenario_reader import load_scenario, parse_scenario
@@ -23,9 +22,7 @@ N, TICKS = 6, 80
 @cache
 def record_chain_log() -> bytes:
     """Returns a run in which every link delays by 20 ms."""
-    stream = io.BytesIO()
-    write_virtual_log(parse_scenario(six_joints(TICKS / 1000)), stream)
-    return stream.getvalue()
+    return simulate_bytes(parse_scenario(six_joint_text(TICKS / 1000)))
 
 
 def changed(field: str, numbers: int) -> Log:
@@ -36,11 +33,11 @@ def changed(field: str, numbers: int) -> Log:
             record[field] = (record[field] * 2)[:numbers]
         return record
 
-    return opened(edited(record_chain_log(), record=change))
+    return open_bytes(edit_log_bytes(record_chain_log(), record=change))
 
 
 def test_six_joints_executed_again_equal_virtual_time() -> None:
-    log = opened(record_chain_log())
+    log = open_bytes(record_chain_log())
     verdict, twins = verify(log), compare_with_virtual(log)
     assert verdict.passed, str(verdict.first)
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -52,8 +49,8 @@ def test_six_joints_executed_again_equal_virtual_time() -> None:
 
 
 def test_two_records_resume_six_joints() -> None:
-    log = opened(
-        edited(
+    log = open_bytes(
+        edit_log_bytes(
             record_chain_log(),
             record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r,
         )
@@ -82,7 +79,7 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
             record["qd"][N - 1] = math.nextafter(record["qd"][N - 1], math.inf)
         return record
 
-    first = verify(opened(edited(record_chain_log(), record=change))).first
+    first = verify(open_bytes(edit_log_bytes(record_chain_log(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.core.compiled import run_program
+from tests.execution.builders import execute_ticks, run_fused
 from tests.execution.varying_links import VARYING_LINKS
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
@@ -54,13 +55,6 @@ def floats(output: TickRecord) -> list[float]:
     ]
 
 
-def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
-    ran: dict[str, list[TickRecord]] = {name: [] for name in scenario.names}
-    for site, _, output in virtual.execute_virtual(scenario):
-        ran[site.name].append(output)
-    return ran
-
-
 def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
     maxima = np.full(
@@ -75,9 +69,8 @@ def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
 
 
 def agree(scenario: Scenario) -> None:
-    expected = per_tick(scenario)
-    fused = FusedRun(scenario)
-    fused.advance_to(scenario.duration_s)
+    expected = execute_ticks(scenario)
+    fused = run_fused(scenario)
     for record, outputs in zip(fused.records, expected.values(), strict=True):
         last = floats(outputs[-1])
         np.testing.assert_array_equal(record[: len(last)], last)
@@ -120,8 +113,7 @@ def test_any_links_rates_and_schemes_agree(
 def test_diverging_runs_end_with_that_tick() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
     agree(scenario)
-    fused = FusedRun(scenario)
-    fused.advance_to(1.0)
+    fused = run_fused(scenario, 1.0)
     assert fused.diverged_s is not None
     before = fused.records
     fused.advance_to(3.0)
@@ -161,8 +153,7 @@ def test_a_split_run_equals_the_whole_run(stops: list[float]) -> None:
 def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None:
     """RMS e, peak force and work of the walls as `trilat metrics` has them; the effort by its formula."""
     scenario = load_scenario(load_scenario(name), changes)
-    fused = FusedRun(scenario)
-    fused.advance_to(0.5 * scenario.duration_s)
+    fused = run_fused(scenario, 0.5 * scenario.duration_s)
     fused.advance_to(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
     whole = {
@@ -187,18 +178,16 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
 @pytest.mark.long
 def test_settling_is_the_last_error_limit_crossing() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
-    fused = FusedRun(scenario, settled_rad=0.01)
-    fused.advance_to(13.0)
+    fused = run_fused(scenario, 13.0, settled_rad=0.01)
     late_times_s = [
         output.t_ns
-        for outputs in per_tick(scenario).values()
+        for outputs in execute_ticks(scenario).values()
         for output in outputs
         if max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         >= 0.01
     ]
     assert fused.settled_s == max(late_times_s) / 1e9
-    early = FusedRun(scenario, settled_rad=0.01)
-    early.advance_to(2.0)
+    early = run_fused(scenario, 2.0, settled_rad=0.01)
     assert early.settled_s is None
 
 
@@ -243,8 +232,7 @@ def test_plugged_laws_have_per_tick_bits(law: str) -> None:
         {"control.law": line, "sites.s.rate_hz": 500},
     ):
         scenario = load_scenario("asymmetric", {**plugged, **changes})
-        fused = FusedRun(scenario)
-        fused.advance_to(0.05)
+        fused = run_fused(scenario, 0.05)
         fused.advance_to(scenario.duration_s)
         last = {tick.site.name: tick.output for tick in virtual.execute_virtual(scenario)}
         for name, row in zip(scenario.names, fused.records, strict=True):

@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
+from tests.execution.builders import OTHER_PLATFORM, make_log_without
 from tests.execution.deliveries import TICKS
-from tests.execution.logs import OTHER_PLATFORM, without_records
-from tests.log_editing import opened, recorded
+from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.execution.resumption import RecordedInputs, read_output
@@ -19,7 +19,7 @@ SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
 def plugged(law: str) -> bytes:
-    return recorded("paper", {**SHORT, "control.law": f"tests.plugged_laws:{law}"})
+    return make_log_bytes("paper", {**SHORT, "control.law": f"tests.plugged_laws:{law}"})
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -28,19 +28,19 @@ def test_plugged_laws_verify_whole_and_behind_gaps(
     law: str, session: dict[str, str] | None
 ) -> None:
     data = plugged(law)
-    verdict = verify(opened(data))
+    verdict = verify(open_bytes(data))
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 3 * TICKS
-    twins = compare_with_virtual(opened(data))
+    twins = compare_with_virtual(open_bytes(data))
     assert twins.fed.identical == twins.plain.identical == 3 * TICKS
-    cut = verify(without_records({"s": range(50, 61)}, data, session))
+    cut = verify(make_log_without({"s": range(50, 61)}, data, session))
     assert cut.agreed
     assert cut.identical > 3 * TICKS - 60
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_any_record_resumes_the_whole_run(law: str) -> None:
-    log = opened(plugged(law))
+    log = open_bytes(plugged(law))
     samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
     ends = dict.fromkeys(log.sites, TICKS - 1)
     for name in log.sites:
@@ -59,7 +59,7 @@ def test_any_record_resumes_the_whole_run(law: str) -> None:
 
 
 def test_a_changed_gain_changes_only_its_effect() -> None:
-    log = opened(plugged("CompiledLine"))
+    log = open_bytes(plugged("CompiledLine"))
     same = rerun(log, closed_loop=True)
     assert all(effect.identical == effect.executed == TICKS for effect in same.sites.values())
     changed = rerun(log, ["s"], {"sites.s.control.K": 25.0})

@@ -6,9 +6,21 @@ from typing import Any
 
 import pytest
 
+from tests.execution.builders import (
+    OTHER_PLATFORM,
+    list_results,
+    make_external_arm_bytes,
+    make_log_without,
+)
 from tests.execution.deliveries import SITES, TICKS
-from tests.execution.logs import OTHER_PLATFORM, external_log, numbers, without_records
-from tests.log_editing import Record, edited, opened, recorded
+from tests.log.builders import (
+    Record,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    open_bytes,
+    simulate_bytes,
+)
 from trilat_net.errors import LawFailed, ScenarioError, UsageError, join_arguments
 from trilat_net.execution import virtual
 from trilat_net.execution.log_checks import LogCheckReport
@@ -24,18 +36,18 @@ SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
 def record_own_law(law: str = LAW, **more: Any) -> bytes:
-    return recorded("paper", {**SHORT, "control.law": law, **more})
+    return make_log_bytes("paper", {**SHORT, "control.law": law, **more})
 
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric"])
 def test_own_paper_law_gives_equal_bits(name: str) -> None:
     """Gains of the shipped scenarios are those of `tests.laws`."""
-    ours = opened(recorded(name, SHORT))
-    theirs = opened(recorded(name, {**SHORT, "control.law": LAW}))
+    ours = make_log(name, SHORT)
+    theirs = make_log(name, {**SHORT, "control.law": LAW})
     for site in ours.sites:
         for a, b in zip(ours[site].states, theirs[site].states, strict=True):
             # but for what a law from outside remembers
-            assert numbers(a)[:-1] == numbers(b)[:-1]
+            assert list_results(a)[:-1] == list_results(b)[:-1]
     verdict = verify(theirs)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -46,10 +58,12 @@ def test_own_paper_law_gives_equal_bits(name: str) -> None:
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> None:
     """As much can be judged as of a shipped law."""
-    verdict = verify(without_records({"s": range(50, 61)}, record_own_law(), session))
+    verdict = verify(make_log_without({"s": range(50, 61)}, record_own_law(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
-    ours = verify(without_records({"s": range(50, 61)}, recorded("paper", SHORT), session))
+    ours = verify(
+        make_log_without({"s": range(50, 61)}, make_log_bytes("paper", SHORT), session)
+    )
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
     assert verdict.identical > 3 * TICKS - 50
 
@@ -58,8 +72,8 @@ def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> 
 def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
     """If no memory has to be restored the law passes; behind a gap, or tick by tick, it does not."""
     data = record_own_law("tests.laws:Forgetful")
-    assert verify(opened(data)).passed
-    verdict = verify(without_records({"s": range(50, 61)}, data, session))
+    assert verify(open_bytes(data)).passed
+    verdict = verify(make_log_without({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
     assert verdict.first.field.startswith(("theta_hat", "tau"))
 
@@ -79,14 +93,13 @@ def test_restarted_sites_are_the_same(law: str) -> None:
         )
         for order in orders
     ]
-    stream = io.BytesIO()
-    virtual.write_virtual_log(scenario, stream, commands={"s": {50: changes}})
-    verdict = verify(opened(stream.getvalue()), resume_every=7)
+    data = simulate_bytes(scenario, commands={"s": {50: changes}})
+    verdict = verify(open_bytes(data), resume_every=7)
     assert verdict.identical == verdict.records == 900
 
 
 def test_hidden_memory_shows_at_a_restart() -> None:
-    log = opened(record_own_law("tests.laws:Forgetful"))
+    log = open_bytes(record_own_law("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
     verification = verify(log, resume_every=40)
@@ -95,7 +108,7 @@ def test_hidden_memory_shows_at_a_restart() -> None:
 
 
 def test_reports_explain_hidden_memory() -> None:
-    log = opened(record_own_law("tests.laws:Forgetful"))
+    log = open_bytes(record_own_law("tests.laws:Forgetful"))
     (law,) = find_user_laws(log.scenario)[:1]
 
     def find_text(**settings: int) -> str:
@@ -114,7 +127,7 @@ def test_reports_explain_hidden_memory() -> None:
     command = join_arguments(verify_command)
     assert find_text().endswith(f"but by: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
-    built_in = LogCheckReport.of_log(opened(recorded("paper")), virtual=False)
+    built_in = LogCheckReport.of_log(make_log("paper"), virtual=False)
     assert not [finding for finding in built_in.findings if "--resume-every" in finding.text]
 
 
@@ -124,7 +137,7 @@ def test_changed_memory_shows_at_its_tick() -> None:
             r["mem"][4] += 1e-3
         return r
 
-    verdict = verify(opened(edited(record_own_law(), record=record)))
+    verdict = verify(open_bytes(edit_log_bytes(record_own_law(), record=record)))
     assert verdict.differing == 1
     assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
 
@@ -142,13 +155,8 @@ def file(
 
 
 def log_of(file: Path) -> io.BytesIO:
-    stream = io.BytesIO()
-    virtual.write_virtual_log(
-        load_scenario("two_sites", {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}),
-        stream,
-    )
-    stream.seek(0)
-    return stream
+    overrides = {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}
+    return io.BytesIO(simulate_bytes(load_scenario("two_sites", overrides)))
 
 
 def test_changed_files_are_judged_on_request(file: Path) -> None:
@@ -239,7 +247,7 @@ def test_failing_laws_leave_a_finished_log(how: str, at: int) -> None:
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
-    log = opened(edited(external_log(), session=session))
+    log = open_bytes(edit_log_bytes(make_external_arm_bytes(), session=session))
     assert log["s"].q[50].tolist() == [0.5, -0.3]
     verdict = verify(log)
     assert verdict.agreed
@@ -251,9 +259,9 @@ def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
 
 def test_external_arms_are_executed_behind_gaps() -> None:
     """As much can be judged as of a simulated arm."""
-    verdict = verify(without_records({"s": range(40, 45)}, external_log()))
+    verdict = verify(make_log_without({"s": range(40, 45)}, make_external_arm_bytes()))
     assert verdict.agreed
-    ours = verify(without_records({"s": range(40, 45)}, recorded("two_sites", SHORT)))
+    ours = verify(make_log_without({"s": range(40, 45)}, make_log_bytes("two_sites", SHORT)))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
 
 
@@ -263,7 +271,7 @@ def test_another_measurement_gives_another_torque() -> None:
             r["q"][1] += 1e-6
         return r
 
-    verdict = verify(opened(edited(external_log(), record=record)))
+    verdict = verify(open_bytes(edit_log_bytes(make_external_arm_bytes(), record=record)))
     assert (verdict.first.site, verdict.first.tick) == ("s", 70)
     assert verdict.first.field.startswith("tau")
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.execution.builders import OTHER_PLATFORM, make_log_without
 from tests.execution.deliveries import (
     SITES,
     TICKS,
@@ -18,8 +19,14 @@ from tests.execution.deliveries import (
     never,
     under_way,
 )
-from tests.execution.logs import OTHER_PLATFORM, without_records
-from tests.log_editing import Record, edited, opened, recorded, without
+from tests.log.builders import (
+    Record,
+    drop_records,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    open_bytes,
+)
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.execution.verification import RecordDifference, verify
 from trilat_net.scenario import list_shipped
@@ -47,7 +54,7 @@ def at(site: str, tick: int, change: Callable[[Record], Any]) -> Callable[[Recor
 
 def first_difference(name: str = "paper", **changes: Any) -> RecordDifference:
     """The first difference of the log of a scenario that was changed as `edited` says."""
-    first = verify(opened(edited(recorded(name), **changes))).first
+    first = verify(open_bytes(edit_log_bytes(make_log_bytes(name), **changes))).first
     assert first is not None
     return first
 
@@ -55,7 +62,7 @@ def first_difference(name: str = "paper", **changes: Any) -> RecordDifference:
 @pytest.mark.parametrize("name", list_shipped())
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 def test_every_record_of_an_untouched_log_is_identical(name: str, scheme: str) -> None:
-    log = opened(recorded(name, {"duration_s": 0.5, "scheme": scheme}))
+    log = make_log(name, {"duration_s": 0.5, "scheme": scheme})
     verdict = verify(log)
     assert verdict.whole_run
     assert verdict.passed
@@ -65,13 +72,13 @@ def test_every_record_of_an_untouched_log_is_identical(name: str, scheme: str) -
 
 def test_different_rates_are_identical() -> None:
     rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
-    log = opened(recorded("paper", {**rates, "duration_s": 0.5}))
+    log = make_log("paper", {**rates, "duration_s": 0.5})
     assert verify(log).identical == 500 + 350 + 166
 
 
 def test_diverged_runs_are_identical_to_their_end() -> None:
-    data = recorded("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3})
-    log = opened(data)
+    data = make_log_bytes("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3})
+    log = open_bytes(data)
     assert log["m1"].states[-1].tick < 999
     assert "diverged" in {log[name].states[-1].mode for name in log.sites}
     verdict = verify(log)
@@ -205,7 +212,7 @@ def ranges(lost: set[int]) -> list[tuple[int, int]]:
     ],
 )
 def test_execution_resumes_behind_a_reported_gap(site: str, lost: set[int]) -> None:
-    verdict = verify(without_records({site: lost}))
+    verdict = verify(make_log_without({site: lost}))
     assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [(site, first, last) for first, last in ranges(lost)]
     assert verdict.records == 3 * TICKS - len(lost)
@@ -217,7 +224,7 @@ def test_execution_resumes_behind_a_reported_gap(site: str, lost: set[int]) -> N
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize("first", [TICKS - 1, TICKS - 10])
 def test_a_gap_at_the_end_is_reported(site: str, first: int) -> None:
-    verdict = verify(without_records({site: range(first, TICKS)}))
+    verdict = verify(make_log_without({site: range(first, TICKS)}))
     assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [(site, first, TICKS - 1)]
 
@@ -234,7 +241,9 @@ def test_gaps_are_never_a_false_alarm(
     site: str, holes: list[tuple[int, int]], whole_run: bool
 ) -> None:
     lost = {t for start, length in holes for t in range(start, start + length) if t < TICKS - 1}
-    verdict = verify(without_records({site: lost}, session={} if whole_run else OTHER_PLATFORM))
+    verdict = verify(
+        make_log_without({site: lost}, session={} if whole_run else OTHER_PLATFORM)
+    )
     assert verdict.agreed, str(verdict.first)
     assert [gap[1:] for gap in verdict.gaps] == ranges(lost)
     assert verdict.identical + verdict.unjudged == verdict.records
@@ -245,7 +254,7 @@ def test_gaps_are_never_a_false_alarm(
 def test_scattered_samples_are_no_difference(
     delays: dict[Sample, int], never: frozenset[Sample]
 ) -> None:
-    verdict = verify(opened(delivered(delays, never)))
+    verdict = verify(open_bytes(delivered(delays, never)))
     assert verdict.identical == verdict.records == 3 * TICKS
 
 
@@ -259,7 +268,7 @@ def test_gaps_with_lost_samples_are_no_difference(
 ) -> None:
     """On links that keep their order, as those of a session do."""
     data = delivered(first_in_first_out(delays), never)
-    verdict = verify(without_records(lost, data, {} if whole_run else OTHER_PLATFORM))
+    verdict = verify(make_log_without(lost, data, {} if whole_run else OTHER_PLATFORM))
     assert verdict.agreed, str(verdict.first)
     assert {gap[0] for gap in verdict.gaps} == set(lost)
 
@@ -268,7 +277,7 @@ def test_gaps_among_reordered_samples_are_no_difference() -> None:
     """Sample 45 comes at 53, after newer ones; record 50 is missing, and the first to be listed is 45."""
     delays = {("m2", peer, tick): way for peer in (0, 1) for tick, way in ((45, 8), (52, 5))}
     data = delivered(delays)
-    verdict = verify(opened(edited(data, record=without("m2", {50}))))
+    verdict = verify(open_bytes(edit_log_bytes(data, record=drop_records("m2", {50}))))
     assert verdict.agreed, str(verdict.first)
 
 
@@ -276,7 +285,7 @@ def test_a_change_behind_a_gap_is_still_found() -> None:
     def record(r: Record) -> Record | None:
         if r["site"] == "m2" and r["tick"] == 90:
             r["tau"][0] = flipped(r["tau"][0], 0)
-        return without("m2", {40, 41})(r)
+        return drop_records("m2", {40, 41})(r)
 
     assert first_difference(record=record)[:3] == ("m2", 90, "tau[0]")
 
@@ -290,8 +299,8 @@ def test_a_record_that_stands_twice_is_found() -> None:
 
 @pytest.mark.parametrize("name", list_shipped())
 def test_other_platforms_execute_from_two_records(name: str) -> None:
-    data = recorded(name, {"duration_s": 0.5})
-    verdict = verify(opened(edited(data, session=OTHER_PLATFORM)))
+    data = make_log_bytes(name, {"duration_s": 0.5})
+    verdict = verify(open_bytes(edit_log_bytes(data, session=OTHER_PLATFORM)))
     assert not verdict.whole_run
     assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records
@@ -313,14 +322,16 @@ def test_on_another_platform_rounding_is_no_difference() -> None:
         return r
 
     assert verify(
-        opened(edited(recorded("free"), record=record, session=OTHER_PLATFORM))
+        open_bytes(
+            edit_log_bytes(make_log_bytes("free"), record=record, session=OTHER_PLATFORM)
+        )
     ).passed
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
 def test_torn_logs_verify_while_whole(share: float) -> None:
-    data = edited(recorded("paper"), chunk_bytes=2048)
-    log = opened(data[: int(share * len(data))])
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
+    log = open_bytes(data[: int(share * len(data))])
     assert not log.complete
     verdict = verify(log)
     assert verdict.agreed, str(verdict.first)

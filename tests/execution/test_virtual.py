@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.execution.deliveries import DUE, PEERS, SCENARIO, Sample, delivered
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
 from trilat_net import simulate
 from trilat_net.core.step.ticks import Arrival, TickRecord
 from trilat_net.execution import virtual
@@ -118,8 +118,8 @@ def test_records_show_whether_limits_held() -> None:
     assert not virtual.write_virtual_log(
         load_scenario("free", {"limits.qd_limit_rad_s": 0.3}), wild
     )
-    assert [e.kind for e in opened(fine.getvalue()).events] == ["end"] * 3
-    kinds = [(e.member, e.kind) for e in opened(wild.getvalue()).events]
+    assert [e.kind for e in open_bytes(fine.getvalue()).events] == ["end"] * 3
+    kinds = [(e.member, e.kind) for e in open_bytes(wild.getvalue()).events]
     assert "diverged" in {kind for _, kind in kinds}
     assert [kind for _, kind in kinds].count("end") == 3
 
@@ -145,7 +145,7 @@ def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
 
 
 def opened_delivered(delays: dict[Sample, int]) -> Log:
-    return opened(delivered(delays))
+    return open_bytes(delivered(delays))
 
 
 links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integers(0, 80))
@@ -202,7 +202,7 @@ def test_an_overtaken_late_sample_is_harmless() -> None:
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric", "two_sites"])
 def test_virtual_logs_equal_virtual_time(name: str) -> None:
-    log = opened(recorded(name, {"duration_s": 0.5}))
+    log = make_log(name, {"duration_s": 0.5})
     twins = compare_with_virtual(log)
     assert twins.late == []
     for twin in (twins.fed, twins.plain):
@@ -216,7 +216,9 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
             r["theta_hat"][3] += 1e-15
         return r
 
-    twins = compare_with_virtual(opened(edited(recorded("paper"), record=record)))
+    twins = compare_with_virtual(
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))
+    )
     for twin in (twins.fed, twins.plain):
         assert twin.first is not None
         assert twin.first[:3] == ("m2", 70, "theta_hat[3]")
@@ -233,13 +235,15 @@ def test_foreign_samples_are_never_late(entry: list[int], gap: range) -> None:
             r["rx"].append(entry)
         return None if r["site"] == "s" and r["tick"] in gap else r
 
-    twins = compare_with_virtual(opened(edited(recorded("paper"), record=record)))
+    twins = compare_with_virtual(
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))
+    )
     assert twins.absent == []
     assert twins.plain.first is None
 
 
 def test_twins_without_hands_are_free() -> None:
-    log = opened(recorded("paper", {"duration_s": 1.2}))
+    log = make_log("paper", {"duration_s": 1.2})
     twin = simulate_without_operators(log)
     assert (twin["m1"].tau_x == 0.0).all()
     assert (log["m1"].tau_x[1100:] < 0.0).all()

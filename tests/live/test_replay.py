@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.log_editing import recorded
+from tests.log.builders import make_log_bytes
 from tests.recorder.play.logs import session_payloads
 from tests.sites.sessions import Session as Sites
 from tests.sites.sessions import gliding
@@ -70,7 +70,7 @@ def test_replayed_and_recorded_logs_are_equal_bytewise(live: bool, stage: Stage)
 
 def virtual_log(folder: Path) -> Path:
     path = folder / "virtual.mcap"
-    path.write_bytes(recorded("two_sites", {"duration_s": 1.0}))
+    path.write_bytes(make_log_bytes("two_sites", {"duration_s": 1.0}))
     return path
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from tests.log.builders import make_log_bytes
 from tests.log.dealt import Message, messages
-from tests.log_editing import recorded
 from trilat_net.errors import LogError, NothingSaved
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
@@ -58,19 +58,19 @@ def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
 
 def shelf() -> dict[str, bytes]:
     """Whole logs of every kind of writer: live and virtual ones, and as other programs write them."""
-    long = recorded("paper", {"duration_s": 1.5})
+    long = make_log_bytes("paper", {"duration_s": 1.5})
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     return {
-        "short": recorded("paper"),
+        "short": make_log_bytes("paper"),
         "long": long,
-        "another run": recorded("paper", {"duration_s": 1.5, "seed": 5}),
+        "another run": make_log_bytes("paper", {"duration_s": 1.5, "seed": 5}),
         "live": live,
         "live elsewhere": (GOLDEN / "live-4g.mcap").read_bytes(),
         "unpacked": rewritten(long, 50_000, compression=CompressionType.NONE),
         "lz4": rewritten(long, 400_000, compression=CompressionType.LZ4),
         "zstd": rewritten(live, 400_000),
         "without checksums": rewritten(live, 50_000, enable_crcs=False),
-        "without chunks": rewritten(recorded("paper"), 0, use_chunking=False),
+        "without chunks": rewritten(make_log_bytes("paper"), 0, use_chunking=False),
     }
 
 

@@ -9,7 +9,7 @@ import msgpack
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tests.log_editing import opened, recorded
+from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.log.accounting import Account
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_reader import McapReader
@@ -112,8 +112,8 @@ def dealt(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> li
 
 def split(folder: Path, *, refilled: range) -> list[Path]:
     """A log in three parts, into which some records of `s` came later than others, out of its memory."""
-    data = recorded("paper")
-    scenario = opened(data).scenario
+    data = make_log_bytes("paper")
+    scenario = open_bytes(data).scenario
     items = [item for item in McapReader(io.BytesIO(data), "log").messages() if item.topic]
     kept_back = [
         i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled

@@ -12,7 +12,7 @@ import lz4.frame
 import msgpack
 import zstandard
 
-from tests.log_editing import edited
+from tests.log.builders import edit_log_bytes
 from trilat_net.analysis.file_overview import info
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import TrilatError
@@ -223,7 +223,7 @@ def field_changed(data: bytes, draws: Draws) -> bytes:
         return {**record, name: value} if hit else record
 
     try:
-        return edited(data, record=change)
+        return edit_log_bytes(data, record=change)
     except Exception:  # it was no log any more
         return data
 
@@ -232,7 +232,7 @@ def told_otherwise(data: bytes, draws: Draws) -> bytes:
     """The session's metadata say something else."""
     keys = "session driver scenario_sha256 epoch_unix_ns schema_version sites fingerprint seed rerun_executed"
     try:
-        return edited(data, session={one_of(draws, keys.split()): one_of(draws, TEXTS)})
+        return edit_log_bytes(data, session={one_of(draws, keys.split()): one_of(draws, TEXTS)})
     except Exception:
         return data
 
@@ -252,7 +252,7 @@ def scenario_changed(data: bytes, draws: Draws) -> bytes:
         return "\n".join(lines)
 
     try:
-        return edited(data, scenario=change)
+        return edit_log_bytes(data, scenario=change)
     except Exception:
         return data
 

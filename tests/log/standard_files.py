@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from trilat_net.core.step.ticks import TickRecord
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
@@ -20,14 +19,6 @@ EPOCH_NS = 1_700_000_000_000_000_000
 SCENARIO = load_scenario("two_sites", {"duration_s": 0.5})
 KINDS = ("virtual", "live", "first part", "last part", "recovered")
 VIEWS_HZ = 100.0
-
-
-def outputs() -> dict[str, list[TickRecord]]:
-    """What each site does."""
-    made: dict[str, list[TickRecord]] = {name: [] for name in SCENARIO.names}
-    for step in virtual.execute_virtual(SCENARIO):
-        made[step.site.name].append(step.output)
-    return made
 
 
 def live(storage: LogStorage) -> None:

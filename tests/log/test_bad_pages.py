@@ -12,8 +12,8 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from tests.log.bad_pages import GOLDEN, damaged, recovered_all, rewritten, shelf
+from tests.log.builders import make_log_bytes
 from tests.log.dealt import messages
-from tests.log_editing import recorded
 from trilat_net.errors import LogError, NothingSaved
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import SCENARIO, SESSION
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("unsynced")
 
 
 def test_no_message_is_invented(tmp_path: Path) -> None:
-    draw, whole = random.Random(2), recorded("paper")
+    draw, whole = random.Random(2), make_log_bytes("paper")
     files = {
         "packed": whole,
         "loose": rewritten(whole, 30_000),
@@ -60,7 +60,7 @@ def recovered(data: bytes, folder: Path) -> tuple[Recovery, bytes]:
 @pytest.mark.long
 def test_torn_chunks_with_zeroed_pages_add_nothing(tmp_path: Path) -> None:
     """The attack that gained nine messages."""
-    data = recorded("paper", {"duration_s": 3.0})
+    data = make_log_bytes("paper", {"duration_s": 3.0})
     truth, draw = Counter(messages(data)), random.Random(1)
     salvaged = 0
     for _ in range(40):
@@ -115,7 +115,7 @@ def test_a_lost_definition_is_restored(tmp_path: Path) -> None:
 
 def test_a_damaged_definition_leaves_the_log_intact(tmp_path: Path) -> None:
     """The index has all definitions, under a checksum."""
-    data = bytearray(recorded("paper"))
+    data = bytearray(make_log_bytes("paper"))
     data[PAGE_BYTES : 2 * PAGE_BYTES] = bytes(PAGE_BYTES)
     result, _ = recovered(bytes(data), tmp_path)
     assert result.chain is DigestState.OPEN
@@ -135,8 +135,8 @@ def test_a_session_of_another_log_is_not_believed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_head_of_another_virtual_run_is_refused(whole: bool, tmp_path: Path) -> None:
     """Another seed gives another hash of the scenario, and with it other boots in every message."""
-    data = recorded("paper", {"duration_s": 0.5})
-    other = recorded("paper", {"duration_s": 0.5, "seed": 5})
+    data = make_log_bytes("paper", {"duration_s": 0.5})
+    other = make_log_bytes("paper", {"duration_s": 0.5, "seed": 5})
     torn = bytearray(data if whole else data[: chunk_offsets(data)[-1][1]])
     torn[:PAGE_BYTES] = other[:PAGE_BYTES]
     result, saved = recovered(bytes(torn), tmp_path)
@@ -150,7 +150,9 @@ def test_a_head_of_another_virtual_run_is_refused(whole: bool, tmp_path: Path) -
 
 def test_chunks_of_other_virtual_runs_are_refused(tmp_path: Path) -> None:
     """Its checksum is right, and in an unfinished file so are its place and its times."""
-    data, other = (recorded("paper", {"duration_s": 1.5, "seed": seed}) for seed in (1, 5))
+    data, other = (
+        make_log_bytes("paper", {"duration_s": 1.5, "seed": seed}) for seed in (1, 5)
+    )
     (begin, end), (last_begin, last_end) = chunk_offsets(data)
     first, length = chunk_offsets(other)[0]
     torn = data[:begin] + other[first:length] + data[last_begin:last_end]
@@ -167,7 +169,7 @@ def test_chunks_of_other_virtual_runs_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["without checksums", "damaged chunk"])
 def test_without_valid_messages_no_file_is_made(kind: str, tmp_path: Path) -> None:
     """Neither a message that nothing proves, nor a file that holds nothing."""
-    data = bytearray(recorded("paper"))
+    data = bytearray(make_log_bytes("paper"))
     if kind == "without checksums":
         live = (GOLDEN / "live-paper.mcap").read_bytes()
         data = bytearray(rewritten(live, 50_000, enable_crcs=False)[:96_571])
@@ -220,7 +222,7 @@ def without_scenario(data: bytes) -> bytes:
 
 
 def test_lost_scenarios_are_taken_from_beside_logs(tmp_path: Path) -> None:
-    data = recorded("paper")
+    data = make_log_bytes("paper")
     result, saved = recovered(without_scenario(data), tmp_path)
     assert any("commands of trilat-net do not" in text for text in result.lost)
     # kept, and not under a name that promises a right checksum
@@ -236,7 +238,7 @@ def test_lost_scenarios_are_taken_from_beside_logs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["head", "chunk", "accounts", "index"])
 def test_check_names_a_zeroed_page(place: str, tmp_path: Path) -> None:
-    data = bytearray(recorded("paper"))
+    data = bytearray(make_log_bytes("paper"))
     (begin, end), *_ = chunk_offsets(bytes(data))
     offset = {
         "head": data.index(b"scenario.toml"),
@@ -261,7 +263,7 @@ def test_cut_runs_name_ticks_behind_their_end(tmp_path: Path) -> None:
 
 def test_blocks_with_a_bad_message_are_omitted(tmp_path: Path) -> None:
     """Packed bytes that are damaged falsify any part of their block, before and behind what shows."""
-    data = recorded("paper", {"duration_s": 3.0})
+    data = make_log_bytes("paper", {"duration_s": 3.0})
     (begin, _), *_ = chunk_offsets(data)
     torn = bytearray(data[: begin + 120_000])
     whole, _ = recovered(bytes(torn), tmp_path)

@@ -20,8 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from tests.log.hostility import CHANGES, chunk, mangled, read_by_all
-from tests.log_editing import edited, opened, recorded
 from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.verification import verify
@@ -29,8 +29,8 @@ from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_c
 from trilat_net.scenario import load_scenario, parse_embedded
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
-DATA = edited(recorded("paper", SHORT), chunk_bytes=4096)
-WHOLE = recorded("paper", SHORT)
+DATA = edit_log_bytes(make_log_bytes("paper", SHORT), chunk_bytes=4096)
+WHOLE = make_log_bytes("paper", SHORT)
 MEMORY_MIB = 256
 
 
@@ -59,7 +59,7 @@ def test_several_changes_get_an_answer(seed: int) -> None:
 
 def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
     """A log of a mebibyte whose site m1 has these records, and as many of them as a reader may be given."""
-    log = edited(
+    log = edit_log_bytes(
         WHOLE,
         scenario=lambda text: text.replace("duration_s = 0.04", f"duration_s = {seconds}"),
     )
@@ -149,8 +149,10 @@ def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None
 
 def test_ticks_outside_the_scenario_are_refused() -> None:
     """Nobody counts up to a number that a stranger wrote, nor keeps a place for every one before it."""
-    data = edited(DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r)
-    log = opened(data)
+    data = edit_log_bytes(
+        DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r
+    )
+    log = open_bytes(data)
     with pytest.raises(
         LogError,
         match=r"has a record of tick 1099511627775, but the scenario has only 40\d* ticks",
@@ -159,7 +161,7 @@ def test_ticks_outside_the_scenario_are_refused() -> None:
 
 
 def test_claims_of_endless_ticks_are_refused() -> None:
-    log = opened(edited(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
+    log = open_bytes(edit_log_bytes(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
     endless = [
         msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events
     ]
@@ -229,6 +231,6 @@ def test_json_is_always_finite(tmp_path: Path) -> None:
     """What a machine is told can be read by it, whatever the file says."""
     path = tmp_path / "strange.mcap"
     path.write_bytes(
-        edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62})
+        edit_log_bytes(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62})
     )
     json.dumps(info(path).facts, allow_nan=False)

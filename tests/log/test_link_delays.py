@@ -1,6 +1,5 @@
 """The measured delays of a log come back as a trace: what the records say, and nothing that they do not."""
 
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -8,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.log_editing import edited
+from tests.log.builders import edit_log_bytes, simulate_bytes
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError
-from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork
 from trilat_net.log.log_reader import read_link_delays
 from trilat_net.scenario import load_scenario
@@ -52,9 +50,7 @@ def log_bytes() -> bytes:
                     schedule[site].setdefault(at, []).append([index, tick, us])
                 if tick == 60:  # and once more, later
                     schedule[site].setdefault(at + 9, []).append([index, tick, us + 9000])
-    stream = io.BytesIO()
-    virtual.write_virtual_log(scenario, stream, RecordedNetwork(schedule, peers))
-    return stream.getvalue()
+    return simulate_bytes(scenario, RecordedNetwork(schedule, peers))
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +122,7 @@ def test_executed_scenarios_do_not_need_the_log(path: Path) -> None:
 def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> None:
     """A gap in the receiver's records hides arrivals: those samples are unknown, not lost."""
     path.write_bytes(
-        edited(
+        edit_log_bytes(
             data, record=lambda r: None if r["site"] == "s" and 200 <= r["tick"] < 220 else r
         )
     )
@@ -154,7 +150,7 @@ def test_links_without_arrivals_have_no_delays(data: bytes, path: Path) -> None:
     def silent(record: dict[str, Any]) -> dict[str, Any]:
         return {**record, "rx": [entry for entry in record["rx"] if entry[0] != 0]}
 
-    path.write_bytes(edited(data, record=silent))
+    path.write_bytes(edit_log_bytes(data, record=silent))
     with pytest.raises(ValueError, match="no sample arrived over m1->s"):
         read_link_delays(path, "m1->s")
 
@@ -188,7 +184,7 @@ def test_losses_at_both_ends_of_a_log_count(data: bytes, path: Path) -> None:
             ]
         return record
 
-    path.write_bytes(edited(data, record=cut))
+    path.write_bytes(edit_log_bytes(data, record=cut))
     delay_ms = {round(t_s * 1000): ms for t_s, ms in read_link_delays(path, "m1->s")}
     known = TICKS - 41
     assert min(delay_ms) == 10

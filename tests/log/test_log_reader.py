@@ -11,8 +11,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from tests.log.builders import (
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    open_bytes,
+    simulate_bytes,
+)
 from tests.log.dealt import foreign
-from tests.log_editing import edited, opened, recorded
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
@@ -30,24 +36,21 @@ TICKS = 120
 def test_equal_virtual_runs_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):
-        stream = io.BytesIO()
-        virtual.write_virtual_log(
-            load_scenario(name, {"duration_s": 0.3}), stream, views_hz=100.0
-        )
-        digests.add(hashlib.sha256(stream.getvalue()).hexdigest())
+        data = simulate_bytes(load_scenario(name, {"duration_s": 0.3}), views_hz=100.0)
+        digests.add(hashlib.sha256(data).hexdigest())
     assert len(digests) == 1
 
 
 def test_another_seed_is_another_file() -> None:
-    assert recorded("paper", {"duration_s": 0.05}) != recorded(
+    assert make_log_bytes("paper", {"duration_s": 0.05}) != make_log_bytes(
         "paper", {"duration_s": 0.05, "seed": 2}
     )
 
 
 def test_virtual_logs_have_no_path_or_clock() -> None:
-    data = edited(recorded("paper"))
+    data = edit_log_bytes(make_log_bytes("paper"))
     assert str(Path(__file__).parents[2]).encode() not in data
-    for _, _, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
+    for _, _, message in make_reader(io.BytesIO(make_log_bytes("paper"))).iter_messages():
         assert message.log_time == message.publish_time < 10**9
 
 
@@ -65,7 +68,7 @@ def test_plain_readers_find_every_payload_byte() -> None:
         )
         for site, arrivals, output in virtual.execute_virtual(scenario)
     }
-    reader = make_reader(io.BytesIO(recorded("paper")), validate_crcs=True)
+    reader = make_reader(io.BytesIO(make_log_bytes("paper")), validate_crcs=True)
     found = 0
     for schema, channel, message in reader.iter_messages():
         assert schema is not None
@@ -112,7 +115,9 @@ def required_and_typed(schema: dict, value: object) -> None:
 
 def test_every_message_is_one_that_its_schema_allows() -> None:
     kinds = set()
-    for schema, channel, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
+    for schema, channel, message in make_reader(
+        io.BytesIO(make_log_bytes("paper"))
+    ).iter_messages():
         assert schema is not None
         required_and_typed(json.loads(schema.data), msgpack.unpackb(message.data))
         kinds.add(channel.topic.rpartition("/")[2])
@@ -120,7 +125,7 @@ def test_every_message_is_one_that_its_schema_allows() -> None:
 
 
 def test_files_hold_session_scenario_and_accounts() -> None:
-    reader = make_reader(io.BytesIO(recorded("paper")))
+    reader = make_reader(io.BytesIO(make_log_bytes("paper")))
     metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
     session = metadata["trilat.session"]
     scenario = load_scenario("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
@@ -149,7 +154,7 @@ def test_session_and_scenario_precede_the_first_message() -> None:
     """So that they survive a crash right after the start."""
     stream = io.BytesIO()
     LogWriter(stream, load_scenario("free"), "lab", "live", 10**18, collect_provenance())
-    log = opened(stream.getvalue())
+    log = open_bytes(stream.getvalue())
     assert log.scenario == load_scenario("free")
     assert (log.driver, log.complete, log.accounts) == ("live", False, {})
     assert len(log["m1"]) == 0
@@ -177,7 +182,7 @@ def test_a_live_log_counts_from_its_epoch() -> None:
 
 
 def test_the_reader_gives_arrays_with_time() -> None:
-    log = opened(recorded("paper"))
+    log = make_log("paper")
     assert log.sites == ("m1", "m2", "s")
     assert log.complete
     m1 = log["m1"]
@@ -204,11 +209,11 @@ def test_the_reader_gives_arrays_with_time() -> None:
 
 def test_cut_files_open_as_far_as_whole() -> None:
     """It says that it is not complete, or is refused; nothing else comes out."""
-    data = edited(recorded("paper"), chunk_bytes=4096)
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=4096)
     before = 0
     for end in range(0, len(data), len(data) // 60):
         try:
-            log = opened(data[:end])
+            log = open_bytes(data[:end])
             records = len(log["m1"].states)
         except LogError:
             continue
@@ -216,7 +221,7 @@ def test_cut_files_open_as_far_as_whole() -> None:
         assert records >= before
         before = records
     assert before == TICKS
-    assert opened(data).complete
+    assert open_bytes(data).complete
 
 
 @pytest.mark.parametrize(
@@ -224,7 +229,7 @@ def test_cut_files_open_as_far_as_whole() -> None:
 )
 def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(LogError):
-        opened(data)
+        open_bytes(data)
     path = tmp_path / "no.mcap"
     path.write_bytes(data)
     with pytest.raises(LogError, match=r"no\.mcap"):
@@ -233,7 +238,7 @@ def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
 
 def test_an_mcap_file_of_others_is_refused() -> None:
     with pytest.raises(LogError, match=r"not a log of trilat-net"):
-        opened(foreign())
+        open_bytes(foreign())
 
 
 def test_mcap_files_using_our_names_are_refused() -> None:
@@ -246,15 +251,16 @@ def test_mcap_files_using_our_names_are_refused() -> None:
     )
     writer.finish()
     with pytest.raises(LogError):
-        len(opened(stream.getvalue())["m1"])
+        len(open_bytes(stream.getvalue())["m1"])
 
 
 def test_unreadable_events_are_omitted() -> None:
     """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
-    whole = opened(recorded("paper"))
-    odd = opened(
-        edited(
-            recorded("paper"), event=lambda payload: b"\xc1" if b"m1" in payload else payload
+    whole = make_log("paper")
+    odd = open_bytes(
+        edit_log_bytes(
+            make_log_bytes("paper"),
+            event=lambda payload: b"\xc1" if b"m1" in payload else payload,
         )
     )
     assert np.array_equal(odd["m1"].q, whole["m1"].q)
@@ -280,13 +286,15 @@ def test_logs_with_unreadable_scenarios_are_refused(text: str) -> None:
         return text.replace("\udcff", "")
 
     with pytest.raises(LogError, match="scenario"):
-        opened(edited(recorded("paper"), scenario=scenario))
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), scenario=scenario))
 
 
 @pytest.mark.parametrize(
     "change", [{"v": VERSION + 1}, {"q": [0.0]}, {"used": 3}, {"tick": -1}]
 )
 def test_logs_with_invalid_records_are_refused(change: dict[str, object]) -> None:
-    data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
+    data = edit_log_bytes(
+        make_log_bytes("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r
+    )
     with pytest.raises(LogError, match="record of m1"):
-        _ = opened(data)["m1"].states
+        _ = open_bytes(data)["m1"].states

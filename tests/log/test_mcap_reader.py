@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
+from tests.log.builders import edit_log_bytes, make_log_bytes
 from tests.log.hostility import chunk
-from tests.log_editing import edited, recorded
 from trilat_net.errors import LogError
-from trilat_net.execution import virtual
 from trilat_net.log import mcap_reader, mcap_records
 from trilat_net.log.mcap_reader import McapMessage, McapReader
 from trilat_net.log.mcap_records import (
@@ -26,9 +25,8 @@ from trilat_net.log.mcap_records import (
     UnreadableRecord,
     unpack_chunk,
 )
-from trilat_net.scenario import load_scenario
 
-DATA = edited(recorded("paper"), chunk_bytes=4096)
+DATA = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=4096)
 FRAMES = list(RecordScanner(io.BytesIO(DATA)).frames())
 CHUNKS = [frame for frame in FRAMES if frame.opcode == Opcode.CHUNK]
 
@@ -255,9 +253,7 @@ def test_resting_arms_are_never_absurd(
 ) -> None:
     """The hands of `outage` do not push before 3 s, and its arms know their weight."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 0)
-    stream = io.BytesIO()
-    virtual.write_virtual_log(load_scenario("outage", {"duration_s": 1.0}), stream)
-    stream.seek(0)
+    stream = io.BytesIO(make_log_bytes("outage", {"duration_s": 1.0}))
     assert sum(1 for _ in McapReader(stream, "log").messages()) > 3000
 
 

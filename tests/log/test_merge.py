@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.log.builders import make_log_bytes, open_bytes
 from tests.log.dealt import Message, a_file, changed, dealt, messages
-from tests.log_editing import opened, recorded
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
@@ -24,7 +24,7 @@ from trilat_net.scenario import load_scenario
 
 @cache
 def whole() -> bytes:
-    return recorded("paper")
+    return make_log_bytes("paper")
 
 
 @cache
@@ -63,7 +63,7 @@ def test_parts_in_any_order_read_as_the_whole(dealing, chance) -> None:
     parts = dealt(whole(), dealing)
     chance.shuffle(parts)
     log = joined(*parts)
-    assert holds(log) == holds(opened(whole()))
+    assert holds(log) == holds(open_bytes(whole()))
     assert log.complete
 
 
@@ -124,8 +124,8 @@ def test_parts_fill_holes_of_torn_parts() -> None:
     every = messages(whole())
     torn = a_file(whole(), every[:150], finished=False)
     carried_on = a_file(whole(), every[100:], part=2)
-    assert not opened(torn).complete
-    assert not opened(carried_on).complete
+    assert not open_bytes(torn).complete
+    assert not open_bytes(carried_on).complete
     assert joined(torn, carried_on).complete
 
 
@@ -142,7 +142,7 @@ def test_unfinished_parts_leave_the_whole_incomplete() -> None:
     parts = dealt(whole(), [range(100), range(100, 200), range(200, count())])
     assert joined(*parts).complete
     assert not joined(parts[0], parts[2]).complete
-    assert not opened(parts[2]).complete
+    assert not open_bytes(parts[2]).complete
     every = messages(whole())
     assert not joined(
         a_file(whole(), every[:50]), a_file(whole(), every[50:], finished=False)

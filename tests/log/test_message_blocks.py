@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from tests.log.builders import edit_log_bytes, make_log_bytes
 from tests.log.hostility import CHANGES, mangled
-from tests.log_editing import edited, recorded
 from trilat_net.errors import LogError
 from trilat_net.log import mcap_reader
 from trilat_net.log.mcap_reader import ChannelMessages, McapReader
 
-WHOLE = recorded("paper")
-MANY_CHUNKS = edited(WHOLE, chunk_bytes=8192)
+WHOLE = make_log_bytes("paper")
+MANY_CHUNKS = edit_log_bytes(WHOLE, chunk_bytes=8192)
 Contents = dict[str, list[tuple[bytes, int, int]]]
 
 

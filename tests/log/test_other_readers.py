@@ -16,12 +16,13 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
+from tests.execution.builders import execute_ticks
 from trilat_net.core.step.ticks import Mode
 from trilat_net.log.log_reader import Log, open_log
 
 from .dealt import messages
 from .programs import PYMCAP, RERUN, printed, rerun_faults
-from .standard_files import EPOCH_NS, KINDS, SCENARIO, made, outputs
+from .standard_files import EPOCH_NS, KINDS, SCENARIO, made
 
 BUCKET = 20
 
@@ -90,7 +91,7 @@ def test_every_view_has_exact_numbers(files: dict[str, Path]) -> None:
             assert all(map(math.isnan, [*ros.velocity[2:], *ros.effort[2:]]))
             number = (message.publish_time - EPOCH_NS) // (BUCKET * 10**6)
             shown[site, number].append([*ros.position, *ros.velocity[:2], *ros.effort[:2]])
-    for site, made_by in outputs().items():
+    for site, made_by in execute_ticks(SCENARIO).items():
         for first in range(0, len(made_by), BUCKET):
             rows = np.array(
                 [[*o.q, *o.q_des, *o.qd, *o.tau] for o in made_by[first : first + BUCKET]]

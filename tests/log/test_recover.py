@@ -18,9 +18,14 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tests.cli.running import trilat
+from tests.log.builders import (
+    drop_records,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+)
 from tests.log.dealt import Message, foreign, messages
 from tests.log.hostility import chunk as packed_chunk
-from tests.log_editing import edited, opened, recorded, without
 from trilat_net.errors import LogError, NothingSaved, UsageError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
@@ -67,9 +72,9 @@ def chunks(data: bytes) -> list[Chunk]:
 @cache
 def log() -> bytes:
     """A log of twenty chunks, as it is written today."""
-    whole, stream = opened(recorded("paper")), io.BytesIO()
+    whole, stream = make_log("paper"), io.BytesIO()
     writer = LogWriter(stream, whole.scenario, "paper", "virtual", 0, collect_provenance())
-    for n, message in enumerate(messages(recorded("paper"))):
+    for n, message in enumerate(messages(make_log_bytes("paper"))):
         topic, payload, log_ns, publish_ns, sequence = message
         writer.add(topic[1:], payload, publish_ns, log_ns, sequence)
         if n % 18 == 17:
@@ -81,7 +86,7 @@ def log() -> bytes:
 @cache
 def earlier_log() -> bytes:
     """The same by `mcap.Writer`: schemas and channels stand in the first chunk and at the end."""
-    return edited(recorded("paper"), chunk_bytes=8000)
+    return edit_log_bytes(make_log_bytes("paper"), chunk_bytes=8000)
 
 
 LOGS = st.sampled_from([log, earlier_log])
@@ -199,7 +204,9 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
 
 def test_missing_records_are_counted_by_site(tmp_path: Path) -> None:
     gone = set(range(30, 50)) | {70}
-    data = edited(recorded("paper"), record=without("m2", gone), chunk_bytes=8000)
+    data = edit_log_bytes(
+        make_log_bytes("paper"), record=drop_records("m2", gone), chunk_bytes=8000
+    )
     result, saved = made(data, tmp_path, "run.mcap")
     assert result.lossless  # what was never in the file was not lost with it
     assert result.missing == ["m2: 21 of 120 records: 30-49 70-70"]

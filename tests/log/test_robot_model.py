@@ -8,8 +8,8 @@ import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.chains import two_arms
 from tests.core.chain_references import ARMS, chain_references
+from tests.scenario.builders import two_arm_text
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import (
     SPACING_M,
@@ -24,7 +24,9 @@ POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5,
 
 
 def scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
-    text = two_arms(f"{arm}.urdf", POSES[arm]).replace("[control]", f"down = {down}\n[control]")
+    text = two_arm_text(f"{arm}.urdf", POSES[arm]).replace(
+        "[control]", f"down = {down}\n[control]"
+    )
     return parse_scenario(text, "two.toml")
 
 

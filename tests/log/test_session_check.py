@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
 from tests.log.dealt import foreign, split
 from tests.log.hostility import chunk
-from tests.log_editing import edited, recorded, without
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
@@ -30,8 +30,8 @@ from trilat_net.log.mcap_records import (
 from trilat_net.log.recovery import recover
 from trilat_net.log.session_check import LogCheckResult, check_file
 
-WHOLE = recorded("paper")
-DATA = edited(WHOLE, chunk_bytes=8192)
+WHOLE = make_log_bytes("paper")
+DATA = edit_log_bytes(WHOLE, chunk_bytes=8192)
 BUILT = {"whole", "checksums", "records", "index"}
 OURS = {"sequence", "accounts", "chain", "schema", "times", "rates", "scenario"}
 
@@ -65,7 +65,7 @@ def within(opcode: int, place: int = 0) -> bytes:
     return poked(DATA, first(opcode).offset + RECORD_HEAD_BYTES + place)
 
 
-@pytest.mark.parametrize("data", [WHOLE, DATA, recorded("jitter", {"duration_s": 0.1})])
+@pytest.mark.parametrize("data", [WHOLE, DATA, make_log_bytes("jitter", {"duration_s": 0.1})])
 def test_a_log_as_it_was_written_is_sound(data: bytes, tmp_path: Path) -> None:
     found = judged(tmp_path, data)
     assert found.passed, found
@@ -134,47 +134,55 @@ def _of(data: bytes) -> LogCheckResult:
 
 SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "records are missing": (
-        lambda: edited(DATA, record=without("m1", {7, 8, 9, 40})),
+        lambda: edit_log_bytes(DATA, record=drop_records("m1", {7, 8, 9, 40})),
         {"sequence", "accounts"},
         "4 missing in 2 ranges",
     ),
     "the last records are missing": (
-        lambda: edited(DATA, record=without("s", {118, 119})),
+        lambda: edit_log_bytes(DATA, record=drop_records("s", {118, 119})),
         {"sequence", "accounts"},
         "2 missing in 1 range",
     ),
     "a number twice": (
-        lambda: edited(DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r
+        ),
         {"sequence", "accounts"},
         "message 5 occurs twice",
     ),
     "a message of another site": (
-        lambda: edited(DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r
+        ),
         {"schema"},
         "a message states the sender 'm2'",
     ),
     "a message that is none": (
-        lambda: edited(DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r
+        ),
         {"schema", "sequence", "accounts"},
         "q has 1 number, not 2",
     ),
     "sent at another time": (
-        lambda: edited(DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r
+        ),
         {"times"},
         "was sent at 5 ns, but is stored with 3000000",
     ),
     "another scenario": (
-        lambda: edited(DATA, scenario=lambda text: text + "# and more\n"),
+        lambda: edit_log_bytes(DATA, scenario=lambda text: text + "# and more\n"),
         {"scenario"},
         "SHA-256",
     ),
     "another seed": (
-        lambda: edited(DATA, session={"seed": "7"}),
+        lambda: edit_log_bytes(DATA, session={"seed": "7"}),
         {"scenario"},
         "has the seed 1",
     ),
     "another version": (
-        lambda: edited(DATA, session={"schema_version": "2"}),
+        lambda: edit_log_bytes(DATA, session={"schema_version": "2"}),
         {"schema"},
         "has the schema trilat.State.v4, not trilat.State.v2",
     ),
@@ -193,8 +201,8 @@ def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
 
 def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
     """Each alone lacks what the other has; together nothing is missing."""
-    early = edited(DATA, record=lambda r: r if r["tick"] < 60 else None)
-    late = edited(DATA, record=lambda r: r if r["tick"] >= 60 else None)
+    early = edit_log_bytes(DATA, record=lambda r: r if r["tick"] < 60 else None)
+    late = edit_log_bytes(DATA, record=lambda r: r if r["tick"] >= 60 else None)
     assert "sequence" in failed(judged(tmp_path, early))
     both = judged(tmp_path, early, late)
     assert "sequence" not in failed(both), both.findings
@@ -236,7 +244,7 @@ def test_recovered_files_lack_only_lost_records(tmp_path: Path) -> None:
 
 def test_files_of_different_sessions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="another session"):
-        judged(tmp_path, DATA, edited(DATA, session={"session": "other"}))
+        judged(tmp_path, DATA, edit_log_bytes(DATA, session={"session": "other"}))
 
 
 def test_foreign_files_are_judged_by_structure(tmp_path: Path) -> None:

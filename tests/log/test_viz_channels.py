@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from tests.execution.builders import execute_ticks
+from tests.log.builders import simulate_bytes
 from tests.log.dealt import messages
 from trilat_net.core.step.ticks import Mode, TickRecord
-from trilat_net.execution import virtual
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.ros2.ros2_messages import stack_signals
@@ -336,11 +337,8 @@ def test_early_events_have_their_arrival_time() -> None:
 def test_views_leave_other_messages_unchanged() -> None:
     own, shown = [], []
     for views_hz in (0.0, 100.0):
-        stream = io.BytesIO()
-        virtual.write_virtual_log(
-            load_scenario("paper", {"duration_s": 0.5}), stream, views_hz=views_hz
-        )
-        every = messages(stream.getvalue())
+        scenario = load_scenario("paper", {"duration_s": 0.5})
+        every = messages(simulate_bytes(scenario, views_hz=views_hz))
         own.append([message for message in every if not message.topic.startswith("/viz")])
         shown.append(len(every) > len(own[-1]))
     assert own[0] == own[1]
@@ -350,9 +348,7 @@ def test_views_leave_other_messages_unchanged() -> None:
 def test_parts_end_with_all_extremes() -> None:
     """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
-    outputs = [
-        step.output for step in virtual.execute_virtual(scenario) if step.site.name == "m"
-    ]
+    outputs = execute_ticks(scenario)["m"]
     shown = []
     for part in (outputs[:77], outputs[77:]):
         stream = io.BytesIO()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.chains import six_joints
 from tests.core.chain_references import chain_references
+from tests.scenario.builders import six_joint_text
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
@@ -21,7 +21,7 @@ from trilat_net.scenario import parse_scenario
 
 from .drawn_words import misplaced
 
-SIX = six_joints(1.0, delay_ms=40.0)
+SIX = six_joint_text(1.0, delay_ms=40.0)
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 
 

@@ -15,8 +15,8 @@ import scipy.io
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.analysis import logs
-from tests.log_editing import opened, recorded
+from tests.analysis.builders import make_busy_run
+from tests.log.builders import make_log, rewrite_log
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
 from trilat_net.presentation.export import Exporter
@@ -33,11 +33,13 @@ def log() -> Log:
     plain = Event(
         member="c", boot=7, kind="end", text="c made 5 ticks", t_ns=9_000_000, ticks=5, n=0
     )
-    stats = opened(recorded("two_sites", {"duration_s": 0.4})).link_stats("m")
+    stats = make_log("two_sites", {"duration_s": 0.4}).link_stats("m")
     new = {"site": "a", "dropped": {"not finite": 3}, "offset_us": {"b": -4}}
     statistics_list = [msgspec.structs.replace(statistics, **new) for statistics in stats]
-    return logs.rewritten(
-        logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *statistics_list]
+    return rewrite_log(
+        make_busy_run().log,
+        lambda s: s.tick % 400 < 40,
+        others=[awkward, plain, *statistics_list],
     )
 
 

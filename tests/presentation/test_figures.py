@@ -11,8 +11,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import trilat_net
-from tests.analysis import logs
-from tests.task_arms import planar_task
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.log.builders import add_clock_readings
+from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.link_summary import DelayDistribution
 from trilat_net.analysis.timeline import find_mode_intervals
@@ -48,7 +49,7 @@ def lines(axes):
 
 
 def test_a_site_has_one_colour_in_every_figure():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     for figure in (
         joint_motion.draw_tracking_errors(log),
         joint_motion.draw_parameter_estimates(log),
@@ -61,13 +62,13 @@ def test_a_site_has_one_colour_in_every_figure():
 
 
 def test_a_single_site_has_the_widest_line():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     first = SimpleNamespace(sites=log.sites[:1], scenario=log.scenario)
     assert style.site_line(first, log.sites[0]) == style.site_line(log, log.sites[0])
 
 
 def test_histograms_count_every_tick():
-    log = logs.timed(logs.simulated("four"))
+    log = add_clock_readings(make_short_log("four"))
     edges = age_and_lateness.choose_bin_edges_us(log)
     for site in log.sites:
         assert age_and_lateness.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
@@ -79,7 +80,7 @@ def test_histograms_count_every_tick():
 
 @pytest.mark.long
 def test_a_log_without_events_has_no_markers():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     for name in registry.list_drawable_figures(log):
         drawn = registry.figure(log, name)
         if name != "certificate":  # which marks a rise of V
@@ -88,7 +89,7 @@ def test_a_log_without_events_has_no_markers():
 
 
 def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
-    log = logs.busy().log
+    log = make_busy_run().log
     figure = joint_motion.draw_positions(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
         for axes in row:
@@ -112,7 +113,7 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
 
 
 def test_the_stated_mean_is_drawn_while_valid():
-    log = logs.busy().log
+    log = make_busy_run().log
     figure = age_and_lateness.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
     t_s, mean_ms = lines(panel)[-1].get_data()
@@ -129,7 +130,7 @@ def test_the_stated_mean_is_drawn_while_valid():
 
 
 def test_each_site_has_estimates_beside_the_truth():
-    figure = joint_motion.draw_parameter_estimates(logs.simulated("paper"))
+    figure = joint_motion.draw_parameter_estimates(make_short_log("paper"))
     assert [len(lines(axes)) for axes in figure.axes] == [3] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
     # m1 lc1 + m2 l1 of the paper's arm
@@ -180,7 +181,7 @@ def test_shares_are_fractions_of_the_total():
 
 
 def test_arms_stand_in_panels_with_equal_axes():
-    log = logs.simulated("four")
+    log = make_short_log("four")
     arm = log.scenario.arms["c"]
     base, elbow, end_effector = arm_poses.joint_positions_m(
         arm, np.array([[np.pi / 2, -np.pi / 2]])
@@ -213,7 +214,7 @@ def test_long_paths_are_thinned_between_ends():
 
 
 def test_a_triangle_stands_where_a_site_settles():
-    log = logs.simulated("two_sites")
+    log = make_short_log("two_sites")
     (axes,) = joint_motion.draw_settling(log).axes
     marks = [line.get_data() for line in axes.lines if line.get_marker() == "v"]
     settled = [site_signals.settling_time_s(log[site]) for site in log.sites]
@@ -224,7 +225,7 @@ def test_a_triangle_stands_where_a_site_settles():
 
 
 def test_phase_portraits_show_e_and_its_rate():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     line = joint_motion.draw_phase_portrait(log).axes[1].lines[0]
     part = log["m1"]
     both = np.stack([part.e[:, 1], (part.qd - part.qd_des)[:, 1]], axis=1)
@@ -234,7 +235,7 @@ def test_phase_portraits_show_e_and_its_rate():
 
 
 def test_torque_limits_are_drawn_where_reached():
-    free = joint_motion.draw_control_torques(logs.simulated("paper"))
+    free = joint_motion.draw_control_torques(make_short_log("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
     log = trilat_net.simulate(
         "paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20}
@@ -265,11 +266,11 @@ def test_shares_are_drawn_as_they_change():
         [0.5, 0.625, 0.75, 0.375, 0.0]
     )
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
-    assert joint_motion.list_sites_with_changing_dominance(logs.simulated("paper")) == []
+    assert joint_motion.list_sites_with_changing_dominance(make_short_log("paper")) == []
 
 
 def test_overview_has_all_extremes_and_the_verdict():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     overview = run_overview.draw_overview(log)
     errors, _, torques, _ = overview.axes
     for site, error, torque in zip(log.sites, lines(errors), lines(torques), strict=False):
@@ -280,10 +281,10 @@ def test_overview_has_all_extremes_and_the_verdict():
 
 def test_overlaid_runs_share_sites_and_kind():
     paper, task = (
-        logs.simulated("paper"),
-        trilat_net.simulate(parse_scenario(planar_task(0.02))),
+        make_short_log("paper"),
+        trilat_net.simulate(parse_scenario(planar_task_text(0.02))),
     )
-    overlay = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
+    overlay = run_overview.draw_overlay({"one": paper, "two": make_short_log("four")})
     one, _ = lines(overlay.axes[2])
     assert np.nanmax(one.get_ydata()) == max(
         np.abs(paper[site].tau).max() for site in paper.sites

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.analysis import logs
+from tests.analysis.builders import make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
 from trilat_net import presentation
@@ -66,7 +66,7 @@ def test_report_fits_screens_and_axe_finds_nothing(
 
 @needs_browser
 def test_arms_play_at_once_unless_motion_is_reduced(browser: Browser, tmp_path: Path) -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     path, _ = write_report(log, tmp_path, certificate=certify(log))
     for motion, label in (("no-preference", "stop"), ("reduce", "play")):
         with watched_page(browser, reduced_motion=motion) as watched:

@@ -11,7 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 import trilat_net as tn
 from tests.cli.running import trilat
-from tests.task_arms import planar_task
+from tests.scenario.builders import planar_task_text
 from trilat_net.errors import UsageError
 from trilat_net.presentation.viewer_files import write_foxglove_layout
 
@@ -162,7 +162,7 @@ def test_a_log_of_urdf_arms_shows_them_itself(tmp_path: Path) -> None:
 
 
 def test_sites_that_share_poses_have_plots_too(tmp_path: Path) -> None:
-    log = tn.simulate(planar_task(), duration_s=0.05)
+    log = tn.simulate(planar_task_text(), duration_s=0.05)
     file = log.save(tmp_path / "run.mcap")
     messages = first_messages(file) | first_messages(
         tn.export(log, "ros2", tmp_path / "b.mcap")

@@ -15,7 +15,8 @@ from markupsafe import Markup
 from trilat_people.live_page.page_opening import BrowserOpening
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import FOUR, make_busy_run, make_short_log
+from tests.log.builders import add_clock_readings, rewrite_log
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
@@ -60,7 +61,7 @@ class Elements(HTMLParser):
 
 def make_log(text: str) -> Log:
     """Returns a log that has a given text wherever a log has free text."""
-    source = logs.FOUR
+    source = FOUR
     for key in ("title", "about", "assumed"):
         quoted = json.dumps([text] if key == "assumed" else text)
         source, count = re.subn(rf"(?m)^{key} = .*$", lambda _: f"{key} = {quoted}", source)  # noqa: B023
@@ -69,7 +70,7 @@ def make_log(text: str) -> Log:
         Event(v=3, member="a", boot=1, kind=kind, text=text, t_ns=10**9, about="b", n=n)
         for n, kind in enumerate(("mark", "lost", "failed", "clock fault", "refused"))
     ]
-    log = logs.rewritten(trilat_net.simulate(parse_scenario(source)), others=events)
+    log = rewrite_log(trilat_net.simulate(parse_scenario(source)), others=events)
     for key in ("commit", "platform", "python", "fingerprint", "version_numba"):
         log.session[key] = text
     return log
@@ -118,7 +119,7 @@ def record_calls() -> list[Call]:
                     patch.setattr(module, "render_macro", macro)
                 if hasattr(module, "render_template"):
                     patch.setattr(module, "render_template", whole)
-        for log in (logs.timed(logs.simulated("four")), logs.busy().log):
+        for log in (add_clock_readings(make_short_log("four")), make_busy_run().log):
             render(log, "text")
         page_summary.render_alarms(in_fault())
         with styled_figure(REPORT_SIZE, 1.0) as figure:

@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import trilat_net
-from tests.analysis import logs
-from tests.task_arms import planar_task, posed_arms
+from tests.analysis.builders import make_busy_run
+from tests.log.builders import rewrite_log
+from tests.scenario.builders import planar_task_text, posed_task_text
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event, State
@@ -42,7 +43,7 @@ def log() -> Log:
     """Returns a log of users a and b, of which b has 150 Hz, and a slave c; from 4 to 5 s its
     shares change to 0.9 and 0.1.
     """
-    return logs.busy().log
+    return make_busy_run().log
 
 
 @cache
@@ -52,7 +53,7 @@ def without(*missing: tuple[float, float]) -> Log:
     def keep(state: State) -> bool:
         return state.site != "c" or not any(a <= state.t_ns * 1e-9 < b for a, b in missing)
 
-    return logs.rewritten(log(), keep)
+    return rewrite_log(log(), keep)
 
 
 def exported(folder: Path, *sources: Log, **settings: Any) -> Path:
@@ -192,7 +193,7 @@ def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
     """Among others that held arms; a log without a policy has no intervention."""
     taken = [make_event("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
     taken += [make_event("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
-    held = logs.rewritten(log(), others=taken)
+    held = rewrite_log(log(), others=taken)
     folder = exported(tmp_path, held, log())
     assert info(folder, "about")["program"] == "b and none"
     assert [each["program"] for each in info(folder, "about")["sessions"]] == ["b", "none"]
@@ -212,7 +213,7 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
             ("three begins", 5.0),
         )
     ]
-    source = logs.rewritten(log(), others=[make_event("look", 0.5), *reversed(marks)])
+    source = rewrite_log(log(), others=[make_event("look", 0.5), *reversed(marks)])
     folder = exported(tmp_path, source, episodes="marks", task="stack the cups")
     frames = read(folder)
     assert read(folder, "meta/episodes")["length"].to_list() == [30, 30, 30]
@@ -242,7 +243,7 @@ def test_unmarked_logs_are_one_reported_episode(tmp_path: Path) -> None:
 
 
 def test_an_episode_outside_the_records_is_refused(tmp_path: Path) -> None:
-    late = logs.rewritten(log(), others=[make_event("episode one begins", 7.0)])
+    late = rewrite_log(log(), others=[make_event("episode one begins", 7.0)])
     with pytest.raises(LogError, match="no marked episode contains a time"):
         exported(tmp_path, late, episodes="marks")
 
@@ -353,7 +354,7 @@ def test_one_user_leads_alone_and_is_a_scalar(tmp_path: Path) -> None:
 
 
 def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
-    source = trilat_net.simulate(parse_scenario(planar_task(0.2)))
+    source = trilat_net.simulate(parse_scenario(planar_task_text(0.2)))
     folder = exported(tmp_path, source)
     assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]
     assert np.array_equal(read(folder)["action"].to_numpy(), newest(source, "m", "x", 6, 30))
@@ -392,7 +393,7 @@ def test_other_actions_are_refused(tmp_path: Path) -> None:
 
 
 def test_different_joints_are_told_to_use_tips(tmp_path: Path) -> None:
-    source = trilat_net.simulate(parse_scenario(posed_arms(0.1)))
+    source = trilat_net.simulate(parse_scenario(posed_task_text(0.1)))
     with pytest.raises(LogError, match=r"m2 and m1 have different joints, .*: use actions tip"):
         exported(tmp_path, source, actions="joints")
     folder = exported(tmp_path, source, actions="tip")

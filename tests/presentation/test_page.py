@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
+from tests.analysis.builders import (
+    JITTER,
+    make_busy_run,
+    make_diverged_log,
+    make_log_without_hands,
+    make_run,
+    make_short_log,
+)
+from tests.log.builders import add_clock_readings, rewrite_log
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
@@ -63,7 +70,7 @@ def column(table, n):
 
 def test_a_report_has_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
-    log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
+    log = make_run("free", {**JITTER, "rate_hz": 100}).log
     paths = write_report(
         log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS
     )
@@ -91,7 +98,7 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
 
 
 def test_the_page_asks_nothing_of_any_network():
-    html, _ = page(logs.timed(logs.simulated("four")))
+    html, _ = page(add_clock_readings(make_short_log("four")))
     seen = Page(html)
     for tag, attrs in seen.elements:
         assert tag not in ("link", "img", "iframe", "object", "base", "form")
@@ -109,7 +116,7 @@ def test_the_page_asks_nothing_of_any_network():
 
 
 def test_texts_of_a_scenario_stay_texts():
-    log = logs.simulated("four")
+    log = make_short_log("four")
     html, _ = page(log)
     seen = Page(html)
     assert sum(tag == "script" for tag, _ in seen.elements) == 3  # data, library, page
@@ -132,7 +139,7 @@ def test_a_page_holds_one_tick_spikes():
             else state
         )
 
-    log = logs.rewritten(logs.simulated("paper"), change=spike)
+    log = rewrite_log(make_short_log("paper"), change=spike)
     _, data = page(log)
     chart = next(c for c in data["charts"] if c["title"] == "s, joint 1")
     series = chart["series"][0]
@@ -150,7 +157,7 @@ def test_a_page_holds_one_tick_spikes():
 
 
 def test_the_page_describes_links_and_events():
-    html, data = page(logs.busy().log)
+    html, data = page(make_busy_run().log)
     assert (
         "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms"
         in html
@@ -178,7 +185,7 @@ def test_the_page_describes_links_and_events():
 
 
 def test_pages_of_plain_logs_have_nothing_superfluous():
-    html, data = page(logs.simulated("paper"))
+    html, data = page(make_short_log("paper"))
     assert data["changes"] == []
     assert set(map(len, data["spans"].values())) == {0}
     assert not [c for c in data["charts"] if c["section"] == "delays"]
@@ -193,11 +200,11 @@ def test_pages_of_plain_logs_have_nothing_superfluous():
 @pytest.mark.parametrize("sites", [(), ("m2", "s")])
 def test_nearly_empty_logs_have_reports(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
-    some = logs.timed(logs.simulated("paper"))
-    log = logs.rewritten(
+    some = add_clock_readings(make_short_log("paper"))
+    log = rewrite_log(
         some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live"
     )
-    twin = logs.twin("paper")
+    twin = make_log_without_hands("paper")
     paths = write_report(log, tmp_path, certificate=certify(log), twin=twin, verdicts=VERDICTS)
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     pictures = write_report_figures(log, tmp_path, twin)
@@ -207,7 +214,7 @@ def test_nearly_empty_logs_have_reports(sites, tmp_path):
 
 @pytest.mark.parametrize("name", ["paper", "four"])
 def test_error_chart_names_its_floor(name):
-    log = logs.simulated(name)
+    log = make_short_log(name)
     _, data = page(log)
     errors = [site_signals.largest_magnitude(log[site].e).min() for site in log.sites]
     chart = next(c for c in data["charts"] if c["section"] == "overview")
@@ -218,7 +225,7 @@ def test_error_chart_names_its_floor(name):
 
 
 def test_a_diverged_run_has_a_page():
-    log = logs.diverged()
+    log = make_diverged_log()
     html, _ = page(log)
     assert '<th scope="row">diverged</th><td>yes</td>' in html
     assert f"m1 diverged: {log.describe_divergence('m1')}." in html

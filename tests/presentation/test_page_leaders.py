@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_busy_run, make_run, make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
@@ -30,7 +29,7 @@ SHORT = {"rate_hz": 100, "duration_s": 14.0, "expect": {}}
 
 def training(**settings: Any) -> Log:
     """The shipped scenario in which the lead passes from m1 to m2, from 10 to 12 s."""
-    return runs.run("training", {**SHORT, **settings}).log
+    return make_run("training", {**SHORT, **settings}).log
 
 
 def test_the_bar_is_the_dominance_at_every_tick() -> None:
@@ -61,14 +60,14 @@ def test_constant_dominance_is_a_sentence() -> None:
 
 
 def test_one_master_leads_alone() -> None:
-    log = runs.run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
+    log = make_run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
     sentences = describe_leads(log, trace_leads(log))
     assert sentences == ["m alone leads the slave, during the whole run."]
 
 
 @pytest.mark.parametrize("name", ["four", "busy"])
 def test_every_following_slave_is_shown(name: str) -> None:
-    log = logs.busy().log if name == "busy" else logs.simulated(name)
+    log = make_busy_run().log if name == "busy" else make_short_log(name)
     followers = {
         site
         for site, spec in log.scenario.sites.items()

@@ -1,6 +1,6 @@
 """The events of a run, as sentences in the order of time."""
 
-from tests.analysis import logs
+from tests.analysis.builders import make_busy_run, make_diverged_log, make_short_log
 from tests.core.guarded_runs import stopped_log
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.log_reader import Log
@@ -14,7 +14,7 @@ def sentences(log: Log) -> list[str]:
 
 
 def test_plain_run_begins_pushes_and_ends() -> None:
-    texts = sentences(logs.simulated("paper"))
+    texts = sentences(make_short_log("paper"))
     assert texts[0].startswith("0.000 The run starts; m1 follows m2 0.5, s 0.5; ")
     assert any(" An operator pushes m1 to the end, with at most " in line for line in texts)
     assert any(" has the largest error of the run, " in line for line in texts)
@@ -22,7 +22,7 @@ def test_plain_run_begins_pushes_and_ends() -> None:
 
 
 def test_changes_and_modes_have_their_origin() -> None:
-    log = logs.busy().log
+    log = make_busy_run().log
     texts = sentences(log)
     assert "2.200 b braked until 3.053 s." in texts
     assert any("(command, applied at tick 500 of a)." in line for line in texts)
@@ -43,5 +43,5 @@ def test_sites_that_act_together_share_a_sentence() -> None:
 
 
 def test_divergence_is_reported() -> None:
-    log = logs.diverged()
+    log = make_diverged_log()
     assert any(f"diverged: {log.describe_divergence()}." in line for line in sentences(log))

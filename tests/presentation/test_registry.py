@@ -12,7 +12,8 @@ import pytest
 from matplotlib.text import Text
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.log.builders import add_clock_readings
 from trilat_net.errors import UsageError
 from trilat_net.presentation.appearance import COLUMN_IN, PAGE_IN, FigureSize
 from trilat_net.presentation.figures import age_and_lateness, joint_motion
@@ -40,12 +41,12 @@ def walled():
 def example(name):
     """Returns a log that has data for a figure: changes and marks if possible."""
     if name in ("operation", "operator_torques", "hands_moved"):
-        return logs.simulated("paper")
+        return make_short_log("paper")
     if name == "observed_energy":
         return trilat_net.simulate(
             "two_sites", {"control.law": "tanks", "scheme": "digital", "duration_s": 0.3}
         )
-    return walled() if name == "contact" else logs.timed(logs.busy().log)
+    return walled() if name == "contact" else add_clock_readings(make_busy_run().log)
 
 
 @cache
@@ -123,12 +124,14 @@ def test_logs_have_the_figures_they_support():
         }
         & have
     )
-    assert "contact" not in list_drawable_figures(logs.busy().log)
-    reasons = {name: entry.absent(logs.simulated("free")) for name, entry in FIGURES.items()}
+    assert "contact" not in list_drawable_figures(make_busy_run().log)
+    reasons = {name: entry.absent(make_short_log("free")) for name, entry in FIGURES.items()}
     assert reasons["operator_torques"] == reasons["hands_moved"] == joint_motion.NO_OPERATOR
     assert reasons["loop_timing"] == age_and_lateness.NO_LOOP_CLOCK
     assert not reasons["positions"]
-    assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
+    assert {"authority", "delay_distributions"} <= set(
+        list_drawable_figures(make_busy_run().log)
+    )
 
 
 def test_wall_force_equals_the_recorded_torque():

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.analysis import logs
+from tests.analysis.builders import make_log_without_hands
 from tests.live.browsers import needs_browser, shows
 from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
@@ -219,7 +219,7 @@ def test_whole_report_with_its_certificate_is_drawn(
 ) -> None:
     """As the command writes it: with the certificate, its pictures, and the twin without operators."""
     log = VARIED[name]()
-    twin = logs.twin("paper") if name == "shipped paper" else None
+    twin = make_log_without_hands("paper") if name == "shipped paper" else None
     certificate = certify(log)
     path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
     observed, twins = certificate.observed, certificate.twins

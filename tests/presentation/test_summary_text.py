@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import make_busy_run, make_short_log
 from tests.core.guarded_runs import stopped_log
+from tests.log.builders import rewrite_log
 from trilat_net.analysis.link_summary import summarise_clock
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
@@ -30,7 +31,7 @@ from trilat_net.presentation.summary_text import (
 
 def test_constant_links_without_loss_get_no_line():
     for name in ("paper", "free", "two_sites", "four"):
-        assert format_run_lines(logs.simulated(name)) == []
+        assert format_run_lines(make_short_log(name)) == []
 
 
 def test_links_give_stated_and_measured_values():
@@ -42,7 +43,7 @@ def test_links_give_stated_and_measured_values():
 
 
 def test_events_are_reported_once():
-    lines = format_run_lines(logs.busy().log)
+    lines = format_run_lines(make_busy_run().log)
     link = "the link c->a was set to uniform 0 to 60 ms, from 3 s on"
     shares = "the shares of c were set to a 0.9, b 0.1 within 1 s, from 4 s on"
     assert f"change: {link} (applied at tick 500)" in lines
@@ -60,7 +61,7 @@ def test_stopped_arms_are_reported_first():
         "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to stop"
         in render_alarms(log)
     )
-    assert render_alarms(logs.simulated("two_sites")) == ""
+    assert render_alarms(make_short_log("two_sites")) == ""
 
 
 @pytest.mark.parametrize(
@@ -104,7 +105,7 @@ def test_foreign_records_raise_no_alarm(mem):
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):
     monkeypatch.setattr(summary_text, "MOST_LINES", 2)
-    lines = format_link_lines(logs.busy().log)
+    lines = format_link_lines(make_busy_run().log)
     assert len(lines) == 3
     assert lines[-1] == "and 4 more of this kind: see summary.json"
 
@@ -140,7 +141,7 @@ def clocked():
     drift = {"drift_ppb": 50_000, "drift_bound_ppb": 900}
     estimate = Event(member="m2", boot=1, kind="clock", text="", about="m1", ticks=20, **drift)
     others = [statistics(20, **first), estimate, statistics(380, **last, **faults)]
-    return logs.rewritten(logs.simulated("paper"), driver="live", others=others)
+    return rewrite_log(make_short_log("paper"), driver="live", others=others)
 
 
 def test_clocks_are_reported_as_at_the_end():
@@ -165,7 +166,7 @@ def test_shared_clocks_get_no_line():
     assert shared is not None
     assert shared.shared
     assert summarise_clock(clocked(), "m2", "m1") is None
-    assert format_clock_lines(logs.simulated("paper")) == []
+    assert format_clock_lines(make_short_log("paper")) == []
 
 
 def test_the_cause_of_the_end_is_one_line() -> None:

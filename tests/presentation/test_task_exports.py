@@ -17,9 +17,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 import trilat_net
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
 from tests.log.programs import RERUN, printed, rerun_faults
-from tests.log_editing import edited, opened, recorded
-from tests.task_arms import planar_task
+from tests.scenario.builders import planar_task_text
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
@@ -41,7 +41,9 @@ HEADS = {
 @cache
 def log() -> Log:
     hands = '[[sites.s.hands]]\nkind = "tip_spring"\nto_m = [1.0, 1.0, 0.0]\nstiffness_n_m = 50\n[dominance]'
-    return trilat_net.simulate(parse_scenario(planar_task(0.2).replace("[dominance]", hands)))
+    return trilat_net.simulate(
+        parse_scenario(planar_task_text(0.2).replace("[dominance]", hands))
+    )
 
 
 def exported(form: str, folder: Path) -> Path:
@@ -137,7 +139,7 @@ def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
     path, log_times = tmp_path / "bag.mcap", list[int]()
-    export_ros2(opened(recorded("paper")), path, log_times.append)
+    export_ros2(make_log("paper"), path, log_times.append)
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages(log_time_order=False))
     times = [message.log_time for _, _, message in messages]
@@ -154,8 +156,10 @@ def test_messages_are_in_order_of_arrival(
 
 def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
     """A gap in the log is a gap in the bag."""
-    log = opened(
-        edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r)
+    log = open_bytes(
+        edit_log_bytes(
+            make_log_bytes("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r
+        )
     )
     path = tmp_path / "bag.mcap"
     export_ros2(log, path)
@@ -165,9 +169,10 @@ def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
 
 
 def test_unreadable_records_are_reported(tmp_path: Path) -> None:
-    log = opened(
-        edited(
-            recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r
+    log = open_bytes(
+        edit_log_bytes(
+            make_log_bytes("paper"),
+            record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r,
         )
     )
     with pytest.raises(LogError, match="a record of m1 cannot be read"):

@@ -8,13 +8,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import trilat_net
-from tests.analysis import logs
-from tests.analysis.certificate import runs
-from tests.chains import six_joints
+from tests.analysis.builders import make_busy_run, make_diverged_log, make_run, make_short_log
 from tests.control_laws.law_settings import LAWS as PLUGGED_LAWS
 from tests.core.guarded_runs import guarded, stopped_log
+from tests.log.builders import add_clock_readings, rewrite_log
+from tests.scenario.builders import planar_task_text, posed_task_text, six_joint_text
 from tests.sites.sessions import Session, gliding, reached
-from tests.task_arms import planar_task, posed_arms
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
@@ -96,8 +95,8 @@ def in_fault() -> Log:
 
 def torn(ticks: int, *sites: str) -> Log:
     """Returns a log that ends after few ticks, without some sites."""
-    whole = logs.timed(logs.simulated("paper"))
-    return logs.rewritten(
+    whole = add_clock_readings(make_short_log("paper"))
+    return rewrite_log(
         whole,
         lambda record: record.tick < ticks and record.site in (sites or whole.sites),
         finished=False,
@@ -107,8 +106,8 @@ def torn(ticks: int, *sites: str) -> Log:
 
 def with_gaps() -> Log:
     """Returns a log in which a site has single records between gaps."""
-    return logs.rewritten(
-        logs.simulated("paper"), lambda record: record.site != "m1" or record.tick % 100 == 0
+    return rewrite_log(
+        make_short_log("paper"), lambda record: record.site != "m1" or record.tick % 100 == 0
     )
 
 
@@ -123,11 +122,11 @@ VARIED: dict[str, MakeLog] = {
     ),
     **{f"law {law}": partial(run_with_law, law) for law in LAW_SETTINGS},
     "six joints": lambda: trilat_net.simulate(
-        parse_scenario(six_joints(1.0), overrides={"rate_hz": 200})
+        parse_scenario(six_joint_text(1.0), overrides={"rate_hz": 200})
     ),
-    "planar task": lambda: trilat_net.simulate(parse_scenario(planar_task(rate_hz=200))),
+    "planar task": lambda: trilat_net.simulate(parse_scenario(planar_task_text(rate_hz=200))),
     "posed task": lambda: trilat_net.simulate(
-        parse_scenario(posed_arms(1.0), overrides={"rate_hz": 200})
+        parse_scenario(posed_task_text(1.0), overrides={"rate_hz": 200})
     ),
     "carried bodies": lambda: simulate(
         "paper",
@@ -138,13 +137,13 @@ VARIED: dict[str, MakeLog] = {
             }
         },
     ),
-    "four sites": lambda: logs.timed(logs.simulated("four")),
-    "live change": lambda: logs.busy().log,
+    "four sites": lambda: add_clock_readings(make_short_log("four")),
+    "live change": lambda: make_busy_run().log,
     "stop and enable": stopped_log,
     "orders in a session": lambda: run_session(gliding(4.0), ((1.5, "stop"), (3.0, "enable"))),
     "fault": in_fault,
-    "diverged": logs.diverged,
-    "everything": lambda: runs.run("rich").log,
+    "diverged": make_diverged_log,
+    "everything": lambda: make_run("rich").log,
     "no record": lambda: torn(0),
     "one record a site": lambda: torn(1),
     "one of three sites": lambda: torn(200, "m1"),

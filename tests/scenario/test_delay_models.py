@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.core.channels import Ints, channel, due
+from tests.core.builders import Ints, compute_due_ns, make_channel
 from tests.scenario.links import links
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import MAX_DELAY_US, DelayKind
@@ -39,7 +39,7 @@ def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
     assert loaded.describe()
     points = loaded.points
     model = loaded.to_core_model()._replace(trace_count=0 if points is None else len(points))
-    fates: Ints = due(channel([model], points=points), 50)
+    fates: Ints = compute_due_ns(make_channel([model], points=points), 50)
     kept = fates[fates != LOST]
     assert (kept >= 0).all()
 
@@ -232,7 +232,7 @@ def test_extreme_numbers_are_refused_or_have_moments(
     if model_of_link.find_problem() is None:
         assert all(math.isfinite(number) and number >= 0 for number in model_of_link.moments())
         assert model_of_link.to_core_model().kind in set(DelayKind)
-        assert due(channel([model_of_link.to_core_model()]), 3).min() >= 0
+        assert compute_due_ns(make_channel([model_of_link.to_core_model()]), 3).min() >= 0
 
 
 def test_traces_may_reach_the_limit() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.scenario.chains import six
+from tests.scenario.builders import make_six_joint_scenario
 from tests.unit_arm import unit_scenario
 from trilat_net.app.cli.options import list_laws
 from trilat_net.errors import ScenarioError
@@ -76,7 +76,7 @@ def test_chains_are_described_by_joint() -> None:
         .read_text()
         .replace('effort="28" velocity', "velocity", 1)
     )
-    text = "\n".join(describe_scenario(six(urdf={"arm6.urdf": unlimited})))
+    text = "\n".join(describe_scenario(make_six_joint_scenario(urdf={"arm6.urdf": unlimited})))
     first = "  shoulder_pan moves shoulder, 3.7 kg; -6.283 to 6.283 rad; 150 N m; 3.142 rad/s; drive 0.2 kg m^2"
     assert (
         f"arm of m1, m2, s: arm6.urdf, 6 joints from base to flange, 17.05 kg move\n{first}\n"

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.scenario.chains import six
+from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.core.arms.chain import Matrix
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_embedded
@@ -315,8 +315,8 @@ def test_link_keys_enter_text_and_hash() -> None:
     assert heavier.arms["s"].theta[0] == 0.6
     assert heavier.sha256 != scenario.sha256
     assert load_scenario(heavier, {"arm.links.yaw.mass_kg": 0.5}).sha256 == scenario.sha256
-    assert "arm.links" not in six().text
-    assert "balance" not in six().text
+    assert "arm.links" not in make_six_joint_scenario().text
+    assert "balance" not in make_six_joint_scenario().text
 
 
 def test_overrides_reach_links_of_arms() -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.core.channels import channel, due
+from tests.core.builders import compute_due_ns, make_channel
 from tests.dropped_files import look, put_beside
 from trilat_net.core.arms.exogenous import torque_on_arm, torque_source_rows
 from trilat_net.scenario.delay_models import DELAY_MODELS
@@ -161,8 +161,8 @@ def test_a_compliant_body_always_dissipates(
 
 def test_low_orbit_paths_last_their_slot() -> None:
     model = LowOrbit(floor_ms=20.0, path_ms=50.0, jitter_ms=0.0, slot_s=0.1)
-    fates = due(
-        channel(
+    fates = compute_due_ns(
+        make_channel(
             [model.to_core_model()._replace(trace_count=len(model.points))], points=model.points
         ),
         1000,

@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.virtual_runs import Run, trajectories
+from tests.execution.builders import Trajectories, make_trajectories
 from trilat_net.scenario import load_scenario
 
 
-def run_shipped(name: str, overrides: dict[str, Any] | None = None) -> Run:
-    return trajectories(load_scenario(name, {"expect": {}, **(overrides or {})}))
+def run_shipped(name: str, overrides: dict[str, Any] | None = None) -> Trajectories:
+    return make_trajectories(load_scenario(name, {"expect": {}, **(overrides or {})}))
 
 
-def ages(run: Run) -> np.ndarray:
+def ages(run: Trajectories) -> np.ndarray:
     used = run.stack("used")
     ticks = np.arange(used.shape[1])[None, :, None]
     age_ticks: np.ndarray = (ticks - used)[used >= 0]

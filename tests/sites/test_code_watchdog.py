@@ -16,7 +16,7 @@ from sites.code_watchdog import (
     CodeWatchdog,
     WatchedCode,
 )
-from tests.core.sites import setup
+from tests.core.builders import make_site_setup
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
@@ -121,7 +121,7 @@ class Hanging:
 
 
 def test_a_hanging_law_is_stopped() -> None:
-    site = Site(setup("s", "two_sites")._replace(law_factory=Hanging))
+    site = Site(make_site_setup("s", "two_sites")._replace(law_factory=Hanging))
     before = signal.getsignal(signal.SIGALRM)
     watched = WatchedCode(
         "the law laws:Hanging", 1000, fail_of("s", "laws:Hanging"), SystemClock()

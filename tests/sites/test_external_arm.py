@@ -22,10 +22,10 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
-from tests.analysis.logs import rewritten
+from tests.log.builders import rewrite_log
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from tests.scenario.chains import six
+from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.analysis.file_overview import info, summarise_run
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.core.step.site_step import Site
@@ -158,10 +158,12 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
     execution.
     """
     changes = {**ARM, "duration_s": 0.3}
-    Site(six(**changes).setup("s")).step(TickInput(0))  # compiles, before anybody waits
+    Site(make_six_joint_scenario(**changes).setup("s")).step(
+        TickInput(0)
+    )  # compiles, before anybody waits
     sent: list[list[float]] = []
-    session = Session.whole(six(**changes), tmp_path, ends={})
-    start = six().sites["s"].q0_rad
+    session = Session.whole(make_six_joint_scenario(**changes), tmp_path, ends={})
+    start = make_six_joint_scenario().sites["s"].q0_rad
     session.stranger(
         driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000
     )
@@ -176,7 +178,7 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
 
 
 def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
-    scenario = six(**ARM)
+    scenario = make_six_joint_scenario(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
     session.stranger(
         driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND
@@ -284,7 +286,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     def delay(state: State) -> State:
         return msgspec.structs.replace(state, late_us=1000 if state.tick in (7, 9) else 1)
 
-    late = rewritten(log, change=delay)
+    late = rewrite_log(log, change=delay)
     page = render_loops(late, summarise_run(late))
     assert "; 4 ticks began a period or more late and were made all the same; " in page
     assert f"{skipped} ticks were skipped." in page

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.chains import six_joints
+from tests.scenario.builders import six_joint_text
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
@@ -49,7 +49,7 @@ def listen_to_sites(
     [
         load_scenario("two_sites", {"duration_s": 0.25, "sites.m.rate_hz": 333}),
         load_scenario("two_sites", {"duration_s": 0.1, "rate_hz": 4000}),
-        parse_scenario(six_joints(0.25)),
+        parse_scenario(six_joint_text(0.25)),
     ],
     ids=["two joints", "four ticks a millisecond", "six joints"],
 )

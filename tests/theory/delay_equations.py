@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from tests.virtual_runs import sampled
+from tests.execution.builders import sample_records
 from trilat_net.scenario import load_scenario
 
 Array = NDArray[np.float64]
@@ -192,7 +192,7 @@ def exact(name: str) -> DelayEquations:
 @cache
 def distance(name: str, scheme: str, rate_hz: int) -> float:
     """Returns max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
-    trajectory_at_times = sampled(
+    trajectory_at_times = sample_records(
         load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S
     )
     return float(

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.execution.builders import Trajectories, make_shipped_trajectories
 from tests.theory.delay_equations import DURATION_S, inertia, theta_of
-from tests.virtual_runs import Run, run
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def left_null_vector(scenario) -> Array:
     return beta / beta.sum()
 
 
-def balance(run: Run, beta: Array) -> Balance:
+def balance(run: Trajectories, beta: Array) -> Balance:
     """Computes the balance of a run whose sites share one rate."""
     scenario = run.scenario
     names = list(scenario.sites)
@@ -87,7 +87,7 @@ def balance(run: Run, beta: Array) -> Balance:
 
 def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Balance:
     """Returns the balance of a shipped scenario."""
-    trajectory_of_run = run(
+    trajectory_of_run = make_shipped_trajectories(
         name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
     )
     return balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))

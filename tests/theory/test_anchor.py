@@ -11,10 +11,10 @@ Dominance is force sharing: at rest, with equal Kp Lambda and known gravity, sum
 import numpy as np
 import pytest
 
+from tests.execution.builders import make_shipped_trajectories, sample_records
 from tests.theory.delay_equations import theta_of
 from tests.theory.energy import left_null_vector
 from tests.theory.figures_of_runs import measured, value
-from tests.virtual_runs import run, sampled
 from trilat_net.scenario import load_scenario
 
 G = 9.81
@@ -48,12 +48,12 @@ def test_the_final_pose_follows_from_the_first_estimates(
     name: str, delay_s: float, end_s: float, bar: dict[str, float]
 ) -> None:
     """The least delay is one period."""
-    end = sampled(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
+    end = sample_records(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
     assert np.sin(angles(end)) == pytest.approx(predicted(name, max(delay_s, PERIOD_S)), **bar)
 
 
 def test_gravity_alone_is_learnt() -> None:
-    theta_hat = sampled(load_scenario("paper"), (60.0,))[0, -1, 12:]
+    theta_hat = sample_records(load_scenario("paper"), (60.0,))[0, -1, 12:]
     assert theta_hat[3:] == pytest.approx([2.0, 1.0], abs=0.02)
     assert theta_hat[2] < 0.0  # inertial estimates are free to be anything
 
@@ -63,7 +63,7 @@ def test_the_derivations_integral_is_conserved(name: str) -> None:
     """theta_hat_4 + Gamma g (sin q1 + int cos(q1) Lambda e1 dt), whatever the hands do; the
     same with q1 + q2.
     """
-    trajectory_of_run = run(name, {"duration_s": 20.0})
+    trajectory_of_run = make_shipped_trajectories(name, {"duration_s": 20.0})
     for site in trajectory_of_run.sites.values():
         e = site.q - site.q_des
         turned = np.stack([site.q[:, 0], site.q.sum(axis=1)], axis=1)
@@ -82,8 +82,8 @@ def test_hands_see_115_nm_per_rad() -> None:
     hands = [
         {"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}
     ]
-    rest = sampled(load_scenario("paper_rods").without_hands(), (20.0,))
-    pushed = sampled(
+    rest = sample_records(load_scenario("paper_rods").without_hands(), (20.0,))
+    pushed = sample_records(
         load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,)
     )
     pushed_angles, from_where = angles(pushed), angles(rest)
@@ -102,9 +102,9 @@ def test_small_gains_let_arms_hang() -> None:
     """Gamma = 0.1: |sin q1(inf)| would have to be 1.7."""
     hanging = load_scenario("paper", {"control.Gamma": 0.1}).without_hands()
     assert predicted("paper", 0.2)[0] / 0.1 < -1.0
-    assert sampled(hanging, np.arange(20.0, 30.0, 0.01))[2, :, 0].mean() == pytest.approx(
-        -np.pi / 2, abs=0.1
-    )
+    assert sample_records(hanging, np.arange(20.0, 30.0, 0.01))[
+        2, :, 0
+    ].mean() == pytest.approx(-np.pi / 2, abs=0.1)
 
 
 LOAD_NM = 5.0

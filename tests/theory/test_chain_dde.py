@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from tests.core.chain_references import Array
+from tests.execution.builders import sample_records
 from tests.theory.chain_motion import TIMES_S, exact_motion, pushed_chains
-from tests.virtual_runs import sampled
 
 LONG_TIMES_S = np.arange(0.05, 10.01, 0.05)
 
 
 def motion(rate_hz: int, times_s: Array) -> Array:
     """Returns q of the tick at each of these times, shape (3, K, 6)."""
-    motion_at_times = sampled(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
+    motion_at_times = sample_records(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
     return motion_at_times[..., :6]
 
 

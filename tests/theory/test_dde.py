@@ -6,8 +6,8 @@ Eq. (6), (8)-(10), (13), (15) in continuous time, to which the sampled runs must
 import numpy as np
 import pytest
 
+from tests.execution.builders import sample_records
 from tests.theory.delay_equations import TIMES_S, distance, equations, exact, order
-from tests.virtual_runs import sampled
 from trilat_net.scenario import load_scenario
 
 
@@ -42,7 +42,7 @@ def test_the_comparison_detects_delays_one_tick_off() -> None:
     tests of their own.
     """
     early, right, late = (
-        sampled(load_scenario("paper", {"link.delay_ms": delay_ms}), TIMES_S)[..., :2]
+        sample_records(load_scenario("paper", {"link.delay_ms": delay_ms}), TIMES_S)[..., :2]
         for delay_ms in (199.0, 200.0, 201.0)
     )
     for slipped in (early, late):

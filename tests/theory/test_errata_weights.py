@@ -9,8 +9,8 @@ import pytest
 import sympy as sp
 from scipy.optimize import linprog
 
+from tests.execution.builders import make_shipped_trajectories
 from tests.theory.energy import balance
-from tests.virtual_runs import run
 from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     find_closed_groups,
@@ -240,7 +240,9 @@ def test_sites_that_nobody_follows_still_settle() -> None:
     rows = {
         f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()
     }
-    trajectory_of_run = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
+    trajectory_of_run = make_shipped_trajectories(
+        "free", {**rows, "rate_hz": 200, "duration_s": 25.0}
+    )
     locked = balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
     assert np.diff(locked).max() <= 1e-6 * locked.max()
     alone = balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from tests.execution.builders import run_fused
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import find_equilibrium, floquet
@@ -18,7 +19,6 @@ from trilat_net.analysis.theory.floquet import (
     find_samples_in_use,
 )
 from trilat_net.analysis.theory.operating_point import OperatingConditions
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.sample_uses import draw_used_samples
 
@@ -96,8 +96,7 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
 
 def speeds(scenario: Scenario) -> list[Array]:
     """Returns the joint speeds of every record of each site."""
-    run = FusedRun(scenario, keep=max(map(scenario.ticks, scenario.names)))
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario, keep=max(map(scenario.ticks, scenario.names)))
     assert run.diverged_s is None
     columns = scenario.layout(scenario.names[0]).columns()["qd"]
     return [rows[:, columns] for _, rows in run.pop_records()]

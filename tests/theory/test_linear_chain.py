@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
 from trilat_studies.sweep.stability_map import evaluate_criterion
 
-from tests.chains import two_arms
 from tests.core.chain_references import ARMS
+from tests.scenario.builders import two_arm_text
 from tests.theory.loops import Array, residual, roots_within
 from trilat_net.analysis.theory import find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
@@ -52,7 +52,7 @@ from trilat_net.scenario.scenario_reader import parse_scenario
 POSE = (0.0, -1.1, 1.2, -0.4, 0.3, 0.1)
 LOADED = [2, 3, 4, 5, 6]
 """Joints of arm6 that gravity loads: not the first, whose axis is upright."""
-TEXT = two_arms("arm6.urdf", POSE, 20.0, 50.0, [0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+TEXT = two_arm_text("arm6.urdf", POSE, 20.0, 50.0, [0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
 LAWS: dict[str, dict[str, Any]] = {
     "adaptive": {
         "law": "adaptive",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.core.chain_references import ARMS
-from tests.task_arms import planar_task, posed_arms
+from tests.scenario.builders import planar_task_text, posed_task_text
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import (
@@ -169,7 +169,7 @@ def realise(outputs: Array, step_s: float, order: int) -> Array:
 
 def settled(name: str) -> tuple[Scenario, Equilibrium]:
     """Returns a scenario at the mean of its start poses, with estimates that are true."""
-    texts = {"planar": planar_task(), "posed": posed_arms()}
+    texts = {"planar": planar_task_text(), "posed": posed_task_text()}
     light = {"control.Kp": 2.0, "control.Gamma": 5.0} if name == "posed" else {}
     scenario = (
         parse_scenario(texts[name], name, light, ARMS) if name in texts else load_scenario(name)
@@ -258,7 +258,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     verdict changes.
     """
     law = {"law": "p_d", "K": 120.0, "d": 12.0}
-    scenario = parse_scenario(planar_task(), "planar", {"control": law})
+    scenario = parse_scenario(planar_task_text(), "planar", {"control": law})
     pose = find_mean_pose(scenario)
     analysis = analyse_linear_loop(scenario, pose=pose)
     end = analysis.margin.intervals[0].high
@@ -278,7 +278,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
 
 
 def test_poses_without_loop_are_refused_by_name() -> None:
-    scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 1e-6})
+    scenario = parse_scenario(planar_task_text(), "planar", {"task.singular_value": 1e-6})
     with pytest.raises(ScenarioError, match="rests in a singular pose") as refused:
         find_equilibrium(scenario, (2.0, 0.0, 0.0))
     assert refused.value.path == "sites.m.task.axes"
@@ -291,6 +291,6 @@ def test_poses_without_loop_are_refused_by_name() -> None:
 
 
 def test_rests_near_singular_poses_include_damping() -> None:
-    scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 0.9})
+    scenario = parse_scenario(planar_task_text(), "planar", {"task.singular_value": 0.9})
     analysis = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
     assert any("rests near a singular pose" in note for note in analysis.notes)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net as tn
-from tests.virtual_runs import simulate_with_commands
+from tests.execution.builders import make_log_with_commands, run_fused
 from trilat_net.analysis.delay_period import find_burst_interval_s, find_final_delay_period
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import RunEnd
@@ -20,7 +20,6 @@ from trilat_net.analysis.theory.loop_roots import (
     resolve_final_scenario,
 )
 from trilat_net.analysis.timeline import list_effective_commands
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 
 PAIR = {
@@ -63,8 +62,7 @@ def measure_growth(scenario: Scenario, until_s: float) -> float:
     A least-squares line through the maxima of 1 s averages over the beat between the motion and
     the period of the delays.
     """
-    run = FusedRun(scenario)
-    run.advance_to(until_s)
+    run = run_fused(scenario, until_s)
     speeds = np.max([buckets[:, 2:4].max(axis=1) for buckets in run.buckets], axis=0)
     seconds = len(speeds) // 20
     maxima = speeds[: 20 * seconds].reshape(seconds, 20).max(axis=1)
@@ -169,8 +167,7 @@ def test_trace_that_has_ended_is_its_last_delay(tmp_path: Path) -> None:
 
 def test_log_and_fused_run_have_the_same_roots() -> None:
     scenario = pair(duration_s=10.0)
-    run = FusedRun(scenario)
-    run.advance_to(10.0)
+    run = run_fused(scenario, 10.0)
     assert find_run_roots(scenario, run) == find_log_roots(tn.simulate(scenario))
 
 
@@ -182,7 +179,7 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     """From 200 ms to 200 ms, and the same factors again."""
     scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
     same_shares = {"dominance": "s", "to": dict(scenario.dominance["s"]), "ramp_s": 0.0}
-    log = simulate_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))
+    log = make_log_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))
     plain = tn.simulate(scenario)
     assert log.changes("s")
     assert list_effective_commands(log) == []
@@ -193,13 +190,13 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
 
 def test_roots_follow_the_last_command() -> None:
     scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
-    log = simulate_with_commands(scenario, "s", (3.0, SLOWER))
+    log = make_log_with_commands(scenario, "s", (3.0, SLOWER))
     final = resolve_final_scenario(log)
     assert [change.link for change in final.timeline] == ["m->s"]
     slower = pair(**{"link.delay_ms": 200.0, "links.m->s": SLOWER["to"], "duration_s": 14.0})
     expected = find_log_roots(tn.simulate(slower)).rate_per_s
     assert find_log_roots(log).rate_per_s == pytest.approx(expected, abs=1e-5)
-    back = simulate_with_commands(scenario, "s", (3.0, SLOWER), (5.0, SAME))
+    back = make_log_with_commands(scenario, "s", (3.0, SLOWER), (5.0, SAME))
     assert len(list_effective_commands(back)) == 2
     unchanged = find_log_roots(tn.simulate(scenario)).rate_per_s
     assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)

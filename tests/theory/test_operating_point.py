@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.virtual_runs import trajectories
+from tests.execution.builders import make_trajectories
 from trilat_net.analysis.theory.equilibrium import extend_scenario
 from trilat_net.analysis.theory.operating_point import (
     OperatingConditions,
@@ -131,7 +131,7 @@ def test_constant_delay_is_used_from_next_tick(delay_ms: float, rate_hz: int) ->
 def test_the_mean_is_that_of_a_run(overrides: dict[str, object]) -> None:
     chosen = load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 500, **overrides})
     age = compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])
-    run = trajectories(chosen).sites["s"]
+    run = make_trajectories(chosen).sites["s"]
     used = run.used[:, 0]
     ages_s = (run.t_s - used / chosen.sites["m"].rate_hz)[used >= 0]
     assert age.mean_s == pytest.approx(ages_s.mean(), abs=1e-5)

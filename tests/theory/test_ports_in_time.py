@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.execution.builders import make_trajectories
 from tests.theory.networks import Array, Complex, hold_by_spring
-from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.analysis.theory.port_analysis import linearise_teleoperator
@@ -43,7 +43,7 @@ def measure_admittance(
     push[:, 0], push[:, joint] = t_s, AMPLITUDE_NM * np.sin(2.0 * np.pi * hz * t_s)
     torque = {"kind": "recorded", "points": push.tolist()}
     hands = [*overrides.get("sites.m.hands", []), torque]
-    run = trajectories(
+    run = make_trajectories(
         load_scenario(name, {**overrides, "sites.m.hands": hands, "duration_s": duration_s})
     )
     late = run.sites["m"].t_s >= settled_s

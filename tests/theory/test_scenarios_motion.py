@@ -14,11 +14,10 @@ A figure "at t" is the largest |e| of the two seconds from t on.
 import numpy as np
 import pytest
 
+from tests.execution.builders import run_fused, sample_records
 from tests.theory.figures_of_runs import Overrides, approximate_figure, measured, peak, value
-from tests.virtual_runs import sampled
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 
 NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
@@ -48,8 +47,7 @@ SETTLED_S = {
     ],
 )
 def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
-    fused_run = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
-    fused_run.advance_to(30.0)
+    fused_run = run_fused(load_scenario("free", {"link.delay_ms": delay_ms}), 30.0)
     assert fused_run.settled_s == approximate_figure(settled_s, 0.1)
 
 
@@ -57,7 +55,7 @@ def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: f
 def test_free_motions_error_grows_with_delay() -> None:
     times_s = np.arange(0.02, 20.01, 0.02)
     runs = [
-        sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
+        sample_records(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
         for delay_ms in SETTLED_S
     ]
     rms = [float(np.sqrt(((run[..., :2] - run[..., 4:6]) ** 2).mean())) for run in runs]
@@ -86,7 +84,7 @@ def test_about_one_rest_some_delay_damps_common_motion(
     ("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)]
 )
 def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: float) -> None:
-    last = sampled(load_scenario(name), (20.0,))[:, -1]
+    last = sample_records(load_scenario(name), (20.0,))[:, -1]
     assert np.abs(last[:, :2] - last[:, 4:6]).max() == pytest.approx(error, rel=0.15)
     assert np.abs(last[:, 2:4]).max() == pytest.approx(speed, rel=0.15)
 
@@ -94,7 +92,7 @@ def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: 
 def test_the_papers_hands_hardly_move_joint_1() -> None:
     paper = load_scenario("paper")
     pushed, alone = (
-        sampled(scenario_run, np.arange(0.01, 20.01, 0.01))[..., :2]
+        sample_records(scenario_run, np.arange(0.01, 20.01, 0.01))[..., :2]
         for scenario_run in (paper, paper.without_hands())
     )
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
@@ -363,6 +361,5 @@ def test_play_out_makes_the_jittered_run_diverge() -> None:
 def test_order_makes_jitter_exceed_its_limits(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
-    fused_run = FusedRun(load_scenario("jitter", changes))
-    fused_run.advance_to(40.0)
+    fused_run = run_fused(load_scenario("jitter", changes), 40.0)
     assert (fused_run.diverged_s is not None) is leaves

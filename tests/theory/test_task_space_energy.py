@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from tests.execution.builders import make_shipped_trajectories
 from tests.theory.energy import DURATION_S, balance, booked, left_null_vector, order
-from tests.virtual_runs import run
 
 Vector = NDArray[np.float64]
 T, G = 0.3, 9.81
@@ -159,7 +159,7 @@ def test_beta_of_ones_usually_fails() -> None:
     (20), which is the right null vector, not the left one. Ones work only if columns sum to
     one.
     """
-    trajectory_of_run = run("asymmetric", {"duration_s": DURATION_S})
+    trajectory_of_run = make_shipped_trajectories("asymmetric", {"duration_s": DURATION_S})
     assert balance(trajectory_of_run, np.full(3, 1 / 3)).residual > 1e-2
 
 
@@ -188,7 +188,7 @@ def test_scaled_kd_needs_beta_divided_alike() -> None:
         "m2": {"m1": 0.8, "s": 0.2},
         "s": {"m1": 0.8, "m2": 0.2},
     }
-    trajectory_of_run = run(
+    trajectory_of_run = make_shipped_trajectories(
         "free",
         {
             **{

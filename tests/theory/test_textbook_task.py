@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.core.chain_references import ARMS
-from tests.task_arms import planar_task, posed_arms
+from tests.scenario.builders import planar_task_text, posed_task_text
 from trilat_net.analysis.theory.site_dynamics import (
     COMPLEX_STEP,
     SiteRates,
@@ -67,7 +67,7 @@ def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
     """Returns a site whose torques have no limit, under a plain digital scheme."""
     control = LAWS.get(law, {"law": "p_f", "K": 30.0, "d": 4.0, "k_f": 0.4})
     given_changes = {"control": control, "scheme": "digital", **overrides}
-    written = planar_task() if text == "planar" else posed_arms()
+    written = planar_task_text() if text == "planar" else posed_task_text()
     scenario = parse_scenario(written, text, given_changes, ARMS)
     return scenario.setup(site)._replace(tau_limit_nm=(1e9,), qd_limit_rad_s=(1e9,))
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.execution.builders import make_trajectories
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
-from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory import find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum, compute_delay_spectrum
 from trilat_net.analysis.theory.floquet import (
@@ -104,7 +104,7 @@ def test_small_deviations_follow_runs_tick_by_tick(
         np.array([start.get(name, 0.0) for name in names]),
         uses_trapezoid=law == "sync" or scheme == "second_order",
     )
-    run = trajectories(scenario)
+    run = make_trajectories(scenario)
     q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(
         pose, 2
     )
@@ -184,7 +184,7 @@ def test_a_growing_swing_matches_a_run() -> None:
     spectrum = compute_sampled_spectrum(now, rest, 2)
     assert spectrum is not None
     root = spectrum.roots[0].s
-    run = trajectories(scenario).sites["m"]
+    run = make_trajectories(scenario).sites["m"]
     late = run.t_s > 8.0
     distance = np.abs(run.q - run.q_des)[late, 0]
     half = round(np.pi / root.imag * 50)

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 import trilat_net
+from tests.analysis.builders import JITTER, LYAPUNOV, find_relative_residual, make_run
 from tests.analysis.rough_arms import rough_log
-from tests.chains import six_joints
 from tests.core.guarded_runs import adaptive_text, stopped_log
-from tests.task_arms import planar_task
+from tests.execution.builders import make_shipped_trajectories
+from tests.scenario.builders import planar_task_text, six_joint_text
 from tests.theory.delay_equations import DelayEquations, equations, inertia
 from tests.theory.energy import balance as balance_by_hand
 from tests.theory.energy import left_null_vector
-from tests.virtual_runs import run
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
     compute_energy_balance,
@@ -31,8 +31,6 @@ from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from trilat_net.presentation.premise_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
-
-from . import runs
 
 CAUGHT = 1e-3
 """A residual, as a share of the largest energy, that no log of these has by itself."""
@@ -45,7 +43,7 @@ def of_largest_v(b: EnergyBalance) -> float:
 def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
     rates = fine_hz // 2, fine_hz
     coarse, fine = (
-        of_largest_v(runs.run(name, {**overrides, "rate_hz": hz}).balance) for hz in rates
+        of_largest_v(make_run(name, {**overrides, "rate_hz": hz}).balance) for hz in rates
     )
     return float(np.log2(coarse / fine))
 
@@ -54,24 +52,24 @@ def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
     "name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"]
 )
 def test_balance_closes_to_2e_5_with_second_order(name: str) -> None:
-    assert of_largest_v(runs.run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
+    assert of_largest_v(make_run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
     assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
 
 
 def test_balance_closes_until_both_hands_let_go() -> None:
     """At a tenth of the rate a hundred times the error is allowed."""
-    assert of_largest_v(runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
+    assert of_largest_v(make_run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
 
 
 def test_digital_closes_to_some_percent_with_first_order() -> None:
-    b = runs.run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
+    b = make_run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
     assert of_largest_v(b) == pytest.approx(3.2e-2, rel=0.2)
     assert order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
     assert np.abs(b.unexplained).max() <= 4e-5 * b.scale
 
 
 def test_jitter_closes_to_1e_4_with_booked_jumps() -> None:
-    b = runs.run("free", runs.JITTER).balance
+    b = make_run("free", JITTER).balance
     links = np.sum([x for name, x in b.work.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
     assert np.abs(b.residual + links).max() / b.V.max() >= 3e-3
@@ -80,7 +78,7 @@ def test_jitter_closes_to_1e_4_with_booked_jumps() -> None:
 
 def test_jitter_is_of_order_one_at_least() -> None:
     """Over some seeds together: the jumps of a run depend on its draws, and errors cancel to order 1.5."""
-    seeds = [{**runs.JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
+    seeds = [{**JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
     orders = [order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
 
@@ -91,7 +89,7 @@ def test_sampling_error_across_jumps_is_second_order() -> None:
     """
     cut = {"link.loss": 1.0, "on_stale.action": "brake", "duration_s": 1.0}
     rest = [
-        float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max())
+        float(np.abs(make_run("free", {**cut, "rate_hz": hz}).balance.unexplained).max())
         for hz in (200, 400)
     ]
     assert np.log2(rest[0] / rest[1]) == pytest.approx(2.0, abs=0.2)
@@ -104,7 +102,7 @@ def test_sampling_error_across_jumps_is_second_order() -> None:
 def test_limits_of_torque_rate_and_reference_are_booked(
     key: str, limit: float, term: str
 ) -> None:
-    b = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
+    b = make_run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
     assert np.abs(b.work[term]).max() > 0.01 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
 
@@ -118,13 +116,13 @@ def test_a_stop_and_restart_is_booked() -> None:
 
 
 def test_sampled_walls_energy_closes_to_1e_4() -> None:
-    b = runs.run("wall").balance
+    b = make_run("wall").balance
     assert b.work["walls"].max() > 1e-3
     assert of_largest_v(b) <= 1e-4
 
 
 def test_all_effects_together_close_to_1e_4() -> None:
-    b = runs.run("rich").balance
+    b = make_run("rich").balance
     assert of_largest_v(b) <= 1e-4
     assert all(
         np.abs(x).max() > 1e-4 * b.scale for name, x in b.work.items() if name not in _SILENT
@@ -151,9 +149,13 @@ TERMS = [
 def test_a_wrong_sign_or_factor_is_detected(
     name: str, group: str, term: str, factor: float
 ) -> None:
-    b = runs.run(name, runs.JITTER if name == "free" else None).balance
+    b = make_run(name, JITTER if name == "free" else None).balance
     terms = {**getattr(b, group), term: factor * getattr(b, group)[term]}
-    assert runs.relative(replace(b, **{group: terms})) > CAUGHT > 5 * runs.relative(b)
+    assert (
+        find_relative_residual(replace(b, **{group: terms}))
+        > CAUGHT
+        > 5 * find_relative_residual(b)
+    )
 
 
 def test_beta_of_ones_is_detected_and_named() -> None:
@@ -162,15 +164,15 @@ def test_beta_of_ones_is_detected_and_named() -> None:
     (20), which is the right null vector of Upsilon, not the left one.
     """
     ones = compute_energy_balance(
-        runs.run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies,
+        make_run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies,
         paper_weights=True,
     )
-    assert runs.relative(ones) > 10 * CAUGHT
+    assert find_relative_residual(ones) > 10 * CAUGHT
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
 def test_v_rises_with_the_papers_weights_only() -> None:
-    books = runs.run("free", runs.LYAPUNOV).energies
+    books = make_run("free", LYAPUNOV).energies
     ones, right = (
         compute_energy_balance(books, paper_weights=True),
         compute_energy_balance(books),
@@ -187,10 +189,10 @@ def test_balance_equals_an_independent_book(name: str) -> None:
     runs both must agree.
     """
     overrides = {"duration_s": 2.5, "rate_hz": 500}
-    run_of_program = run(name, overrides)
+    run_of_program = make_shipped_trajectories(name, overrides)
     theirs, ours = (
         balance_by_hand(run_of_program, left_null_vector(run_of_program.scenario) * 3),
-        runs.run(name, overrides).balance,
+        make_run(name, overrides).balance,
     )
     close = {"abs": 1e-12 * float(theirs.V.max())}
     assert pytest.approx(theirs.V, **close) == ours.V
@@ -204,7 +206,7 @@ def test_v_converges_to_the_exact_functional() -> None:
     """
     scenario = load_scenario("paper", {"duration_s": 2.0})
     exact = equations(scenario).solve(2.0)
-    ours = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000}).balance
+    ours = make_run("paper", {"duration_s": 2.0, "rate_hz": 1000}).balance
     for t in (0.5, 1.2, 1.9):
         k = round(t * 1000)
         assert float(ours.V[k]) == pytest.approx(_exact_v(exact, t), abs=3e-4)
@@ -279,10 +281,10 @@ def test_a_closed_group_balances_alone() -> None:
         "dominance.m2.m1": 1.0,
         "dominance.m2.s": 0.0,
     }
-    energies = runs.run("free", {**pair, "duration_s": 1.5, "rate_hz": 500}).energies
+    energies = make_run("free", {**pair, "duration_s": 1.5, "rate_hz": 500}).energies
     group = compute_energy_balance({site: energies[site] for site in ("m1", "m2")})
     assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
-    assert runs.relative(group) <= 1e-4
+    assert find_relative_residual(group) <= 1e-4
     assert group.transfer == pytest.approx(np.zeros(len(group.t_s)), abs=1e-9 * group.scale)
 
 
@@ -296,7 +298,7 @@ def unexplained(balance: EnergyBalance) -> float:
 
 def check_six(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
-    log = trilat_net.simulate(parse_scenario(six_joints(duration_s, 200.0)))
+    log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
     certificate, metrics = certify(log), compute_log_metrics(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None
@@ -328,7 +330,7 @@ def test_six_joints_close_with_the_base_parameters() -> None:
 @pytest.mark.long
 def test_energy_of_seven_joints_closes() -> None:
     text = (
-        six_joints(10.0, 200.0)
+        six_joint_text(10.0, 200.0)
         .replace("arm6", "arm7")
         .replace("[0.2, 0.2, 0.2, 0.05, 0.05, 0.05]", "0.2")
     )
@@ -389,7 +391,7 @@ def test_friction_and_stops_stand_in_arm_energies() -> None:
 
 
 def judge(rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object) -> Certificate:
-    text = planar_task(rate_hz=rate_hz, elbow_rad=elbow_rad)
+    text = planar_task_text(rate_hz=rate_hz, elbow_rad=elbow_rad)
     return certify(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
 
 
@@ -468,7 +470,7 @@ def test_following_an_axis_free_at_peers_fails() -> None:
 
 def test_orientations_have_no_v_for_a_reason() -> None:
     text = (
-        planar_task(duration_s=0.1)
+        planar_task_text(duration_s=0.1)
         .replace("position", "pose")
         .replace("[8.0, 5.0, 1.0]", "5.0")
     )
@@ -477,7 +479,7 @@ def test_orientations_have_no_v_for_a_reason() -> None:
 
 def test_false_records_break_the_balance() -> None:
     """Every site's torque is checked against the law in task space."""
-    log = trilat_net.simulate(parse_scenario(planar_task(duration_s=1.0)))
+    log = trilat_net.simulate(parse_scenario(planar_task_text(duration_s=1.0)))
     energies = compute_site_energies(log)
     motion = energies["s"].motion
     assert (

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.analysis.builders import make_run
 from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
 from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.certificate.energy_terms import (
@@ -17,8 +18,6 @@ from trilat_net.analysis.certificate.energy_terms import (
 )
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.analysis.torque_sources import TorqueSplit
-
-from . import runs
 
 ROWS = 40
 NOW = 30
@@ -173,13 +172,13 @@ def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
 
 
 def test_a_box_around_the_truth_only_dissipates() -> None:
-    given_by_box = runs.run("rich").balance.work["estimates"]
+    given_by_box = make_run("rich").balance.work["estimates"]
     assert given_by_box[-1] < -0.1
     assert np.diff(given_by_box).max() <= 1e-12
 
 
 def test_the_torque_limit_counts_when_active() -> None:
-    book = runs.run("rich").energies["s"]
+    book = make_run("rich").energies["s"]
     cut = (np.abs(book.motion.records.tau) >= book.motion.constants.tau_limit).any(axis=1)
     booked = book.work["torque limit"]
     assert cut.any()

@@ -13,7 +13,8 @@ import pytest
 from trilat_studies.tuning.tuning_report import list_energy_notes
 
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
+from tests.scenario.builders import make_scenario
 from tests.unit_arm import hand, unit_scenario
 from trilat_net.analysis.certificate.observed_energy import (
     NEGATIVE_ENERGY_MEANING,
@@ -60,17 +61,16 @@ damping_nm_s_rad = 10.0
 
 
 @cache
-def clamped(**changes: Any) -> Log:
-    """A run of a master that a hand moves, a line, and a clamped slave."""
-    overrides = {key.replace("__", "."): value for key, value in changes.items()}
-    return simulate_scenario(load_scenario(load_scenario(PAIR), overrides))
+def simulate_clamped_pair(**changes: Any) -> Log:
+    """Returns the log of a master that a hand moves, a line, and a clamped slave."""
+    return simulate_scenario(make_scenario(load_scenario(PAIR), **changes))
 
 
 def test_a_line_at_rest_is_a_spring() -> None:
     """The spring b / T lies between the hand and the clamp of the slave: its energy is half its
     force squared times T / b.
     """
-    log = clamped()
+    log = simulate_clamped_pair()
     energies = ObservedEnergy.of_log(log, own_laws=True)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
@@ -91,7 +91,7 @@ def test_waves_held_over_an_outage_add_energy() -> None:
     The hand lets go in the outage, so that the master sends less than the slave goes on using.
     """
     outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
-    log = clamped.__wrapped__(**outage, duration_s=3.2)
+    log = simulate_clamped_pair.__wrapped__(**outage, duration_s=3.2)
     certificate = certify(log, own_laws=True)
     assert certificate.observed.finding is ObservedFinding.NEGATIVE
     lowest = min(certificate.observed.least, key=lambda one: one.amount_j)
@@ -108,14 +108,14 @@ def test_waves_held_over_an_outage_add_energy() -> None:
 
 def test_books_detect_a_law_sending_too_much() -> None:
     energies = ObservedEnergy.of_log(
-        clamped(control__boost=1.01, duration_s=2.0), own_laws=True
+        simulate_clamped_pair(control__boost=1.01, duration_s=2.0), own_laws=True
     )
     assert energies.finding is ObservedFinding.BROKEN
     assert energies.residual_j > 1e-4
 
 
 def test_code_from_outside_runs_only_on_request() -> None:
-    log = clamped()
+    log = simulate_clamped_pair()
     assert ObservedEnergy.of_log(log) is None
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
     mixed = simulate_scenario(load_scenario(log.scenario, silent))
@@ -125,7 +125,7 @@ def test_code_from_outside_runs_only_on_request() -> None:
 
 
 def test_the_certificate_reports_it_in_text_and_json() -> None:
-    certificate = certify(clamped(), own_laws=True)
+    certificate = certify(simulate_clamped_pair(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(certificate)}
     assert lines[certificate.observed.text] == "ok"
     observed = certificate.to_dict()["observed"]
@@ -139,15 +139,15 @@ def test_the_certificate_reports_it_in_text_and_json() -> None:
 
 
 @cache
-def run(law: str) -> Log:
-    """A run with a clamped slave, 200 ms each way."""
+def simulate_law(law: str) -> Log:
+    """Returns the log of a law with a clamped slave and delays of 200 ms each way."""
     return simulate_scenario(pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> None:
-    log = run(law)
+    log = simulate_law(law)
     energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
@@ -166,7 +166,7 @@ def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> Non
 
 @pytest.mark.long
 def test_a_figure_shows_energies_over_time() -> None:
-    drawn = figure(run("wave"), "observed_energy")
+    drawn = figure(simulate_law("wave"), "observed_energy")
     lines, known, stored, given_curve = drawn.axes
     assert len(lines.lines) == len(known.lines) == len(stored.lines) == 2
     assert len(given_curve.lines) == 4
@@ -248,15 +248,15 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 4])
 def test_missing_law_memory_in_records_is_reported(mem: list[float]) -> None:
-    data = recorded(
+    data = make_log_bytes(
         "two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"}
     )
-    broken = edited(
+    broken = edit_log_bytes(
         data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
     )
-    assert ObservedEnergy.of_log(opened(data)).curves
+    assert ObservedEnergy.of_log(open_bytes(data)).curves
     with pytest.raises(LogError, match="a record of s does not have"):
-        ObservedEnergy.of_log(opened(broken))
+        ObservedEnergy.of_log(open_bytes(broken))
 
 
 def test_three_texts_explain_negative_energy_alike() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run
 from trilat_net.analysis.certificate.running_energy import (
     EnergyCourse,
     RecordWindow,
@@ -46,8 +46,8 @@ def joined(found: list[EnergyCourse]) -> EnergyCourse:
 @pytest.mark.parametrize("late", [0, 7])
 def test_v_while_running_equals_that_of_log(late: int) -> None:
     """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
-    whole = runs.run("rich").balance
-    course = joined(courses(runs.run("rich").log, late=late))
+    whole = make_run("rich").balance
+    course = joined(courses(make_run("rich").log, late=late))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert len(set(rows.tolist())) > 0.95 * len(whole.t_s)
     most = np.abs(whole.V).max()
@@ -57,9 +57,9 @@ def test_v_while_running_equals_that_of_log(late: int) -> None:
 
 def test_v_without_some_records_is_the_incomplete_logs() -> None:
     """Unavailable records are passed over as `certify` passes over them."""
-    log = runs.run("rich").log
+    log = make_run("rich").log
     gap = frozenset(range(700, 760))
-    whole = runs.run("rich").balance
+    whole = make_run("rich").balance
     course = joined(courses(log, without=gap))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     # the gap and the samples of it that are in use
@@ -69,7 +69,7 @@ def test_v_without_some_records_is_the_incomplete_logs() -> None:
 
 
 def test_v_begins_late_in_a_session_joined_late() -> None:
-    log, whole = runs.run("rich").log, runs.run("rich").balance
+    log, whole = make_run("rich").log, make_run("rich").balance
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running, blocks = RunningEnergy(log.scenario, windows), []
     for first in range(1200, 2400, BLOCK):
@@ -85,7 +85,7 @@ def test_v_begins_late_in_a_session_joined_late() -> None:
 
 
 def test_a_law_without_v_is_reported() -> None:
-    log = runs.run("jitter", {"duration_s": 0.3}).log
+    log = make_run("jitter", {"duration_s": 0.3}).log
     windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
     assert "p_d" in running.reason or "law" in running.reason

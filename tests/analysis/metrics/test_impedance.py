@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from tests.analysis.builders import make_run
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse, estimate_responses
-
-from .written import simulated
 
 RATE_HZ = 200
 EVERYTHING = np.ones(60 * RATE_HZ, dtype=np.bool_)
@@ -114,7 +113,7 @@ def shaken() -> dict[str, object]:
 
 def test_linear_pair_has_its_closed_form_impedance() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
-    log = simulated("two_sites", shaken())
+    log = make_run("two_sites", shaken()).log
     (measured_response,) = (
         response
         for response in compute_log_metrics(log).responses
@@ -136,7 +135,7 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
 
 def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
-    responses = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
+    responses = compute_log_metrics(make_run("contact", {"rate_hz": 200}).log).responses
     for response in responses:
         if response.kind == "impedance":
             assert response.ratio.gain is None
@@ -167,7 +166,7 @@ MULTISINE = {
 @pytest.mark.parametrize(("hand", "lines"), [(CHIRP, 15), (MULTISINE, 5)])
 def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
     """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
-    log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
+    log = make_run("two_sites", {**shaken(), "sites.m.hands": [hand]}).log
     measured_response = next(
         response
         for response in compute_log_metrics(log).responses

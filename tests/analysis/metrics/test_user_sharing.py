@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.analysis.logs import rewritten
+from tests.log.builders import rewrite_log
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_run
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
@@ -56,7 +56,7 @@ def pushed(log: Log, steps: Mapping[int, float] | None = None) -> Log:
         tau_x = [-torque for torque in PUSHES[state.site]]
         return msgspec.structs.replace(state, tau_x=tau_x, q_des=[way[state.tick], 0.0])
 
-    return rewritten(log, change=change)
+    return rewrite_log(log, change=change)
 
 
 def prescribed(ramp_s: float = 0.5, steps: Mapping[int, float] | None = None) -> Log:
@@ -108,7 +108,7 @@ def test_a_takeover_lasts_until_the_larger_share() -> None:
 def test_the_log_names_the_program_as_user() -> None:
     """m1 leads for ticks 0 to 249, and at tick 250, with equal shares, if m1 is the program."""
     event = Event(member="m1", boot=1, kind="hand", text="m1: policy takes hold at t = 0.000 s")
-    log = rewritten(prescribed(), others=[event])
+    log = rewrite_log(prescribed(), others=[event])
     figure = measure_run(log, ["intervention_share"])["intervention_share"]
     assert figure.value == pytest.approx(149.0 / 400.0)
 
@@ -151,14 +151,14 @@ def test_shares_are_identified_from_motion() -> None:
         first, second = (np.array(rates[peer](state.used[peer])) for peer in ("m1", "m2"))
         return msgspec.structs.replace(state, qd=(0.6 * first + 0.4 * second).tolist())
 
-    metrics = compute_log_metrics(rewritten(prescribed(), change=change))
+    metrics = compute_log_metrics(rewrite_log(prescribed(), change=change))
     assert metrics.sites["m1"]["motion_share"].value == pytest.approx(0.6)
     assert metrics.sites["m2"]["motion_share"].value == pytest.approx(0.4)
     assert not metrics.sites["s"]["motion_share"].applies
 
 
 def test_users_moving_alike_are_not_separated() -> None:
-    log = rewritten(
+    log = rewrite_log(
         prescribed(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5])
     )
     assert "not independent" in compute_log_metrics(log).sites["m1"]["motion_share"].why
@@ -172,5 +172,5 @@ def test_contradictory_motion_of_the_slave_has_no_shares() -> None:
         moves = {"m1": [1.0, 0.0], "m2": [0.0, 1.0], "s": [5.0 * sign, 0.0]}
         return msgspec.structs.replace(state, qd=moves[state.site])
 
-    metrics = compute_log_metrics(rewritten(prescribed(), change=change))
+    metrics = compute_log_metrics(rewrite_log(prescribed(), change=change))
     assert "does not determine" in metrics.sites["m1"]["motion_share"].why

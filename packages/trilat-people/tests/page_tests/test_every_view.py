@@ -12,16 +12,15 @@ from trilat_people.experiment.trial_run import ExperimentTrial, SyntheticTrial
 from trilat_people.live_page.experiment_stage import Stage, TrialWatch
 from trilat_people.live_page.page_server import PageServer
 
-from tests.analysis.logs import BUSY, FOUR
-from tests.chains import six_joints
+from tests.analysis.builders import BUSY, FOUR
 from tests.experiments import APART, REACH, write_protocol
 from tests.live.browsers import needs_browser, shows
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.page.whole_pages import watched_page
+from tests.scenario.builders import planar_task_text, posed_task_text, six_joint_text
 from tests.sites.sessions import Session, gliding, reached
-from tests.task_arms import planar_task, posed_arms
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
@@ -93,9 +92,9 @@ SESSIONS: dict[str, Views] = {
         ),
         "m",
     ),
-    "six joints": record(parse(six_joints(3.0)), "m1"),
-    "planar task": record(parse(planar_task(3.0)), "m"),
-    "posed task": record(parse(posed_arms(3.0)), "m2"),
+    "six joints": record(parse(six_joint_text(3.0)), "m1"),
+    "planar task": record(parse(planar_task_text(3.0)), "m"),
+    "posed task": record(parse(posed_task_text(3.0)), "m2"),
     "carried bodies": record(
         load_scenario("paper", {"duration_s": 3.0, "rate_hz": 200, "sites.s.plant": CAROUSEL}),
         "m1",

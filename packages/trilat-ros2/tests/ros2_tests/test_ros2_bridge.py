@@ -42,7 +42,7 @@ from tests.log.standard_files import made
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
-from tests.task_arms import posed_arms
+from tests.scenario.builders import posed_task_text
 from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from trilat_net.app.running_session import ShareHistory
 from trilat_net.core.step.ticks import Mode, TickRecord
@@ -353,7 +353,7 @@ def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
         "six_joints",
         "unlike_arms",
         "wall_in_space",
-        pytest.param(posed_arms(), id="posed"),
+        pytest.param(posed_task_text(), id="posed"),
     ],
 )
 def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:

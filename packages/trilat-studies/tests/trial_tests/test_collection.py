@@ -24,7 +24,7 @@ from trilat_studies.measure_run import (
 )
 
 import trilat_net
-from tests.log_editing import edited, opened, recorded, without
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.core.arms.two_link_arm import end_effector_jacobian
 from trilat_net.errors import ScenarioError
 from trilat_net.log.log_reader import Log
@@ -120,15 +120,24 @@ def test_a_diverged_run_has_its_instant() -> None:
 
 
 def test_every_missing_record_of_a_log_is_counted() -> None:
-    whole = recorded("free")
-    assert measure_log(opened(whole)).missing == 0
-    assert measure_log(opened(edited(whole, record=without("s", {3, 4, 100})))).missing == 3
+    whole = make_log_bytes("free")
+    assert measure_log(open_bytes(whole)).missing == 0
     assert (
-        measure_log(opened(edited(whole, record=without("s", set(range(60, 120)))))).missing
+        measure_log(
+            open_bytes(edit_log_bytes(whole, record=drop_records("s", {3, 4, 100})))
+        ).missing
+        == 3
+    )
+    assert (
+        measure_log(
+            open_bytes(edit_log_bytes(whole, record=drop_records("s", set(range(60, 120)))))
+        ).missing
         == 60
     )
-    assert measure_log(opened(edited(whole, record=lambda _: None))).missing == 360
-    none = measure_log(opened(edited(whole, record=without("s", set(range(120))))))
+    assert measure_log(open_bytes(edit_log_bytes(whole, record=lambda _: None))).missing == 360
+    none = measure_log(
+        open_bytes(edit_log_bytes(whole, record=drop_records("s", set(range(120)))))
+    )
     assert none.missing == 120
     assert none.synchronised_at_s is none.end_spread_rad is none.ages["m1->s"].mean_ms is None
 

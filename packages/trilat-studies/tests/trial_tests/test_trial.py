@@ -14,7 +14,7 @@ from trilat_studies.run_commands import list_assignments
 from trilat_studies.trials import Trial, evaluate_live_log
 
 import trilat_net
-from tests.log_editing import edited, recorded, without
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import apply_overrides, load_scenario
 
@@ -131,7 +131,7 @@ def write_log(folder: Path, data: bytes) -> Path:
 
 
 def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
-    log = write_log(tmp_path, recorded("free"))
+    log = write_log(tmp_path, make_log_bytes("free"))
     result = evaluate_live_log(trial, log, [], 1.0)
     assert result.held
     assert [o.key for o in result.outcomes] == [
@@ -146,14 +146,16 @@ def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Pat
 
 def test_a_session_problem_fails_the_trial(trial: Trial, tmp_path: Path) -> None:
     result = evaluate_live_log(
-        trial, write_log(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
+        trial, write_log(tmp_path, make_log_bytes("free")), ["s was killed by SIGKILL"], 1.0
     )
     assert [o.key for o in result.outcomes if not o.held] == ["session"]
     assert "SIGKILL" in result.failures[0]
 
 
 def test_missing_records_fail_the_trial(trial: Trial, tmp_path: Path) -> None:
-    log = write_log(tmp_path, edited(recorded("free"), record=without("s", {50})))
+    log = write_log(
+        tmp_path, edit_log_bytes(make_log_bytes("free"), record=drop_records("s", {50}))
+    )
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
         "no_gaps",
         "executed again",
@@ -168,7 +170,7 @@ def test_a_record_that_contradicts_its_inputs_fails(trial: Trial, tmp_path: Path
             else record
         )
 
-    log = write_log(tmp_path, edited(recorded("free"), record=bent))
+    log = write_log(tmp_path, edit_log_bytes(make_log_bytes("free"), record=bent))
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
         "executed again"
     ]
@@ -180,7 +182,7 @@ def test_without_records_there_is_only_a_reason(
 ) -> None:
     log = tmp_path / "run.mcap"
     if content == "empty":
-        write_log(tmp_path, edited(recorded("free"), record=lambda _: None))
+        write_log(tmp_path, edit_log_bytes(make_log_bytes("free"), record=lambda _: None))
     elif isinstance(content, bytes):
         write_log(tmp_path, content)
     result = evaluate_live_log(trial, log, ["m1 ended with code 2"], 1.0)

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from trilat_studies.arm_gains import SHARES, ArmGains, tune_arm
 
 import trilat_net as tn
-from tests.chains import robot_files
 from tests.cli.running import trilat
+from tests.scenario.builders import find_robot_files
 from tests.sites.visits import ping_sites
 from trilat_net.errors import TrilatError
 from tuning_tests.mode_count import count_growing
@@ -61,7 +61,7 @@ def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
     if name in MAKERS:
         pytest.importorskip("pinocchio", reason="robots are not installed: make test-long")
         file, tip = MAKERS[name]
-        arm = robot_files()[file]
+        arm = find_robot_files()[file]
 
     delay_text = str(write_jitter(folder / "jitter.csv")) if delay == "jitter" else delay
     return tune_arm(arm, delay_text, tip=tip, **more)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from trilat_studies.tuning.candidate import (
     measure_candidate,
 )
 
-from tests.virtual_runs import trajectories
+from tests.execution.builders import make_trajectories
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 
@@ -170,7 +170,7 @@ def test_error_and_effort_are_the_documented_sums() -> None:
     """Errors refer to the weighted mean of the starts, and the effort leaves out gravity."""
     scenario = trio(*FIRM)
     score = scored(scenario)
-    run = trajectories(scenario)
+    run = make_trajectories(scenario)
     q, tau = run.stack("q"), run.stack("tau")
 
     # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
