@@ -29,7 +29,7 @@ def bare_environment() -> dict[str, str]:
     return {name: os.environ[name] for name in names}
 
 
-def run(*words: object, cwd: Path, **more: str) -> str:
+def run_program(*words: object, cwd: Path, **more: str) -> str:
     """Runs a program outside of the checkout; returns what it printed."""
     done = subprocess.run(
         [str(word) for word in words],
@@ -44,19 +44,19 @@ def run(*words: object, cwd: Path, **more: str) -> str:
 
 def make_sources(folder: Path) -> Path:
     """Makes the sources of all distributions in a folder, each in a folder of its own."""
-    run(sys.executable, ROOT / ".ci" / "distributions", folder, cwd=folder.parent)
+    run_program(sys.executable, ROOT / ".ci" / "distributions", folder, cwd=folder.parent)
     return folder
 
 
-def build(source: Path, folder: Path) -> list[Path]:
+def build_distributions(source: Path, folder: Path) -> list[Path]:
     """Builds a distribution: its sdist, and the wheel that is made of that sdist."""
     code = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
-    run(sys.executable, "-c", code, "build_sdist", folder, cwd=source)
+    run_program(sys.executable, "-c", code, "build_sdist", folder, cwd=source)
     (sdist,) = folder.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         archive.extractall(folder / "unpacked", filter="data")
     (unpacked,) = (folder / "unpacked").iterdir()
-    run(sys.executable, "-c", code, "build_wheel", folder, cwd=unpacked)
+    run_program(sys.executable, "-c", code, "build_wheel", folder, cwd=unpacked)
     return [sdist, *folder.glob("*.whl")]
 
 
@@ -84,7 +84,7 @@ def install(clean: Path, wheel: Path | None, libraries: set[str]) -> Path:
             "--no-index",
             wheel,
         ]
-        run(sys.executable, "-m", "pip", *onto, cwd=clean)
+        run_program(sys.executable, "-m", "pip", *onto, cwd=clean)
     (packages,) = (clean / "lib").glob("python3*/site-packages")
     for one in needed(libraries).values():
         for top in {

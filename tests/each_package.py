@@ -14,16 +14,16 @@ import tempfile
 import tomllib
 from pathlib import Path
 
+from tests.distributions import build_distributions, run_program
+
 from .distributions import (
     CORE,
     PACKAGES,
     ROOT,
     bare_environment,
-    build,
     install,
     make_sources,
     names_of,
-    run,
 )
 
 TEST_LIBRARIES = {"hypothesis", "playwright", "pytest", "pytest-timeout", "pytest-xdist"}
@@ -40,7 +40,7 @@ SOURCES = {"packages", "recorder", "sites", "trilat_net"}
 def make_environment(name: str, sources: Path, folder: Path) -> Path:
     """Makes an environment with the core, one package and the libraries of tests; returns its folder."""
     clean = folder / "clean"
-    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=folder)
+    run_program(sys.executable, "-m", "venv", "--without-pip", clean, cwd=folder)
     for distribution in (CORE, name):
         built = folder / distribution
         built.mkdir()
@@ -48,7 +48,7 @@ def make_environment(name: str, sources: Path, folder: Path) -> Path:
             (sources / distribution / "pyproject.toml").read_text(encoding="utf-8")
         )
         libraries = names_of(stated["project"]["dependencies"]) - {CORE}
-        install(clean, build(sources / distribution, built)[1], libraries)
+        install(clean, build_distributions(sources / distribution, built)[1], libraries)
     of_tests = stated.get("dependency-groups", {}).get("test", [])
     install(clean, None, TEST_LIBRARIES | names_of(of_tests))
     return clean
@@ -60,7 +60,7 @@ def make_tree(name: str, folder: Path) -> Path:
     tests = tree / "packages" / name / "tests"
     tests.parent.mkdir(parents=True)
     tests.symlink_to(ROOT / "packages" / name / "tests")
-    listed = run("git", "ls-tree", "--name-only", "HEAD", cwd=ROOT).split()
+    listed = run_program("git", "ls-tree", "--name-only", "HEAD", cwd=ROOT).split()
     for top in set(listed) - SOURCES:
         (tree / top).symlink_to(ROOT / top)
     return tree
@@ -74,7 +74,7 @@ def run_tests(name: str, sources: Path) -> int:
         tree = make_tree(name, folder)
         modules = [package.replace("-", "_") for package in PACKAGES]
         code = FOUND.format(names=modules)
-        found, origin = run(clean / "bin" / "python", "-c", code, cwd=tree).splitlines()
+        found, origin = run_program(clean / "bin" / "python", "-c", code, cwd=tree).splitlines()
         assert found == name.replace("-", "_"), found
         assert Path(origin).is_relative_to(clean), origin
         tests = f"packages/{name}/tests"

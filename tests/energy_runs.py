@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from tests.execution.builders import sample_records
-from tests.unit_arm import CLAMP, H50, hand, unit_scenario
+from tests.unit_arm import CLAMP, H50, make_spring_hand, make_unit_scenario
 from trilat_net.scenario import Scenario
 
 CONSTANT = {"model": "constant", "delay_ms": 200.0}
@@ -21,31 +21,38 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
-def pair(control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any) -> Scenario:
+def make_energy_pair(
+    control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any
+) -> Scenario:
     """A master with the hand H50 that leads only, and a slave with K and B, of laws that have them."""
     follows, leads = (
         ({}, {}) if control["law"].lower().endswith("tanks") else (FOLLOWER, LEADER)
     )
     slave = {"hands": [CLAMP] if clamped else [], "control": {**control, **follows}}
     sites = {"m": {"hands": [H50], "control": {**control, **leads}}, "s": slave}
-    return unit_scenario(sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more})
+    return make_unit_scenario(
+        sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more}
+    )
 
 
-def run_contact(
+def sample_contact_run(
     delay_ms: float, duration_s: float = 20.0, loss: float = 0.0, **more: Any
 ) -> Any:
     """A master that leads only, and a slave that 700 N m/rad and 3 N m s/rad hold; every tick."""
     law = {"law": "tdpa", **more}
     clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
     sites = {
-        "m": {"hands": [hand(0.3, 40.0, 6.0)], "control": {**law, "K": 0.0, "B": 0.0}},
+        "m": {
+            "hands": [make_spring_hand(0.3, 40.0, 6.0)],
+            "control": {**law, "K": 0.0, "B": 0.0},
+        },
         "s": {"hands": [clamp], "control": {**law, "K": 80.0, "B": 8.0}},
     }
     link = {**CONSTANT, "delay_ms": delay_ms, "loss": loss}
-    return ticked(unit_scenario(sites, law, duration_s=duration_s, link=link))
+    return sample_every_tick(make_unit_scenario(sites, law, duration_s=duration_s, link=link))
 
 
-def ticked(scenario: Scenario, every: int = 1) -> dict[str, Any]:
+def sample_every_tick(scenario: Scenario, every: int = 1) -> dict[str, Any]:
     """Returns per site arrays with a row for every so many ticks, up to the last.
 
     They are q, qd, tau, ..., and what it sends: `to_all.H` of shape (rows, length), `sent[j].u` to peer j.
@@ -76,7 +83,7 @@ def _name_columns(scenario: Scenario, name: str, rows: Any) -> Any:
     return run
 
 
-def least_energy(run: dict[str, Any]) -> float:
+def find_least_energy(run: dict[str, Any]) -> float:
     """The least energy, J, that any end of a line or coupling, or any tank, has observed."""
     energies = [run[site].to_all.H for site in run if hasattr(run[site].to_all, "H")]
     energies += [
@@ -124,7 +131,7 @@ def draw_energy_run(law: str, seed: int) -> Scenario:
     for name, to in zip(names[:-1], (0.3, -0.3), strict=False):
         k = round(float(rng.uniform(20.0, 100.0)), 1)
         sites = {
-            name: {"hands": [hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]},
+            name: {"hands": [make_spring_hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]},
             **sites,
         }
     sites = {name: sites[name] for name in names}
@@ -142,7 +149,7 @@ def draw_energy_run(law: str, seed: int) -> Scenario:
         ]
         more["dominance"] = {name: _draw_shares(rng, name) for name in names}
     control, link = {"law": law, **keys[law]}, links[rng.integers(4)]
-    return unit_scenario(sites, control, duration_s=8.0, link=link, seed=seed, **more)
+    return make_unit_scenario(sites, control, duration_s=8.0, link=link, seed=seed, **more)
 
 
 def _draw_shares(rng: np.random.Generator, name: str) -> dict[str, float]:

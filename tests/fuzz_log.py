@@ -16,6 +16,7 @@ from pathlib import Path
 import atheris  # type: ignore[import-not-found]
 
 from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.log.hostility import mangle_log
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -25,7 +26,7 @@ import trilat_net.core.step.site_step  # noqa: F401
 with atheris.instrument_imports(
     include=["trilat_net.log", "trilat_net.execution", "trilat_net.app.play", "mcap"]
 ):
-    from tests.log.hostility import mangled, read_by_all
+    from tests.log.hostility import read_by_all
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
 LOGS = (
@@ -54,7 +55,7 @@ def changed(data: bytes) -> None:
     """Runs once: a log, changed by the fuzzer's bytes, is read by all readers."""
     choices = Choices(data)
     log = LOGS[choices.randrange(0, len(LOGS))]
-    read(mangled(log, choices))
+    read(mangle_log(log, choices))
 
 
 def read(data: bytes) -> None:

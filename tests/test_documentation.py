@@ -24,7 +24,7 @@ import tomli_w
 from latex2mathml.converter import convert
 
 import trilat_net as tn
-from tests.cli.running import parses, trilat
+from tests.cli.running import assert_parses, trilat
 from tests.documentation import (
     ELSEWHERE,
     NOT_RUN,
@@ -84,7 +84,7 @@ def test_commands_parse_as_written(page: str) -> None:
     for block in find_blocks(page):
         for words, _ in read_commands(block.text) if block.language == "sh" else ():
             if words[0] == "trilat":
-                parses(words)
+                assert_parses(words)
 
 
 @pytest.mark.parametrize("page", PAGES)

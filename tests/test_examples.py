@@ -22,7 +22,7 @@ from tests.log.builders import make_log_bytes
 from tests.net.waiting import until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reached
+from tests.sites.sessions import SESSION, Session, reach_session
 from trilat_net.app.running_session import open_hand
 from trilat_net.log.ros2.topic_names import TopicTable
 from trilat_net.net.arm_client import SwitchClient
@@ -290,7 +290,7 @@ def test_programs_hand_over_without_a_step(
         def wait_s(time_s: float) -> None:
             clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
 
-        running = reached(bus, clock)
+        running = reach_session(bus, clock)
         wait_s(1.0)
         with (
             open_hand(bus, clock, SESSION, "m2", scenario) as program,
@@ -320,7 +320,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
             clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
 
         with (
-            reached(bus, clock) as running,
+            reach_session(bus, clock) as running,
             open_hand(bus, clock, SESSION, "m1", scenario) as hand,
             open_hand(bus, clock, SESSION, "m2", scenario) as follower,
         ):

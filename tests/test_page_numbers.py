@@ -32,7 +32,7 @@ from tests.cli.running import trilat
 from tests.execution.builders import run_fused, sample_records
 from tests.scenario.builders import make_overrides
 from tests.theory import delay_equations, energy
-from tests.theory.figures_of_runs import measured, value
+from tests.theory.figures_of_runs import find_value, measure_run
 from tests.theory.loops import RODS
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
 from trilat_net.analysis.theory import (
@@ -77,7 +77,9 @@ Changes = dict[str, Any]
 # -- the linear loop
 
 
-def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[float, float]:
+def find_continuous_root(
+    name: str, changes: Changes, pose: Pose | None = None
+) -> tuple[float, float]:
     analysis = analyse_linear_loop(
         load_scenario(name, changes), pose=pose, roots=1
     ).continuous.rightmost
@@ -85,7 +87,7 @@ def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[f
     return analysis.s.real, abs(analysis.s.imag)
 
 
-def root(
+def find_root(
     name: str, changes: Changes | None = None, pose: Pose | None = None
 ) -> tuple[float, float]:
     """Returns the rightmost root that decides, the upper one of a pair."""
@@ -96,7 +98,7 @@ def root(
     return analysis.s.real, abs(analysis.s.imag)
 
 
-def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
+def find_margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
     """Returns the largest common delay, ms, and the frequency there, rad/s."""
     high = (
         analyse_linear_loop(load_scenario(name, changes or {}), roots=1)
@@ -107,7 +109,7 @@ def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
     return 1e3 * high.delay_s, high.omega_rad_s
 
 
-def edge(
+def find_edge(
     name: str, key: str, low: float, high: float, changes: Changes, pose: Pose | None = None
 ) -> float:
     scenario = load_scenario(name, changes)
@@ -119,7 +121,7 @@ def edge(
 
 def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
     line = share * 10.0 * delay_ms / 1e3
-    return edge(name, "control.d", 0.05 * line, 1.2 * line, {"link.delay_ms": delay_ms})
+    return find_edge(name, "control.d", 0.05 * line, 1.2 * line, {"link.delay_ms": delay_ms})
 
 
 def common_motion() -> tuple[float, float, float]:
@@ -133,7 +135,7 @@ def common_motion() -> tuple[float, float, float]:
 # -- ports
 
 
-def ports(name: str, **changes: Any) -> PortAnalysis:
+def analyse_shipped_ports(name: str, **changes: Any) -> PortAnalysis:
     scenario = load_scenario(name, make_overrides(**changes))
     return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
@@ -145,7 +147,7 @@ def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
 
 
 def learning(delay_ms: float) -> Numbers:
-    analysed = ports("two_sites", link__delay_ms=delay_ms)
+    analysed = analyse_shipped_ports("two_sites", link__delay_ms=delay_ms)
     assert analysed.proof is not None
     assert analysed.proof.passive
     (band,), least = analysed.velocity.minima.below, analysed.velocity.minima
@@ -159,13 +161,13 @@ def learning(delay_ms: float) -> Numbers:
 
 
 def known(delay_ms: float) -> float:
-    analysed = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
+    analysed = analyse_shipped_ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
     assert analysed.velocity.passive
     return float(find_felt_impedance(analysed).ratio_db)
 
 
 def lacking() -> Numbers:
-    velocity = ports("p_d_margin_two", control__d=1.96).velocity
+    velocity = analyse_shipped_ports("p_d_margin_two", control__d=1.96).velocity
     (band,) = velocity.minima.below
     return (
         *band[:2],
@@ -177,7 +179,9 @@ def lacking() -> Numbers:
 
 def reflecting(delay_ms: float, d: float) -> PortAnalysis:
     open_ends = {"sites__m__hands": [], "sites__s__environment": []}
-    return ports("contact", **open_ends, link__delay_ms=delay_ms, sites__m__control__d=d)
+    return analyse_shipped_ports(
+        "contact", **open_ends, link__delay_ms=delay_ms, sites__m__control__d=d
+    )
 
 
 def stable_with_any(delay_ms: float, d: float) -> Numbers:
@@ -189,7 +193,7 @@ def stable_with_any(delay_ms: float, d: float) -> Numbers:
 # -- runs
 
 
-def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
+def run_shipped(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
     scenario = load_scenario(name, make_overrides(**changes))
     return run_fused(scenario, duration_s)
 
@@ -206,15 +210,18 @@ def measure_windows(
     name: str, quantity: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
     """Returns quantities of windows of a run, window by window."""
-    values = measured(name, make_overrides(**changes), *windows)
-    return [value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
+    values = measure_run(name, make_overrides(**changes), *windows)
+    return [find_value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
 
 
-def age(**changes: Any) -> float:
+def measure_age(**changes: Any) -> float:
     """Returns the mean age of the samples in use in `jitter`, ms."""
     return float(
         np.mean(
-            [one.mean_ms for one in measured("jitter", make_overrides(**changes)).ages.values()]
+            [
+                one.mean_ms
+                for one in measure_run("jitter", make_overrides(**changes)).ages.values()
+            ]
         )
     )
 
@@ -222,7 +229,7 @@ def age(**changes: Any) -> float:
 def anchored(delay_s: float, duration_s: float) -> Numbers:
     """Returns the final angle of the first joint in `paper`: predicted, and of a run."""
     predicted = math.asin(-2.0 / (G * (1.0 + delay_s)))
-    return predicted, fused("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
+    return predicted, run_shipped("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
 
 
 def pi() -> Any:
@@ -232,7 +239,7 @@ def pi() -> Any:
     return vector / vector.sum()
 
 
-def lyapunov(ones: bool = False, **changes: Any) -> EnergyBalance:
+def compute_lyapunov_balance(ones: bool = False, **changes: Any) -> EnergyBalance:
     return compute_energy_balance(
         make_run("lyapunov", make_overrides(**changes)).energies, paper_weights=ones
     )
@@ -250,7 +257,7 @@ def energy_of_healing() -> Numbers:
 
 
 @cache
-def certified(folder: Path) -> str:
+def certify_paper(folder: Path) -> str:
     trilat("sim", "paper", "-o", "run.mcap", cwd=folder)
     return trilat("certify", "run.mcap", cwd=folder).out
 
@@ -260,12 +267,15 @@ def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
-def distances(scheme: str) -> list[float]:
+def list_distances(scheme: str) -> list[float]:
     """Returns distances from the exact solution of `paper`, rad, at three rates, and the orders
     between them.
     """
-    far = [delay_equations.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
-    return [*far, *delay_equations.order("paper", scheme)]
+    far = [
+        delay_equations.measure_distance("paper", scheme, rate_hz)
+        for rate_hz in (500, 1000, 2000)
+    ]
+    return [*far, *delay_equations.measure_orders("paper", scheme)]
 
 
 def shipped_trials() -> list[Any]:
@@ -278,22 +288,26 @@ DELAYS_MS = (20, 100, 200, 400, 800, 1600)
 SETTLING_MS = (0, 20, 50, 100, 200, 400, 800)
 
 LINEAR_METHOD: dict[str, Make] = {
-    "a delay decays at {}/s": lambda: [-root("jitter")[0]],
-    "at 400 ms grows at {}/s": lambda: root("jitter", {"link.playout_ms": 400})[:1],
+    "a delay decays at {}/s": lambda: [-find_root("jitter")[0]],
+    "at 400 ms grows at {}/s": lambda: find_root("jitter", {"link.playout_ms": 400})[:1],
 }
 LINEAR: dict[str, Make] = {
     "| point masses | {} ± {} j | {} ± {} j | {} ± {} j |": lambda: [
-        part for T in (0, 200, 400) for part in continuous("free", {"link.delay_ms": T})
+        part
+        for T in (0, 200, 400)
+        for part in find_continuous_root("free", {"link.delay_ms": T})
     ],
     "| rods | {} ± {} j | {} ± {} j | {} ± {} j |": lambda: [
-        part for T in (0, 200, 400) for part in continuous("free", {"link.delay_ms": T, **RODS})
+        part
+        for T in (0, 200, 400)
+        for part in find_continuous_root("free", {"link.delay_ms": T, **RODS})
     ],
     "for good at {}, {}, {}, {}, {}, {} and {} s": lambda: [
-        fused("free", link__delay_ms=T).settled_s for T in SETTLING_MS
+        run_shipped("free", link__delay_ms=T).settled_s for T in SETTLING_MS
     ],
     "with every delay, from {} to {} rad": lambda: [rms_of_free(T) for T in (0, 800)],
     "in e: {}/s at 0, {}/s at 200 ms, {}/s at 1.6 s": lambda: [
-        root("free", {"link.delay_ms": T}, (-0.124, 0.337))[0] for T in (0, 200, 1600)
+        find_root("free", {"link.delay_ms": T}, (-0.124, 0.337))[0] for T in (0, 200, 1600)
     ],
     "| 8 | | roots | {} | {} | {} | {} | {} | {} |": lambda: [
         edge_of_p_d("p_d_margin", 0.5, T) for T in DELAYS_MS
@@ -301,15 +315,19 @@ LINEAR: dict[str, Make] = {
     "| 16 | | roots | {} | {} | {} | {} | {} | {} |": lambda: [
         edge_of_p_d("p_d_margin_two", 1.0, T) for T in DELAYS_MS
     ],
-    "the continuous loop decays at {}/s": lambda: [-continuous("paper", DIGITAL, PAPER_END)[0]],
-    "as computed grows at {}/s": lambda: root("paper", DIGITAL, PAPER_END)[:1],
-    "is stable from {} Hz on": lambda: [edge("paper", "rate_hz", 20, 400, DIGITAL, PAPER_END)],
-    "unstable, {} ± {} j": lambda: root("contact"),
-    "the margin is {} ms ({} rad/s)": lambda: margin("contact"),
-    "force gain for 200 ms is {}": lambda: [
-        edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})
+    "the continuous loop decays at {}/s": lambda: [
+        -find_continuous_root("paper", DIGITAL, PAPER_END)[0]
     ],
-    "and a margin of {} ms at them": lambda: margin("paper", {"link.delay_ms": 0})[:1],
+    "as computed grows at {}/s": lambda: find_root("paper", DIGITAL, PAPER_END)[:1],
+    "is stable from {} Hz on": lambda: [
+        find_edge("paper", "rate_hz", 20, 400, DIGITAL, PAPER_END)
+    ],
+    "unstable, {} ± {} j": lambda: find_root("contact"),
+    "the margin is {} ms ({} rad/s)": lambda: find_margin("contact"),
+    "force gain for 200 ms is {}": lambda: [
+        find_edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})
+    ],
+    "and a margin of {} ms at them": lambda: find_margin("paper", {"link.delay_ms": 0})[:1],
 }
 PORTS: dict[str, Make] = {
     **{
@@ -319,7 +337,7 @@ PORTS: dict[str, Make] = {
         for T in (0, 50, 200, 800)
     },
     "it is {} dB at T = 0 and {} dB at 200 ms": lambda: [known(0), known(200)],
-    "make it unstable, at {}-{} Hz.": lambda: ports(
+    "make it unstable, at {}-{} Hz.": lambda: analyse_shipped_ports(
         "training", timeline=[], sites__m1__hands=[], sites__m2__hands=[]
     ).absolute.below[0][:2],
     **{
@@ -334,7 +352,9 @@ PORTS: dict[str, Make] = {
     },
 }
 ERRATA: dict[str, Make] = {
-    "with ones rises by {} J of {} J while": lambda: rise(lyapunov(ones=True).V),
+    "with ones rises by {} J of {} J while": lambda: rise(
+        compute_lyapunov_balance(ones=True).V
+    ),
     "M = {}`$ kg m²": lambda: [3.0 + math.sqrt(8.0)],
     r"that is $`\dot T \le {}`$.": lambda: [6.0 / (6.0 + (6.0 + math.sqrt(8.0)) ** 2)],
 }
@@ -344,8 +364,10 @@ DAMPING: dict[str, Make] = {
         math.sqrt(asked[2]),
     ],
     r"m = {}\, K T^2 / {}`$, equal": lambda: common_motion()[1:],
-    "K T`$, grow by {}/s.": lambda: root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
-    "200 ms and $`d = 4`$ grows by {}/s": lambda: root("p_d_margin", ONE_WAY, (-0.1, 0.4))[:1],
+    "K T`$, grow by {}/s.": lambda: find_root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
+    "200 ms and $`d = 4`$ grows by {}/s": lambda: find_root("p_d_margin", ONE_WAY, (-0.1, 0.4))[
+        :1
+    ],
     "1/6 of $`K T`$ is {}, 0.2172 of it {})": lambda: [2.0 / 6.0, 2.0 * common_motion()[0]],
 }
 PORT_CONDITIONS: dict[str, Make] = {
@@ -355,9 +377,11 @@ PORT_CONDITIONS: dict[str, Make] = {
 }
 LAB: dict[str, Make] = {
     "of these arms are {}, {} and {}, so": lambda: [
-        edge("p_d_margin", "control.d", 0.5, 1.5, {"control.K": 12.0}),
-        edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
-        edge("p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}),
+        find_edge("p_d_margin", "control.d", 0.5, 1.5, {"control.K": 12.0}),
+        find_edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
+        find_edge(
+            "p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}
+        ),
     ],
     "only the first decays: {} rad at 38 s": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, "")
@@ -365,19 +389,19 @@ LAB: dict[str, Make] = {
     "against {} rad at a constant 200 ms": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, ""), **CONSTANT
     ),
-    "the age in use is {} ms on average": lambda: [age()],
-    "the order makes it {} ms": lambda: [age(link__order="in_order")],
-    "to choose from: {} ms": lambda: [age(rate_hz=100)],
+    "the age in use is {} ms on average": lambda: [measure_age()],
+    "the order makes it {} ms": lambda: [measure_age(link__order="in_order")],
+    "to choose from: {} ms": lambda: [measure_age(rate_hz=100)],
     "so {} rad, and the run ends at {}.": lambda: anchored(0.2, 20),
     "At 400 ms it is {}, and {}.": lambda: anchored(0.4, 40),
     "(1 + Lambda T) = {} N m/rad": lambda: [G**2 * 1.2],
-    "moves the slave to {} rad for good": lambda: [fused("box").q[-1, 0]],
-    "without the box it returns to {}.": lambda: [fused("box", **NO_BOX).q[-1, 0]],
+    "moves the slave to {} rad for good": lambda: [run_shipped("box").q[-1, 0]],
+    "without the box it returns to {}.": lambda: [run_shipped("box", **NO_BOX).q[-1, 0]],
     "pi = ({}, {}, {}), so": pi,
     "proportional to ({}, {}, {}).": lambda: pi() / (10.0, 3.0, 0.3),
-    "V falls from {} to {} J": lambda: lyapunov().V[[0, -1]],
-    "With ones it rises by {} of {} J": lambda: rise(lyapunov(ones=True).V),
-    "ones still fail, by {} J": lambda: rise(lyapunov(True, **EQUAL_KD).V)[:1],
+    "V falls from {} to {} J": lambda: compute_lyapunov_balance().V[[0, -1]],
+    "With ones it rises by {} of {} J": lambda: rise(compute_lyapunov_balance(ones=True).V),
+    "ones still fail, by {} J": lambda: rise(compute_lyapunov_balance(True, **EQUAL_KD).V)[:1],
     "At 20 ms one hit, then {} N.": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), link__delay_ms=20.0
     ),
@@ -427,12 +451,13 @@ PAGES: dict[str, dict[str, Make]] = {
     },
     "docs/reference/certificate-premises.md": {
         "prints its edge, {} kN/m": lambda: [
-            1e-3 * edge("windup", f"{WALL}.stiffness_n_m", 1e3, 4e4, {f"{WALL}.sampled": True})
+            1e-3
+            * find_edge("windup", f"{WALL}.stiffness_n_m", 1e3, 4e4, {f"{WALL}.sampled": True})
         ],
     },
     "docs/reference/stability.md": {
         "ever more for 200 s, to {} rad/s": lambda: [
-            fused("free", 200.0, **make_overrides(**DIGITAL)).maxima[0][-2400:, 1].max()
+            run_shipped("free", 200.0, **make_overrides(**DIGITAL)).maxima[0][-2400:, 1].max()
         ],
     },
     "docs/data/map-p_d-edges.csv": {
@@ -442,25 +467,31 @@ PAGES: dict[str, dict[str, Make]] = {
         },
         **{
             f" 2,{T},{{}},": lambda T=T: [
-                edge("p_d_margin", "control.d", 0.02, 0.6, {**SOFT, "link.delay_ms": T})
+                find_edge("p_d_margin", "control.d", 0.02, 0.6, {**SOFT, "link.delay_ms": T})
             ]
             for T in (50, 100, 150, 200, 250, 300, 350, 400)
         },
     },
     "docs/theory/benchmarks.md": {
-        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances(
+        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: list_distances(
             "second_order"
         ),
-        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances(
-            "digital"
+        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: (
+            list_distances("digital")
         ),
         "part of max V | `paper` {}, `asymmetric` {}; orders {} and {}": lambda: [
-            *[energy.booked(name).residual for name in ("paper", "asymmetric")],
-            *[energy.order("paper", "second_order", rate_hz) for rate_hz in (1000, 2000)],
+            *[
+                energy.compute_shipped_balance(name).residual
+                for name in ("paper", "asymmetric")
+            ],
+            *[
+                energy.measure_order("paper", "second_order", rate_hz)
+                for rate_hz in (1000, 2000)
+            ],
         ],
         "the same with `digital` | {}, order {} and {}": lambda: [
-            energy.booked("paper", "digital").residual,
-            *[energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
+            energy.compute_shipped_balance("paper", "digital").residual,
+            *[energy.measure_order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
         "makes {} runs of the shipped": lambda: [len(shipped_trials())],
         "random once): {} s simulated": lambda: [
@@ -512,7 +543,7 @@ ROWS = [
 ]
 
 
-def numbers(phrase: str, text: str) -> list[str]:
+def list_numbers(phrase: str, text: str) -> list[str]:
     """Returns the numbers in the single place of a text that has these words."""
     pattern = NUMBER.join(map(re.escape, phrase.split("{}")))
     matches = re.findall(pattern, " ".join(text.split()))
@@ -520,14 +551,16 @@ def numbers(phrase: str, text: str) -> list[str]:
     return [matches[0]] if isinstance(matches[0], str) else list(matches[0])
 
 
-def check(page: str, phrase: str, source: Numbers | str) -> None:
+def check_page(page: str, phrase: str, source: Numbers | str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     for word, plain in WORDS.items():
         text = text.replace(word, plain)
     wanted = (
-        list(map(float, numbers(phrase, source))) if isinstance(source, str) else list(source)
+        list(map(float, list_numbers(phrase, source)))
+        if isinstance(source, str)
+        else list(source)
     )
-    printed = numbers(phrase, text)
+    printed = list_numbers(phrase, text)
     digits = [
         10.0 ** (int(e or 0) - len(m.partition(".")[2]))
         for m, _, e in (p.partition("e") for p in printed)
@@ -541,13 +574,13 @@ def check(page: str, phrase: str, source: Numbers | str) -> None:
 
 @pytest.mark.parametrize(("page", "phrase", "make"), ROWS)
 def test_page_numbers_equal_their_source(page: str, phrase: str, make: Make) -> None:
-    check(page, phrase, make())
+    check_page(page, phrase, make())
 
 
 @pytest.mark.long
 def test_the_printed_certificate_is_the_example(tmp_path: Path) -> None:
     for words in CERTIFIED:
-        check("docs/logs/certificate.md", words, certified(tmp_path))
+        check_page("docs/logs/certificate.md", words, certify_paper(tmp_path))
 
 
 TUNED = re.findall(
@@ -562,7 +595,7 @@ ENDS = [
 ]
 
 
-def tuned(duration_s: float, changes: Changes) -> CandidateScore:
+def score_candidate(duration_s: float, changes: Changes) -> CandidateScore:
     scenario = load_scenario(
         "free", {"limits.tau_limit_nm": 60, "duration_s": duration_s, **changes}
     )
@@ -590,7 +623,7 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
         name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
     }
     controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
-    scores = tuned(
+    scores = score_candidate(
         30.0 if row < 4 else 6.0,
         {f"sites.{name}.control": table for name, table in controls.items()},
     )
@@ -605,8 +638,8 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("statement", AS_PRINTED)
 def test_printed_gains_repeat_the_page(statement: str) -> None:
-    score = tuned(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
-    check(
+    score = score_candidate(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
+    check_page(
         "docs/theory/fair-comparison-results.md",
         f"| as printed{statement} | {{}} | {{}} |",
         [score.error_rad, score.effort_nm],
@@ -623,7 +656,7 @@ EDGES = read_table("map-p_d-edges.csv")
 LIVE_CELLS = read_table("map-p_d-live.csv")
 
 
-def class_of(longest_s: float, **changes: Any) -> CellClass:
+def classify_shipped(longest_s: float, **changes: Any) -> CellClass:
     return classify_cell(
         load_scenario("p_d_margin", make_overrides(**changes)).text, longest_s
     ).verdict
@@ -637,8 +670,8 @@ def test_p_d_edges_lie_between_two_runs(row: int) -> None:
     stiffness, delay_ms, _, low, high = map(float, EDGES[row][:5])
     soft, longest_s = (SOFT, 640.0) if stiffness == SOFT["control.K"] else ({}, 320.0)
     changes = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
-    assert class_of(longest_s, **changes, control__d=low).stable is False
-    assert class_of(longest_s, **changes, control__d=high).stable is True
+    assert classify_shipped(longest_s, **changes, control__d=low).stable is False
+    assert classify_shipped(longest_s, **changes, control__d=high).stable is True
 
 
 @pytest.mark.parametrize("row", range(len(LIVE_CELLS)))
@@ -658,6 +691,8 @@ def test_live_cells_have_their_class(row: int) -> None:
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
 def test_hardly_excited_modes_are_not_ignored(delay_ms: float, d: float) -> None:
     """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
-    assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
-    cell_class = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
+    assert (
+        0.005 < find_root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
+    )
+    cell_class = classify_shipped(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
     assert cell_class is CellClass.UNDECIDED

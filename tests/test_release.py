@@ -14,17 +14,17 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.cli.running import parses
+from tests.cli.running import assert_parses
 from tests.distributions import (
     CORE,
     OF_PACKAGES,
     PACKAGES,
     WHOLE,
-    build,
+    build_distributions,
     install,
     make_sources,
     names_of,
-    run,
+    run_program,
 )
 from trilat_net.net.connection import find_free_endpoints
 
@@ -84,7 +84,7 @@ def test_commands_of_workflows_exist() -> None:
                 if words[0].startswith(".ci/"):
                     assert os.access(ROOT / words[0], os.X_OK), line
                 elif words[0] in PROJECT["project"]["scripts"] and words[1:] != ["--version"]:
-                    parses(["trilat", *words[1:]])
+                    assert_parses(["trilat", *words[1:]])
                 else:
                     assert words[0] in (
                         "python",
@@ -186,7 +186,7 @@ def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     made = {}
     shutil.copytree(ROOT / "examples" / "package", sources / EXAMPLE)
     for name in (CORE, *PACKAGES, WHOLE, EXAMPLE):
-        made[name] = build(sources / name, tmp_path_factory.mktemp("built"))
+        made[name] = build_distributions(sources / name, tmp_path_factory.mktemp("built"))
     return made
 
 
@@ -245,15 +245,17 @@ def test_a_robot_runs_trilat_net_core_alone(
         packages
     )
     clean = tmp_path / "clean"
-    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
+    run_program(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
     stated = names_of(PROJECT["project"]["dependencies"])
     where = install(clean, built[CORE][1], stated - OF_PACKAGES)
     heavy = *OF_PACKAGES, "pandas", "polars", "pydantic"
     assert not [name for name in heavy if (where / name).exists()]
     trilat = clean / "bin" / "trilat"
-    run(trilat, "keys", "new", "keys", "m", "s", "recorder", cwd=tmp_path)
-    run(trilat, "sim", "two_sites", "--duration", "1", "-o", "first.mcap", cwd=tmp_path)
-    run(trilat, "verify", "first.mcap", cwd=tmp_path)  # compiled before three at once would
+    run_program(trilat, "keys", "new", "keys", "m", "s", "recorder", cwd=tmp_path)
+    run_program(trilat, "sim", "two_sites", "--duration", "1", "-o", "first.mcap", cwd=tmp_path)
+    run_program(
+        trilat, "verify", "first.mcap", cwd=tmp_path
+    )  # compiled before three at once would
     ends = [one.replace("tcp", "tls", 1) for one in find_free_endpoints(3)]
     ways = [
         ["--listen", own, *(f"--connect={one}" for one in ends[:n])]
@@ -275,13 +277,20 @@ def test_a_robot_runs_trilat_net_core_alone(
     finally:
         for process in started:
             process.kill()
-    assert "4000/4000 records identical" in run(trilat, "verify", "run.mcap", cwd=tmp_path)
+    assert "4000/4000 records identical" in run_program(
+        trilat, "verify", "run.mcap", cwd=tmp_path
+    )
     for name in PACKAGES:
         install(clean, built[name][1], stated)
     install(clean, built[WHOLE][1], stated)
     for name in PROJECT["project"]["scripts"]:
-        assert run(clean / "bin" / name, "--version", cwd=tmp_path) == f"trilat-net {VERSION}\n"
-    run(clean / "bin" / "trilat-net", "report", "run.mcap", "-o", "report", cwd=tmp_path)
+        assert (
+            run_program(clean / "bin" / name, "--version", cwd=tmp_path)
+            == f"trilat-net {VERSION}\n"
+        )
+    run_program(
+        clean / "bin" / "trilat-net", "report", "run.mcap", "-o", "report", cwd=tmp_path
+    )
     assert (tmp_path / "report" / "report.html").is_file()
 
 
@@ -317,11 +326,11 @@ def test_own_and_foreign_packages_join_the_core(
 ) -> None:
     """The core imports none of them, and says what to install; with them it has their commands and functions."""
     clean = tmp_path / "clean"
-    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
+    run_program(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
     stated = names_of(PROJECT["project"]["dependencies"])
     install(clean, built[CORE][1], stated - OF_PACKAGES)
     python, trilat = clean / "bin" / "python", clean / "bin" / "trilat"
-    printed = run(python, "-c", ALONE, cwd=tmp_path).splitlines()
+    printed = run_program(python, "-c", ALONE, cwd=tmp_path).splitlines()
     assert printed[-5] == "(100, 2)"
     assert "pip install trilat-studies" in printed[-4]
     assert "pip install trilat-people" in printed[-3]
@@ -335,13 +344,17 @@ def test_own_and_foreign_packages_join_the_core(
             f"error: trilat {command} is in a package of its own: pip install {package}"
         ]
     install(clean, built[EXAMPLE][1], set())
-    assert "lag " in run(trilat, "--help", cwd=tmp_path)
+    assert "lag " in run_program(trilat, "--help", cwd=tmp_path)
     words = ("lag", "two_sites", "--seeds", "2", "--duration", "0.1")
-    assert len(run(trilat, *words, cwd=tmp_path).splitlines()) == 2
+    assert len(run_program(trilat, *words, cwd=tmp_path).splitlines()) == 2
     called = "import trilat_net as tn; print(len(tn.measure_lags('two_sites', 2, 0.1)))"
-    assert run(python, "-c", called, cwd=tmp_path) == "2\n"
-    run(trilat, "sim", "two_sites", "--duration", "2", "-o", "lagging.mcap", cwd=tmp_path)
-    lines = run(trilat, "log", "view", "lagging.mcap", "--in", "lag", cwd=tmp_path).splitlines()
+    assert run_program(python, "-c", called, cwd=tmp_path) == "2\n"
+    run_program(
+        trilat, "sim", "two_sites", "--duration", "2", "-o", "lagging.mcap", cwd=tmp_path
+    )
+    lines = run_program(
+        trilat, "log", "view", "lagging.mcap", "--in", "lag", cwd=tmp_path
+    ).splitlines()
     assert [line.partition(":")[0] for line in lines] == [
         "m, 0 s",
         "m, 1 s",
@@ -350,13 +363,13 @@ def test_own_and_foreign_packages_join_the_core(
     ]
     install(clean, built["trilat-studies"][1], stated)
     grid = ("--over", "link.delay_ms=0,100", "--duration", "0.5", "--jobs", "1", "-o", "grid")
-    run(trilat, "sweep", "two_sites", *grid, cwd=tmp_path)
+    run_program(trilat, "sweep", "two_sites", *grid, cwd=tmp_path)
     assert (tmp_path / "grid" / "results.csv").is_file()
     install(clean, built["trilat-people"][1], stated)
-    run(trilat, "experiment", "new", "reach.toml", cwd=tmp_path)
-    assert "trials" in run(trilat, "experiment", "check", "reach.toml", cwd=tmp_path)
+    run_program(trilat, "experiment", "new", "reach.toml", cwd=tmp_path)
+    assert "trials" in run_program(trilat, "experiment", "check", "reach.toml", cwd=tmp_path)
     page = "import trilat_people.live_page.page_files as p; print(*sorted(p._list_assets()))"
-    assert "/three.module.min.js" in run(python, "-c", page, cwd=tmp_path).split()
+    assert "/three.module.min.js" in run_program(python, "-c", page, cwd=tmp_path).split()
 
 
 def test_the_page_of_installation_names_every_package() -> None:
@@ -372,8 +385,8 @@ def test_the_packagers_find_nothing(built: dict[str, list[Path]]) -> None:
     tools = {name: shutil.which(name) for name in ("check-wheel-contents", "twine")}
     if missing := [name for name, path in tools.items() if path is None]:
         pytest.skip(f"there is no {', '.join(missing)} here; the release workflow has them")
-    run(tools["check-wheel-contents"], built[CORE][1], cwd=ROOT)
-    run(tools["twine"], "check", "--strict", *built[CORE], *built[WHOLE], cwd=ROOT)
+    run_program(tools["check-wheel-contents"], built[CORE][1], cwd=ROOT)
+    run_program(tools["twine"], "check", "--strict", *built[CORE], *built[WHOLE], cwd=ROOT)
 
 
 def test_importing_the_package_imports_nothing_slow() -> None:

@@ -39,7 +39,7 @@ class Motion(NamedTuple):
     q: Array
 
 
-def turn(number: int, records: int = RECORDS) -> Rotation:
+def make_rotation(number: int, records: int = RECORDS) -> Rotation:
     """Returns a tool that points down, half turns about every axis, or several turns about an
     axis that moves.
     """
@@ -57,12 +57,12 @@ def turn(number: int, records: int = RECORDS) -> Rotation:
     return Rotation.from_rotvec(2.0 * sway) * turns
 
 
-def move(number: int, site: str, start: Array, records: int = RECORDS) -> Motion:
+def make_motion(number: int, site: str, start: Array, records: int = RECORDS) -> Motion:
     """Returns the motion of one site; sites move alike, one later than the other."""
     random = np.random.default_rng([number, *map(ord, site)])
     s = np.linspace(0.0, 1.0, records)[:, np.newaxis]
     reach = random.uniform(-2.5, 2.5, len(start)) * np.pi
-    whole = turn(number, records + 2)
+    whole = make_rotation(number, records + 2)
     first = 1 if site == "m" else 0
     return Motion(
         whole[first : first + records], whole[2:], start + reach * s**2 * (3.0 - 2.0 * s)
@@ -75,7 +75,7 @@ def count_wraps(turned: Rotation) -> int:
     return int(np.count_nonzero(steps > np.pi))
 
 
-def largest_step(turned: Rotation) -> float:
+def find_largest_step(turned: Rotation) -> float:
     """Returns the largest angle from one orientation to the next, rad."""
     return float((turned[1:] * turned[:-1].inv()).magnitude().max())
 
@@ -105,11 +105,11 @@ def _simulate() -> bytes:
     return simulate_bytes(load_case())
 
 
-def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
+def make_turning_log(number: int) -> tuple[Log, dict[str, Motion]]:
     """Returns a log of two arms whose records have one of the motions, and the motions by site."""
     scenario = load_case()
     motions = {
-        site: move(number, site, np.array(scenario.sites[site].q0_rad))
+        site: make_motion(number, site, np.array(scenario.sites[site].q0_rad))
         for site in scenario.names
     }
     vectors = {

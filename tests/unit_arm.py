@@ -32,7 +32,7 @@ CLAMP = {
 """What holds a clamped slave; without it the slave is free."""
 
 
-def hand(
+def make_spring_hand(
     to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: float = 1.0
 ) -> dict[str, Any]:
     """Returns a spring hand that goes to x = `to` in two seconds."""
@@ -46,9 +46,9 @@ def hand(
     }
 
 
-H50 = hand(0.3)
+H50 = make_spring_hand(0.3)
 """The hand of most tests."""
-WALL = hand(0.0, 500.0, 5.0)
+WALL = make_spring_hand(0.0, 500.0, 5.0)
 DRIVE = {
     "kind": "multisine",
     "amplitude_nm": [2.0, 1.0],
@@ -94,14 +94,14 @@ def unit_text(
     return "\n".join(f"{key} = {_toml(value)}" for key, value in table.items())
 
 
-def unit_scenario(
+def make_unit_scenario(
     sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
 ) -> Scenario:
     """Returns the scenario of `unit_text`."""
     return allow_own_code(parse_scenario(unit_text(sites, control, **more), "unit"))
 
 
-def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
+def read_last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
     """Returns, per time, the records before it, of a compiled run: by field shape (N, 2)."""
     rows = sample_records(scenario, times_s)
     columns = next(iter(scenario.names))
@@ -109,7 +109,9 @@ def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
     return [{name: rows[:, k, fields[name]] for name in fields} for k in range(len(times_s))]
 
 
-def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any) -> Scenario:
+def make_four_channel_pair(
+    variant: str, delay_s: float, duration_s: float = 9.0, **more: Any
+) -> Scenario:
     """Returns a driven master and a slave at a wall, `delay_s` apart, under a variant of the
     four-channel law.
     """
@@ -121,8 +123,8 @@ def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any
         }
 
     sites = {
-        "m": {"hands": [DRIVE, hand(0.0)], "control": one(0)},
+        "m": {"hands": [DRIVE, make_spring_hand(0.0)], "control": one(0)},
         "s": {"hands": [WALL], "control": one(1)},
     }
     link = {"model": "constant", "delay_ms": 1e3 * delay_s}
-    return unit_scenario(sites, {}, link=link, duration_s=duration_s)
+    return make_unit_scenario(sites, {}, link=link, duration_s=duration_s)

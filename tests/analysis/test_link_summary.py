@@ -33,16 +33,16 @@ from trilat_net.scenario.sample_uses import first_ticks
 PERIOD_MS = 1.0
 
 
-def uses(log):
+def summarise_by_name(log):
     return {use.name: use for use in summarise_links(log)}
 
 
 @cache
-def busy():
-    return uses(make_busy_run().log)
+def summarise_busy_run():
+    return summarise_by_name(make_busy_run().log)
 
 
-def counted(run, link):
+def find_counts(run, link):
     peer, site = link.split("->")
     return run.counts[site][run.log[site].peers.index(peer)]
 
@@ -52,7 +52,7 @@ def counted(run, link):
 
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
 def test_counts_equal_those_of_the_link(link):
-    counts, core = busy()[link].counts, counted(make_busy_run(), link)
+    counts, core = summarise_busy_run()[link].counts, find_counts(make_busy_run(), link)
     assert counts.arrived + counts.duplicate == core.accepted
     assert (counts.lost, counts.late, counts.duplicate) == (
         core.lost,
@@ -79,14 +79,14 @@ def test_superseded_samples_are_never_in_use():
             if log[site].peers[j] == peer
         }
         never = (released & arrived) - set(log[site].used[peer].tolist())
-        assert busy()[f"{peer}->{site}"].counts.superseded == len(never) > 0
+        assert summarise_busy_run()[f"{peer}->{site}"].counts.superseded == len(never) > 0
 
 
 def test_lost_and_doubled_samples_are_counted():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
     run = drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
-    link_uses = uses(run.log)
+    link_uses = summarise_by_name(run.log)
     lossy = link_uses["m2->m1"]
     assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
     assert lossy.loss == 14 / 199
@@ -94,7 +94,7 @@ def test_lost_and_doubled_samples_are_counted():
     assert lossy.silence_ms == 55.0  # ten samples of 5 ms, and the one that came again
     assert not lossy.plain
     assert link_uses["m2->s"].counts.duplicate == 2
-    assert counted(run, "m2->s").duplicate == 2
+    assert find_counts(run, "m2->s").duplicate == 2
     assert (
         link_uses["s->m1"].counts.missing,
         link_uses["s->m1"].burst,
@@ -110,7 +110,7 @@ def test_samples_of_missing_records_have_no_fate():
     log = rewrite_log(
         make_short_log("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
     )
-    link_uses = uses(log)
+    link_uses = summarise_by_name(log)
     for link in ("m1->m2", "s->m2"):
         counts = link_uses[link].counts
         assert (counts.missing, counts.lost, counts.late) == (0, 0, 0)
@@ -122,7 +122,7 @@ def test_samples_of_missing_records_have_no_fate():
 def test_a_link_cut_until_the_end_loses_everything():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     run = drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
-    cut = uses(run.log)["m2->m1"]
+    cut = summarise_by_name(run.log)["m2->m1"]
     assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
     assert cut.silence_ms == 1000.0 - (99 * 5.0 + 20.0)
 
@@ -134,7 +134,7 @@ def test_late_samples_equal_those_of_the_core():
     assert hurried != log.scenario.text
     run = drive_run(parse_scenario(hurried))
     for use in summarise_links(run.log):
-        assert use.counts.late == counted(run, use.name).late
+        assert use.counts.late == find_counts(run, use.name).late
 
 
 def test_only_out_of_range_stamps_are_refused():
@@ -144,7 +144,7 @@ def test_only_out_of_range_stamps_are_refused():
             rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx,
         )
 
-    link_uses = uses(rewrite_log(make_short_log("paper"), change=hostile))
+    link_uses = summarise_by_name(rewrite_log(make_short_log("paper"), change=hostile))
     assert [use.counts.refused for use in link_uses.values()] == [1] * 6
     assert [use.counts.sent for use in link_uses.values()] == [400] * 6
 
@@ -162,7 +162,7 @@ def test_false_tick_numbers_cost_no_memory():
     with pytest.raises(
         LogError, match="m2 has a record of tick 549755813888, but the scenario has only 400"
     ):
-        uses(rewrite_log(make_short_log("paper"), change=far))
+        summarise_by_name(rewrite_log(make_short_log("paper"), change=far))
 
 
 # -- ages
@@ -191,7 +191,9 @@ def test_recorded_ages_follow_from_fates_of_samples(link):
     in_use = np.maximum.accumulate(usable)
     t_ns = np.arange(len(part)) * 10**9 // part.rate_hz
     ages = [(t_ns[tick] - fate.stamp_ns[n]) / 1e6 for tick, n in enumerate(in_use) if n >= 0]
-    assert tuple(busy()[link].age_ms) == pytest.approx(tuple(compute_statistics(ages)))
+    assert tuple(summarise_busy_run()[link].age_ms) == pytest.approx(
+        tuple(compute_statistics(ages))
+    )
 
 
 def hyperexponential(t_ms):
@@ -230,7 +232,7 @@ MODELS = {
 
 
 @cache
-def jittery(order):
+def simulate_jitter(order):
     links = {f"links.{name}": {**table, "order": order} for name, (table, _) in MODELS.items()}
     return trilat_net.simulate(load_scenario("free", {"duration_s": 2.0, **links}))
 
@@ -246,9 +248,9 @@ def test_effective_delay_under_jitter_follows_theory(link, order, theory, margin
     A run of two seconds starts with nothing older to wait for, and the largest of many delays
     varies.
     """
-    log = jittery(order)
+    log = simulate_jitter(order)
     mean_ms, deviation_ms = theory(MODELS[link][1], PERIOD_MS)
-    use = uses(log)[link]
+    use = summarise_by_name(log)[link]
     assert use.age_ms.mean == pytest.approx(mean_ms, rel=margin)
     peer, site = link.split("->")
     release = predict_delivery(log, peer, site, 100_000).release(1000)
@@ -290,7 +292,7 @@ def test_measured_loss_and_bursts_follow_the_model():
 
 
 def test_playout_makes_smaller_jitter_constant():
-    use = busy()["b->c"]
+    use = summarise_busy_run()["b->c"]
     assert use.drawn_ms.deviation == pytest.approx(20.0, rel=0.4)
     assert use.age_ms.p50 < 80.0  # a tick of 5 ms, a sample every 6.67 ms
     assert use.stated[0].link.moments().deviation_ms < 21.0
@@ -300,7 +302,7 @@ def test_playout_makes_smaller_jitter_constant():
 
 
 def test_histogram_counts_ticks_in_few_round_bins():
-    for use in busy().values():
+    for use in summarise_busy_run().values():
         bins = use.ages
         assert sum(bins.ticks) == pytest.approx(
             (6.0 - use.first_use_s) * make_busy_run().log[use.site].rate_hz
@@ -337,18 +339,18 @@ def test_measured_delays_equal_those_in_the_records():
         )
 
     log = rewrite_log(make_short_log("paper"), change=timed, driver="live")
-    use = uses(log)["m2->m1"]
+    use = summarise_by_name(log)["m2->m1"]
     assert (use.one_way_us.min, use.one_way_us.max) == (100.0, 100.0 + 398)
     old = rewrite_log(log, change=lambda s: replace_fields(s, v=1), driver="live")
     # before version 2 it was the age of the stamp
-    assert uses(old)["m2->m1"].one_way_us is None
+    assert summarise_by_name(old)["m2->m1"].one_way_us is None
 
 
 COUNT = 900
 LINKS = [(peer, site) for site in "abc" for peer in "abc" if peer != site]
 
 
-def decided(peer: str, site: str) -> Site:
+def make_decided_site(peer: str, site: str) -> Site:
     """Returns the site of the core, given every change at the tick at which it was applied."""
     log = make_busy_run().log
     core = Site(log.scenario.setup(site))
@@ -362,7 +364,7 @@ def decided(peer: str, site: str) -> Site:
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
 def test_fates_equal_those_of_the_cores_link(peer, site):
-    log, core = make_busy_run().log, decided(peer, site)
+    log, core = make_busy_run().log, make_decided_site(peer, site)
     delivery_ticks = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
     index = log[site].peers.index(peer)
     expected = [core.release_tick(index, sample) for sample in range(COUNT)]

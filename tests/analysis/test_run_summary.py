@@ -29,14 +29,14 @@ from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
 from trilat_net.errors import LogError
 
 
-def strict(facts):
+def parse_strictly(facts):
     """Parses JSON as strict programs do; NaN and arrays are errors."""
     return json.loads(json.dumps(facts, allow_nan=False))
 
 
 def test_numbers_agree_with_the_records():
     log = make_short_log("paper")
-    facts = strict(summarise_run(log, make_log_without_hands("paper")))
+    facts = parse_strictly(summarise_run(log, make_log_without_hands("paper")))
     for name in log.sites:
         states = log[name].states
         site = facts["sites"][name]
@@ -112,7 +112,7 @@ def test_saturation_is_counted():
 
 
 def test_divergence_is_reported_without_missing_records():
-    facts = strict(summarise_run(make_diverged_log()))
+    facts = parse_strictly(summarise_run(make_diverged_log()))
     assert facts["diverged"] is True
     assert facts["missing"] == 0
     assert (
@@ -126,13 +126,13 @@ def test_a_held_site_has_not_diverged():
     def hold(state):
         return replace_fields(state, mode="hold" if state.tick > 350 else "run")
 
-    facts = strict(summarise_run(rewrite_log(make_short_log("paper"), change=hold)))
+    facts = parse_strictly(summarise_run(rewrite_log(make_short_log("paper"), change=hold)))
     assert facts["diverged"] is False
     assert facts["sites"]["m1"]["modes"] == [{"mode": "hold", "from_s": 351 / 200, "to_s": 2.0}]
 
 
 def test_changes_are_reported_with_their_author():
-    facts = strict(summarise_run(make_busy_run().log))
+    facts = parse_strictly(summarise_run(make_busy_run().log))
     changes = [
         (c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"])
         for c in facts["changes"]
@@ -149,7 +149,7 @@ def test_a_measured_link_states_no_delay():
     log = trilat_net.simulate(
         "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
     )
-    facts = strict(summarise_run(log))
+    facts = parse_strictly(summarise_run(log))
     for link in facts["links"].values():
         assert (link["delay_ms"], link["drawn_ms"], link["stated"][0]["mean_ms"]) == (
             None,
@@ -172,7 +172,7 @@ def test_missing_records_are_counted():
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_nulls_and_no_nan(records):
     log = rewrite_log(make_short_log("paper"), keep=lambda s: s.tick < records, finished=False)
-    facts = strict(summarise_run(log, make_log_without_hands("paper")))
+    facts = parse_strictly(summarise_run(log, make_log_without_hands("paper")))
     assert facts["session"]["complete"] is False
     for site in facts["sites"].values():
         assert site["records"] == records

@@ -27,6 +27,7 @@ import numpy as np
 from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net
+from tests.certificate.drawn_loops import make_experiment, make_swinging_hand
 from tests.execution.builders import run_fused
 from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.premises import find_missing_functionals
@@ -42,16 +43,7 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
-from .drawn_loops import (
-    SAMPLED,
-    STIFFNESS,
-    WIDE_FROM,
-    Drawn,
-    draw_experiment,
-    experiment,
-    p_d,
-    swinging,
-)
+from .drawn_loops import SAMPLED, STIFFNESS, WIDE_FROM, Drawn, draw_experiment, p_d
 from .hidden_loops import NEAR_PER_S, draw_hidden, write_scenario
 
 HIDDEN = range(1000)
@@ -100,7 +92,7 @@ def two_pairs(
         i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()
     }
     keys = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
-    return experiment("pairs", **{**keys, **more})
+    return make_experiment("pairs", **{**keys, **more})
 
 
 class Row(NamedTuple):
@@ -169,9 +161,9 @@ def _margin(
     return _load("p_d_margin", keys, **more)
 
 
-WIDER = [swinging([(0.0, 0.0), (39.98, 12.0)])]
-EARLY = [swinging([(0.0, 0.0), (10.0, 6.0)])]
-LASTING = [swinging([(0.0, 5.0), (40.0, 5.0)])]
+WIDER = [make_swinging_hand([(0.0, 0.0), (39.98, 12.0)])]
+EARLY = [make_swinging_hand([(0.0, 0.0), (10.0, 6.0)])]
+LASTING = [make_swinging_hand([(0.0, 5.0), (40.0, 5.0)])]
 WIDE = (0.9, -0.9, 1e-3, -1e-3)
 APART = (0.35, 0.25, -0.15, -0.25)
 LEARNT = ({"law": "adaptive", "theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]},) * 2
@@ -252,7 +244,7 @@ def _turntables(
     link = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 199.0, "period_s": period_s}
     arm = {"urdf": "arm6.urdf", "tip": "shoulder", "armature_kg_m2": 2.5}
     law, keys = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
-    return lambda: experiment(
+    return lambda: make_experiment(
         "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **keys
     )
 
@@ -266,7 +258,7 @@ def pair(first: Any, second: Any, **more: Any) -> Scenario:
         "sites": sites,
         "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}},
     }
-    return experiment("pair", **{**keys, **more})
+    return make_experiment("pair", **{**keys, **more})
 
 
 def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[], Scenario]:

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.certificate.drawn_loops import make_experiment
 from trilat_net.scenario import Scenario, load_scenario
 
-from .drawn_loops import experiment
 from .linear_truth import Loop, Way, gravity_gradient, measure_growth, planar_inertia
 
 SPREAD_RAD = 1e-3
@@ -320,7 +320,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
             "age_ms": 1e3 * loop.hold_s,
             "return_s": loop.return_s,
         }
-    scenario = experiment("hidden", **keys)
+    scenario = make_experiment("hidden", **keys)
     return load_scenario(scenario, laws) if hidden.own_law else scenario
 
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
+from tests.certificate.drawn_loops import make_experiment
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -29,7 +30,7 @@ from .adversaries import (
     tally_clear,
     under_noise,
 )
-from .drawn_loops import WIDE_FROM, Drawn, draw_experiment, experiment
+from .drawn_loops import WIDE_FROM, Drawn, draw_experiment
 from .hidden_loops import PUSH as HIDDEN_PUSH
 
 
@@ -196,7 +197,7 @@ def test_a_run_without_motion_is_read_whole() -> None:
         "dominance": shares,
         "link": {"delay_ms": 0.0},
     }
-    still = experiment(
+    still = make_experiment(
         "still", sites=sites, control={"law": "wave", "b": 60.0, "K": 0.0}, **given
     )
     log = trilat_net.simulate(still)

@@ -24,7 +24,7 @@ COMMAND = [sys.executable, "-m", "trilat_net"]
 PLAIN = {**os.environ, "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "100"}
 
 
-class Done:
+class CommandResult:
     """The exit code of a command, and its output."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
@@ -50,36 +50,36 @@ class Done:
 
 
 @cache
-def whole_command() -> Any:
+def build_command() -> Any:
     """Returns `trilat` with all of its commands, built once because that takes a while."""
     return get_command(app)
 
 
-def parses(arguments: list[str]) -> None:
+def assert_parses(arguments: list[str]) -> None:
     """Asserts that a command line, `trilat` included, names a command, and only options and
     arguments of that command.
     """
     program, *rest = arguments
     assert program == "trilat"
-    command: Any = whole_command()
+    command: Any = build_command()
     while hasattr(command, "commands"):
         command = command.commands[rest.pop(0)]
     with command.make_context(command.name, rest) as context:
         assert context.args == []
 
 
-def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+def start_command(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([*COMMAND, *arguments], cwd=cwd, env=PLAIN, text=True, **pipes)
 
 
-def simulated(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:
+def simulate_by_command(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:
     options = [word for setting in settings for word in ("--set", setting)]
     trilat("sim", scenario, "--duration", seconds, "-o", "run.mcap", *options, cwd=folder)
     return "run.mcap"
 
 
-def trilat(*arguments: str | Path, cwd: Path) -> Done:
+def trilat(*arguments: str | Path, cwd: Path) -> CommandResult:
     before = dict(allowed_code)
     allowed_code.clear()
     out, err = io.StringIO(), io.StringIO()
@@ -100,7 +100,7 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
         except SystemExit as end:
             code = end.code
     allowed_code.update(before)  # logs that other tests keep name laws
-    return Done(0 if code is None else int(str(code)), out.getvalue(), err.getvalue())
+    return CommandResult(0 if code is None else int(str(code)), out.getvalue(), err.getvalue())
 
 
 def shorten(file: Path) -> None:

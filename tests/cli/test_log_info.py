@@ -22,7 +22,7 @@ def write_log(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
     return path
 
 
-def foreign() -> bytes:
+def make_foreign_bytes() -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
@@ -68,7 +68,7 @@ def test_info_in_json_has_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_info_of_a_foreign_file_shows_channels(tmp_path: Path) -> None:
-    path = write_log(tmp_path, foreign())
+    path = write_log(tmp_path, make_foreign_bytes())
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "mcap"
     assert facts["session"] is None
@@ -106,7 +106,7 @@ def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
 
 
 def test_foreign_mcap_files_are_checked_for_structure(tmp_path: Path) -> None:
-    done = trilat("log", "check", write_log(tmp_path, foreign()), cwd=tmp_path)
+    done = trilat("log", "check", write_log(tmp_path, make_foreign_bytes()), cwd=tmp_path)
     assert done.code == 0
     assert len(done.out.splitlines()) == 4
     assert "not a trilat-net log" in done.err

@@ -23,7 +23,7 @@ WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE
 """Of short files Python would keep modules that are cut off."""
 
 
-def limited(
+def run_limited(
     kind: int, most: int, *arguments: str | Path, cwd: Path
 ) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
@@ -42,7 +42,7 @@ def limited(
     "form", ["pdf", *(pytest.param(one, marks=pytest.mark.long) for one in ("svg", "png"))]
 )
 def test_figures_refused_by_disk_leave_no_file(form: str, tmp_path: Path) -> None:
-    done = limited(
+    done = run_limited(
         resource.RLIMIT_FSIZE,
         1000,
         "figure",
@@ -62,7 +62,7 @@ def test_figures_refused_by_disk_leave_no_file(form: str, tmp_path: Path) -> Non
 
 
 def test_keys_refused_by_disk_leave_no_file(tmp_path: Path) -> None:
-    done = limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
+    done = run_limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
     assert done.returncode == 5
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: k: cannot be written: File too large; nothing is left of it")
@@ -76,7 +76,7 @@ def test_too_little_memory_is_one_line(
     mib: int, arguments: Sequence[str], tmp_path: Path
 ) -> None:
     """With `ulimit -v` libraries cannot be loaded, or retry for ever."""
-    done = limited(resource.RLIMIT_AS, mib << 20, *arguments, LOG, cwd=tmp_path)
+    done = run_limited(resource.RLIMIT_AS, mib << 20, *arguments, LOG, cwd=tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "error: there is too little memory" in done.stderr

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 import trilat_net as tn
-from tests.cli.running import simulated, trilat
+from tests.cli.running import simulate_by_command, trilat
 from tests.execution.builders import make_log_without
 from trilat_net.app.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
@@ -20,7 +20,7 @@ OWN_LAW = Path(__file__).parents[1] / "golden" / "own-law.mcap"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("twin")
-    simulated(folder, "two_sites", seconds="4")
+    simulate_by_command(folder, "two_sites", seconds="4")
     return folder
 
 
@@ -91,7 +91,7 @@ def test_bad_input_is_refused_in_one_line(
 
 
 def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
-    other = tmp_path / simulated(tmp_path, "two_sites", "seed=2", seconds="1")
+    other = tmp_path / simulate_by_command(tmp_path, "two_sites", "seed=2", seconds="1")
     trilat("twin", "run.mcap", other, cwd=folder).refuses("not a part of the session")
 
 

@@ -52,7 +52,7 @@ s = {{ m1 = 0.5, m2 = 0.5 }}
 ROBUST = f"rho_nm = {RHO_NM}\nwidth_rad_s = {WIDTH_RAD_S}"
 
 
-def run(law: str, more: str = "") -> Log:
+def simulate_law(law: str, more: str = "") -> Log:
     return trilat_net.simulate(parse_scenario(SHAKEN.format(law=law, more=more)))
 
 
@@ -94,7 +94,7 @@ def test_robust_dissipation_stays_bounded_unlike_the_box() -> None:
         robust_w = ROBUST_RESIDUE * float(balance.beta[0].sum()) * 2 * RHO_NM * WIDTH_RAD_S
         return robust_w + float(balance.V[0] - balance.V[-1]) / log.scenario.duration_s
 
-    robust, box = run("adaptive_robust", ROBUST), run("adaptive_box")
+    robust, box = simulate_law("adaptive_robust", ROBUST), simulate_law("adaptive_box")
     assert mean_dissipation(robust, 1.0) <= bound(robust)
     assert mean_dissipation(box, 0.0) > bound(box)
 

@@ -17,7 +17,13 @@ from tests.transmission import (
     rightmost_root,
     transmitted,
 )
-from tests.unit_arm import DRIVE, WALL, last_rows, two_sites, unit_scenario
+from tests.unit_arm import (
+    DRIVE,
+    WALL,
+    make_four_channel_pair,
+    make_unit_scenario,
+    read_last_rows,
+)
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
@@ -85,14 +91,16 @@ def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> 
     }
     control = {"law": "six_channel", "K": 100.0, "B": 20.0, **more}
     link = {"model": "constant", "delay_ms": 0.0}
-    return unit_scenario(sites, control, dominance=shares, link=link, duration_s=duration_s)
+    return make_unit_scenario(
+        sites, control, dominance=shares, link=link, duration_s=duration_s
+    )
 
 
-def measured(scenario: Scenario, site: str) -> float:
+def measure_transmission(scenario: Scenario, site: str) -> float:
     """Returns the same as `transmitted` at 1 Hz, for a run in time: over its last period."""
     times_s = 8.0 + np.arange(1, 21) / 20.0
     site_index = scenario.names.index(site)
-    rows = last_rows(scenario, *times_s)
+    rows = read_last_rows(scenario, *times_s)
     turn = np.exp(-2j * np.pi * times_s)
     torque, speed = (
         np.array([row[name][site_index, 0] for row in rows]) for name in ("tau_x", "qd")
@@ -142,7 +150,9 @@ def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
     ],
 )
 def test_six_channel_runs_transmit_like_their_loop(a: float, user: int, felt: float) -> None:
-    assert measured(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(felt, abs=6e-5)
+    assert measure_transmission(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(
+        felt, abs=6e-5
+    )
 
 
 @pytest.mark.long
@@ -162,7 +172,9 @@ def test_four_channel_runs_transmit_like_their_loop(
     variant: str, delay_s: float, acceleration: float, felt: float
 ) -> None:
     """With a part of the acceleration, as all of it is unstable; a held torque is modelled as held."""
-    ratio = measured(two_sites(variant, delay_s, acceleration=acceleration), "m")
+    ratio = measure_transmission(
+        make_four_channel_pair(variant, delay_s, acceleration=acceleration), "m"
+    )
     law = {**VARIANTS[variant], "acceleration": acceleration, "delay_s": delay_s}
     assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
     assert ratio == pytest.approx(felt, abs=6e-5)
@@ -171,7 +183,7 @@ def test_four_channel_runs_transmit_like_their_loop(
 
 @pytest.mark.long
 def test_full_acceleration_one_tick_late_is_unstable() -> None:
-    rows = last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
+    rows = read_last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
     assert np.abs(rows["qd"]).max() > 100.0
     assert (
         "does not hold: " in describe_law_conditions(three_sites(0.5, 0, acceleration=1.0))[0]
@@ -197,7 +209,7 @@ def test_shares_without_a_single_factor_are_reported() -> None:
         "u2": {"u1": 0.2, "s": 0.8},
         "s": {"u1": 0.5, "u2": 0.5},
     }
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         {name: {} for name in others}, {"law": "six_channel"}, dominance=others
     )
     assert (
@@ -209,14 +221,16 @@ def test_shares_without_a_single_factor_are_reported() -> None:
 def test_two_sites_cannot_share_by_one_factor() -> None:
     with pytest.raises(ScenarioError, match="is for 3 sites"):
         make_trajectories(
-            unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01)
+            make_unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01)
         )
 
 
 @pytest.mark.long
 def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     """`trilat metrics` of a log of 26 s: stretches of 4 s, driven at 1 Hz alone."""
-    log = open_bytes(simulate_bytes(two_sites("without qdd", 0.001, duration_s=26.0)))
+    log = open_bytes(
+        simulate_bytes(make_four_channel_pair("without qdd", 0.001, duration_s=26.0))
+    )
     responses = compute_log_metrics(log).responses
     felt = next(
         response

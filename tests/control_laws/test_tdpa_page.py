@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.unit_arm import unit_scenario
+from tests.unit_arm import make_unit_scenario
 
 Pair = list[float]
 H = 1e-3
@@ -381,7 +381,7 @@ def test_the_page_alone_gives_the_run(name: str) -> None:
         site: {"q0_rad": START, "hands": [HANDS[site].table()] if HANDS[site] else []}
         for site in alpha
     }
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         sites,
         {"law": "tdpa", **LAW, **gains},
         arm={**LINKS, "g_m_s2": GRAVITY},

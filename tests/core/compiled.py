@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 
-def run_program(program: str, *, compiled: bool) -> str:
+def run_python(program: str, *, compiled: bool) -> str:
     """Returns the output of a program in a process of its own."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if compiled else "1"}
     command = [sys.executable, "-c", program]

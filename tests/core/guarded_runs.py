@@ -65,7 +65,7 @@ def adaptive_text() -> str:
     return text.replace('law = "pd_d"', 'law = "adaptive"')
 
 
-def guarded(
+def make_guarded_scenario(
     limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object
 ) -> Scenario:
     """Returns the scenario of the rule, with limits of all sites or of one."""
@@ -73,7 +73,9 @@ def guarded(
     return allow_own_code(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
 
 
-def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:
+def make_ordered_log(
+    scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0
+) -> Log:
     """Returns a virtual run in which sites are given orders at ticks."""
 
     def change(site: str, tick: int, order: str) -> CoreChange:
@@ -88,7 +90,7 @@ def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 
     return open_bytes(simulate_bytes(scenario, commands=commands))
 
 
-def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
+def list_reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
     """Returns the modes of a site in order, each with its reason."""
     modes: list[tuple[str, LifeReason]] = []
     for state in log[site].states:
@@ -99,12 +101,14 @@ def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
 
 
 @functools.cache
-def stopped_log(text: str = TEXT, enabled: int = 3500) -> Log:
+def make_stopped_log(text: str = TEXT, enabled: int = 3500) -> Log:
     """Returns the log of a slave that is stopped at 2 s, while it moves, and enabled at a tick."""
-    return ordered(guarded(text=text), {"s": {2000: "stop", enabled: "enable"}})
+    return make_ordered_log(
+        make_guarded_scenario(text=text), {"s": {2000: "stop", enabled: "enable"}}
+    )
 
 
-def largest_step(log: Log, site: str, first: int = 0) -> float:
+def find_largest_step(log: Log, site: str, first: int = 0) -> float:
     """Returns the largest change of a joint's torque between ticks; the torque before tick 0 is
     zero.
 

@@ -14,7 +14,9 @@ def gravity_of(theta: Array, q: Array) -> Array:
     return 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
 
 
-def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
+def compute_reference(
+    gains: RestGains, part: SiteLog, first: int, rows: int
+) -> tuple[Array, Array]:
     """Returns q_ref and qd_ref of an arm that comes to rest from record `first` on, with no
     torque at its limit.
 
@@ -35,7 +37,7 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
     return np.array(q_ref), np.array(qd_ref)
 
 
-def rest_torque(
+def compute_rest_torque(
     gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array
 ) -> tuple[Array, Array]:
     """Returns law + w - B s from a record on, and w, of a slow arm whose law does not learn.
@@ -44,7 +46,7 @@ def rest_torque(
     value at the start of a tick.
     """
     rows = slice(first, first + len(law))
-    q_ref, qd_ref = reference(gains, part, first, len(law))
+    q_ref, qd_ref = compute_reference(gains, part, first, len(law))
     B, qd = np.array(gains.damping), part.qd[rows]
     slip = qd - qd_ref + REST_RATE_1_S * (part.q[rows] - q_ref)
     haste = float((B * np.abs(qd[0]) / limit).max())
@@ -60,7 +62,7 @@ def rest_torque(
     return np.array(taken), np.array(begun)
 
 
-def integrals(part: SiteLog, rows: slice) -> Array:
+def read_integrals(part: SiteLog, rows: slice) -> Array:
     """Returns w of the records after a given one, read from the torque at rest in `mem`."""
     first = 2 * (part.layout.shared + 1) + len(part.peers)
     return np.array(

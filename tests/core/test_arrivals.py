@@ -37,11 +37,11 @@ every_kind = pytest.mark.parametrize(
 quick = settings(max_examples=12)
 
 
-def behind(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
+def make_site_behind_link(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
     return make_site_with_link(rate_hz, peer_rate_hz, [KINDS[name]], POINTS)
 
 
-def releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
+def list_releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
     """Returns the first tick of the receiver that may use each sample, or LOST, from a channel alone."""
     release_times = compute_due_ns(
         make_channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count
@@ -62,8 +62,8 @@ def test_the_newest_due_arrived_sample_is_used(
     name: str, came: list[list[int]], rates: tuple[int, int]
 ) -> None:
     """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
-    release = releases(name, 251, *rates)
-    site = behind(name, *rates)
+    release = list_releases(name, 251, *rates)
+    site = make_site_behind_link(name, *rates)
     arrived: set[int] = set()
     before = -1
     for k in range(TICKS):
@@ -85,8 +85,8 @@ def test_the_newest_due_arrived_sample_is_used(
 @given(came=arrivals)
 def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> None:
     """Accepted = refused + duplicate + lost + superseded + used, once no sample waits any more."""
-    site = behind(name)
-    release = releases(name, 251, 1000, 1000)
+    site = make_site_behind_link(name)
+    release = list_releases(name, 251, 1000, 1000)
     used: set[int] = set()
     for k in range(max(release) + len(came) + 1):
         now = came[k] if k < len(came) else []
@@ -127,7 +127,7 @@ def test_the_order_of_arrival_changes_no_bit(
         ]
         return [
             output._replace(rx_crc=0)
-            for output in step_site(behind(name, 1000, peer_rate_hz), ticks)
+            for output in step_site(make_site_behind_link(name, 1000, peer_rate_hz), ticks)
         ]
 
     scattered: dict[int, list[int]] = {}
@@ -143,13 +143,13 @@ def test_reused_sites_have_the_same_future(name: str, k: int) -> None:
     the beginning.
     """
     ticks = [TickInput(n, [make_arrival(n - 1)] if n else []) for n in range(TICKS)]
-    whole = step_site(behind(name), ticks)
+    whole = step_site(make_site_behind_link(name), ticks)
     before, last = whole[max(0, k - 2)], whole[k - 1]
     in_use = [make_arrival(last.used[0]) if last.used[0] >= 0 else None]
     waiting = [make_arrival(m) for m in range(last.used[0] + 1, k - 1)]
-    worn = behind(name)
+    worn = make_site_behind_link(name)
     step_site(worn, ticks[: k + 100])
-    for site in (behind(name), worn):
+    for site in (make_site_behind_link(name), worn):
         site.restore_links(k, in_use, waiting)
         site.restore_state(before, last)
         assert step_site(site, ticks[k:]) == whole[k:]
@@ -159,11 +159,12 @@ def test_reused_sites_have_the_same_future(name: str, k: int) -> None:
 def test_a_long_silence_changes_nothing_afterwards(name: str) -> None:
     """The channel advances by index while no sample comes."""
     silent = step_site(
-        behind(name),
+        make_site_behind_link(name),
         [TickInput(k, [make_arrival(k - 1)] if k > 600 else []) for k in range(900)],
     )
     heard = step_site(
-        behind(name), [TickInput(k, [make_arrival(k - 1)] if k else []) for k in range(900)]
+        make_site_behind_link(name),
+        [TickInput(k, [make_arrival(k - 1)] if k else []) for k in range(900)],
     )
     settled = next(k for k in range(601, 900) if silent[k].used[0] >= 600)
     assert [o.used for o in silent[settled:]] == [o.used for o in heard[settled:]]
@@ -183,7 +184,7 @@ hostile = st.one_of(
 @given(came=st.lists(st.lists(hostile, max_size=5), max_size=6))
 def test_work_is_bounded_for_any_sample_number(name: str, came: list[list[int]]) -> None:
     """A channel looks no further ahead than ten seconds, and no other peer's samples suffer."""
-    site = behind(name)
+    site = make_site_behind_link(name)
     for k, now in enumerate(came):
         output = site.step(TickInput(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
         assert site._links["scheduled"][0] <= k + 10_000
@@ -193,13 +194,13 @@ def test_work_is_bounded_for_any_sample_number(name: str, came: list[list[int]])
     assert counts.refused == sum(
         not 0 <= m <= k + 10_000 for k, now in enumerate(came) for m in now
     )
-    assert site.release_tick(0, 200) == behind(name).release_tick(0, 200)
+    assert site.release_tick(0, 200) == make_site_behind_link(name).release_tick(0, 200)
 
 
 @pytest.mark.parametrize("name", ["constant", "uniform", "measured", "in order"])
 def test_an_ancient_sample_counts_as_lost(name: str) -> None:
     """The page of the calendar has been reused; at 1 Hz there are 32 pages."""
-    site = behind(name, 1, 1)
+    site = make_site_behind_link(name, 1, 1)
     step_site(site, [TickInput(k, [make_arrival(k - 1)] if k else []) for k in range(60)])
     before = site.counts()[0]
     output = site.step(

@@ -15,7 +15,7 @@ each = pytest.mark.parametrize("name", ["arm6", "arm7", "random3"])
 LAMBDA = 2.0
 
 
-def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
+def build_arrays(name: str, state: ChainState, **gains: object) -> SiteArrays:
     """Returns a site with the chain in a state; with its reference, v and a are those of the state."""
     chain = REFERENCES[name].chain
     joints = tuple(
@@ -65,7 +65,7 @@ def find_torque(arrays: SiteArrays) -> Array:
 def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
     """Eq. (13): Y theta - Kp r - Kd ed, and Y' r of Eq. (15)."""
     for state in REFERENCES[name].states:
-        arrays = build(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
+        arrays = build_arrays(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
         wanted = state.inverse_dynamics - 3.0 * (state.qd - state.v) + 5.0 * state.a / LAMBDA
         np.testing.assert_allclose(find_torque(arrays), wanted, rtol=1e-9, atol=1e-9)
         transpose_rows = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
@@ -78,7 +78,7 @@ def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
 def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
     """G - K e - d qd - Kd ed, where G is the torque of inverse dynamics for the arm at rest."""
     for state in REFERENCES[name].states:
-        arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
+        arrays = build_arrays(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
         torque = find_torque(arrays)
         still = 0.0 * state.q
         arm = Arm(

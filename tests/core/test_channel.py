@@ -17,7 +17,7 @@ from tests.core.builders import (
     compute_stamps_ns,
     make_channel,
 )
-from tests.core.compiled import run_program
+from tests.core.compiled import run_python
 from trilat_net.core.links.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
@@ -280,17 +280,17 @@ def test_golden_fates(name: str) -> None:
 
 _PROGRAM = """
 from tests.core.philox_reference import table
-from tests.core.kinds import fates, KINDS
+from tests.core.builders import KINDS, compute_fates
 for kind, shape in ((0, 0.0), (1, 0.0), (2, 0.3), (2, 4.0)):
     print(" ".join(number.hex() for number in table(300, kind, shape).tolist()))
 for name in KINDS:
-    print(name, fates(name, 200).tolist())
+    print(name, compute_fates(name, 200).tolist())
 """
 
 
 @pytest.mark.long
 def test_uncompiled_draws_and_fates_have_equal_bits() -> None:
-    plain = run_program(_PROGRAM, compiled=False)
+    plain = run_python(_PROGRAM, compiled=False)
     assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)
     assert plain.count("[") == len(KINDS)
-    assert plain == run_program(_PROGRAM, compiled=True)
+    assert plain == run_python(_PROGRAM, compiled=True)

@@ -40,7 +40,7 @@ def ramp_lists(draw: st.DrawFn) -> Ramps:
     return [DominanceRamp(start, start + draw(lasts), draw(rows())) for start in starts]
 
 
-def table(first: Row, ramps: Ramps) -> np.ndarray:
+def make_share_table(first: Row, ramps: Ramps) -> np.ndarray:
     return np.array(
         [(0, 0, *first), *((r.start_ns, r.end_ns, *r.alpha) for r in ramps)], dtype=np.float64
     )
@@ -49,7 +49,7 @@ def table(first: Row, ramps: Ramps) -> np.ndarray:
 def shares(t_ns: int, first: Row, ramps: Ramps) -> tuple[list[float], list[float]]:
     """Returns (alpha, its derivative) per peer."""
     links = np.zeros(PEERS, link_dtype(2))
-    apply_ramps(t_ns, 1 + len(ramps), table(first, ramps), links)
+    apply_ramps(t_ns, 1 + len(ramps), make_share_table(first, ramps), links)
     return links["alpha"].tolist(), links["alpha_rate"].tolist()
 
 
@@ -106,7 +106,7 @@ def test_the_derivative_is_the_finite_difference(first: Row, ramps: Ramps, t_ns:
 # In a site.
 
 
-def site(ramps: tuple[DominanceRamp, ...] = ()) -> Site:
+def make_ramped_site(ramps: tuple[DominanceRamp, ...] = ()) -> Site:
     """Returns a site that follows a peer at rest at (1, -1) and one that moves at (0.5, 0) rad/s."""
     links = (LinkSetup("a", 0.9, 1000, (1.0, -1.0)), LinkSetup("b", 0.1, 1000, (0.0, 0.0)))
     return Site(make_site_setup()._replace(links=links, ramps=ramps))
@@ -124,7 +124,7 @@ def run_site(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickReco
 
 def test_references_follow_changing_shares() -> None:
     """Eq. (6) with shares that change: the derivative contains their rates."""
-    outputs = run_site(site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
+    outputs = run_site(make_ramped_site((DominanceRamp(S, 2 * S, (0.1, 0.9)),)), {})
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     t_s = np.arange(3000) / 1000
     a = np.clip(0.9 - 0.8 * (t_s - 1), 0.1, 0.9)
@@ -138,8 +138,8 @@ def test_references_follow_changing_shares() -> None:
 
 def test_a_command_equals_the_scripted_ramp() -> None:
     ramp = DominanceRamp(S, 2 * S, (0.1, 0.9))
-    commanded = run_site(site(), {700: [CoreChange("shares", ramp=ramp)]})
-    scripted = run_site(site((ramp,)), {})
+    commanded = run_site(make_ramped_site(), {700: [CoreChange("shares", ramp=ramp)]})
+    scripted = run_site(make_ramped_site((ramp,)), {})
     assert [o._replace(cmd=[]) for o in commanded] == scripted
     assert commanded[700].cmd == ["shares"]
 
@@ -147,12 +147,12 @@ def test_a_command_equals_the_scripted_ramp() -> None:
 def test_earlier_commands_precede_planned_ramps() -> None:
     """Later ramps of the scenario still take place."""
     planned, sooner = DominanceRamp(2 * S, 2 * S, (0.0, 1.0)), DominanceRamp(S, S, (0.5, 0.5))
-    outputs = run_site(site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
+    outputs = run_site(make_ramped_site((planned,)), {500: [CoreChange("shares", ramp=sooner)]})
     assert [outputs[k].q_des[1] for k in (999, 1000, 1999, 2000)] == [-0.9, -0.5, -0.5, 0.0]
 
 
 def test_more_commands_than_a_run_takes_are_refused() -> None:
-    site_of_run = site()
+    site_of_run = make_ramped_site()
     for n in range(MAX_RAMPS):
         site_of_run.apply_change(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
     with pytest.raises(ValueError, match="256"):
@@ -168,14 +168,16 @@ def test_each_ramp_begins_where_the_last_was() -> None:
         start_ns, share = (7 * n + 100) * 1_000_000, 0.5 + 0.4 * math.sin(0.1 * n)
         ramps.append(DominanceRamp(start_ns, start_ns + 500_000_000, (share, 1.0 - share)))
     orders = {7 * n: [CoreChange("", ramp=ramp)] for n, ramp in enumerate(ramps)}
-    commanded = run_site(site(), orders)
-    assert [o._replace(cmd=[]) for o in commanded] == run_site(site(tuple(ramps)), {})
+    commanded = run_site(make_ramped_site(), orders)
+    assert [o._replace(cmd=[]) for o in commanded] == run_site(
+        make_ramped_site(tuple(ramps)), {}
+    )
     assert 7 * len(orders) < 3000
 
 
 @given(rows(), ramp_lists(), st.integers(0, 12 * S), st.integers(0, 12 * S))
 def test_folded_ramps_keep_the_bits(first: Row, ramps: Ramps, t: int, later: int) -> None:
-    folded = table(first, ramps)
+    folded = make_share_table(first, ramps)
     count = fold_ramps(min(t, later), 1 + len(ramps), folded)
     links = np.zeros(PEERS, link_dtype(2))
     apply_ramps(max(t, later), count, folded, links)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.compiled import run_program
+from tests.core.compiled import run_python
 
 SYMBOLS = """
 import numba, numpy as np
@@ -26,7 +26,7 @@ def test_symbols_of_leaves_separate_layouts() -> None:
     one, other = (
         dict(
             line.split()
-            for line in run_program(SYMBOLS.format(order), compiled=True).splitlines()
+            for line in run_python(SYMBOLS.format(order), compiled=True).splitlines()
         )
         for order in ((6, 7), (7, 6))
     )

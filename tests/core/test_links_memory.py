@@ -68,7 +68,7 @@ def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
 # Calendars that widen give what the widest give.
 
 
-def wide(site: Site, pages: int) -> Site:
+def make_wide_site(site: Site, pages: int) -> Site:
     site._arrays = widen_calendars(site._arrays, 0, pages)
     site._tick_arrays = (*site._arrays, *site._buffers)
     return site
@@ -91,7 +91,7 @@ def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataOb
         make_site_with_link(*rates, [LinkModel(location=1_000.0)]),
         make_site_with_link(*rates, [LinkModel(location=1_000.0)]),
     )
-    widest = wide(widest, calendar_pages(rates[0]))
+    widest = make_wide_site(widest, calendar_pages(rates[0]))
     first = grown._arrays.calendars.shape[1]
     now = 0
     arrival_ticks = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
@@ -136,7 +136,7 @@ def test_samples_on_their_way_survive_the_widening() -> None:
         "paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"}
     )
     setups = [scenario.setup("m1")] * 2
-    small, large = Site(setups[0]), wide(Site(setups[1]), 1 << 15)
+    small, large = Site(setups[0]), make_wide_site(Site(setups[1]), 1 << 15)
     for k in range(400):
         arrivals = [
             make_arrival(k - 1, peer)._replace(

@@ -9,7 +9,6 @@ from tests.execution.builders import (
     Trajectories,
     execute_ticks,
     make_shipped_trajectories,
-    make_trajectories,
 )
 from trilat_net.scenario import load_scenario
 
@@ -44,19 +43,19 @@ def same_bits(a: Trajectories, b: Trajectories) -> bool:
 def test_jitter_below_budget_is_constant_bit_for_bit(name: str) -> None:
     over = {"duration_s": 2.0}
     constant = make_shipped_trajectories("free", {**over, "link.delay_ms": BUDGET_MS})
-    buffered = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})
+    buffered = make_shipped_trajectories(
+        "free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}}
+    )
     assert same_bits(buffered, constant)
     assert buffered.stack("used").max() == 2000 - 1 - 200
-
-
-def trajectory(scenario: str, overrides: dict[str, Any]) -> Trajectories:
-    return make_trajectories(load_scenario(scenario, overrides))
 
 
 @pytest.mark.long
 def test_play_out_holds_throughout_the_paper() -> None:
     link = {"model": "gamma", "delay_ms": 60.0, "deviation_ms": 10.0, "playout_ms": BUDGET_MS}
-    assert same_bits(trajectory("paper", {"link": link}), make_shipped_trajectories("paper"))
+    assert same_bits(
+        make_shipped_trajectories("paper", {"link": link}), make_shipped_trajectories("paper")
+    )
 
 
 def test_jitter_above_budget_varies() -> None:
@@ -66,7 +65,7 @@ def test_jitter_above_budget_varies() -> None:
         "half_width_ms": 100.0,
         "playout_ms": BUDGET_MS,
     }
-    buffered = trajectory("free", {"link": link, "duration_s": 2.0})
+    buffered = make_shipped_trajectories("free", {"link": link, "duration_s": 2.0})
     constant = make_shipped_trajectories(
         "free", {"duration_s": 2.0, "link.delay_ms": BUDGET_MS}
     )

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 TICKS = 60
 
 
-def linked(law: str, name: str = "asymmetric", **more: Any) -> Scenario:
+def make_law_scenario(law: str, name: str = "asymmetric", **more: Any) -> Scenario:
     return load_scenario(name, {"link.delay_ms": 5.0, "control.law": law, **more})
 
 
@@ -47,7 +47,8 @@ def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRe
 
 def test_compiled_laws_give_the_plain_bits() -> None:
     a, b = (
-        run_by_hand(linked(f"tests.plugged_laws:{law}")) for law in ("Line", "CompiledLine")
+        run_by_hand(make_law_scenario(f"tests.plugged_laws:{law}"))
+        for law in ("Line", "CompiledLine")
     )
     assert a == b
     last = a["s"][-1]
@@ -73,7 +74,7 @@ class Watching:
 
 def test_laws_see_peers_external_torque_and_past() -> None:
     pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
-    scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
+    scenario = make_law_scenario("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
     laws: list[Watching] = []
     setup = scenario.setup("m1")._replace(
         law_factory=lambda facts: laws.append(Watching(facts)) or laws[-1]
@@ -201,7 +202,7 @@ REFUSED = {
 @pytest.mark.parametrize("law", REFUSED)
 def test_code_unsuitable_for_numba_is_refused(law: str) -> None:
     with pytest.raises(ScenarioError, match=REFUSED[law]) as caught:
-        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+        Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
     assert caught.value.path == "sites.s.control.law"
 
 
@@ -223,7 +224,7 @@ def test_a_law_with_memory_is_recognised(law: str) -> None:
     with pytest.raises(
         ScenarioError, match=rf"{law} writes self.sums: .* remembers = \('sums',\)"
     ):
-        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+        Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
 
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3)
@@ -273,7 +274,7 @@ FAILING = {
 @pytest.mark.parametrize("law", FAILING)
 def test_failing_compiled_laws_name_their_tick(law: str) -> None:
     site, (tick, problem) = (
-        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s")),
+        Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s")),
         FAILING[law],
     )
     for k in range(tick):
@@ -286,7 +287,8 @@ def test_failing_compiled_laws_name_their_tick(law: str) -> None:
 def test_chain_laws_have_equal_bits_everywhere() -> None:
     """The law uses inertia, bias and gravity."""
     scenarios = [
-        linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")
+        make_law_scenario(f"tests.plugged_laws:{law}", "six_joints")
+        for law in ("Line", "CompiledLine")
     ]
     # soon after that the arms diverge
     a, b = (run_by_hand(scenario, 30) for scenario in scenarios)

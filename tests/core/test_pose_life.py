@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 import trilat_net
 from tests.core.builders import POSE, make_task_arrays
-from tests.core.guarded_runs import largest_step, ordered
+from tests.core.guarded_runs import find_largest_step, make_ordered_log
 from tests.scenario.builders import posed_task_text
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
@@ -157,7 +157,7 @@ outages_s = [[2.0, 4.0]]"""
 
 
 @functools.cache
-def posed() -> Log:
+def make_pose_log() -> Log:
     """Returns three arms that agree on a pose; no site hears another from 2.04 to 4.04 s."""
     text = posed_task_text(5.0).replace("[link]", GLIDES)
     far = "posture_rad = [1.2, -0.3, -0.9, -1.6, -0.3, 1.4, 0.25] }"
@@ -174,7 +174,7 @@ def test_arms_hold_joints_and_follow_again() -> None:
 
     The remaining motion comes from gravity that is not learnt yet.
     """
-    log = posed()
+    log = make_pose_log()
     for site in log.sites:
         part = log[site]
         held = np.flatnonzero(part.mode == "hold")
@@ -215,7 +215,7 @@ def test_held_arms_return_from_free_motion() -> None:
 @pytest.mark.long
 def test_references_integrate_their_velocities() -> None:
     """If the reference follows peers alone, it does so only once these agree; see `task_space`."""
-    log = posed()
+    log = make_pose_log()
     for site in log.sites:
         part = log[site]
         rest = np.isin(part.mode, ["waiting", "hold"])
@@ -258,11 +258,11 @@ def test_equal_arms_stop_and_return_smoothly() -> None:
     text = posed_task_text(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
     scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
     orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}
-    log = ordered(scenario, orders)
+    log = make_ordered_log(scenario, orders)
     assert {"stopped", "fault", "hold"} <= {
         str(mode) for site in log.sites for mode in log[site].mode
     }
     for site in log.sites:
-        assert largest_step(log, site) <= 0.5 * (1.0 + 1e-9)
+        assert find_largest_step(log, site) <= 0.5 * (1.0 + 1e-9)
         assert set(log[site].mode[-200:]) == {"run"}
     assert verify(log).identical == 18_000

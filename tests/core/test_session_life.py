@@ -28,7 +28,7 @@ from trilat_net.scenario import Scenario, parse_scenario
 OUTAGE = "[[2.0, 2.6]]"
 
 
-def glide(
+def make_glide_scenario(
     duration_s: float = 5.0, rate_hz: int = 1000, outages_s: str = OUTAGE, **keys: float
 ) -> Scenario:
     keys = {"speed": 1.0, "limit": 1.5, **keys}
@@ -39,7 +39,7 @@ def glide(
 
 @pytest.fixture(scope="module")
 def log() -> Log:
-    return trilat_net.simulate(glide())
+    return trilat_net.simulate(make_glide_scenario())
 
 
 def test_sites_wait_then_align_then_follow(log: Log) -> None:
@@ -90,7 +90,7 @@ def test_the_reference_never_jumps(site: str, log: Log) -> None:
 
 @pytest.mark.parametrize("speed", [0.2, 1.0])
 def test_approaches_to_peers_keep_their_speed_limit(speed: float) -> None:
-    log = trilat_net.simulate(glide(12.0, outages_s="[]", speed=speed))
+    log = trilat_net.simulate(make_glide_scenario(12.0, outages_s="[]", speed=speed))
     part, other = log["s"], log["m"]
     aligning = np.flatnonzero(part.mode == "return")
     way_rate = part.qd_des[aligning] - other.qd[aligning - 100]
@@ -100,14 +100,14 @@ def test_approaches_to_peers_keep_their_speed_limit(speed: float) -> None:
 
 
 def test_sites_beyond_their_limit_wait_and_say_so() -> None:
-    log = trilat_net.simulate(glide(1.0, outages_s="[]", limit=0.1))
+    log = trilat_net.simulate(make_glide_scenario(1.0, outages_s="[]", limit=0.1))
     assert set(log["s"].mode) == {"waiting"}
     shared = 2
     assert log["s"].states[-1].mem[2 * shared + 1] == LifeReason.ALIGN_LIMIT
 
 
 def test_every_driver_gives_the_same_bits() -> None:
-    scenario = glide(3.0)
+    scenario = make_glide_scenario(3.0)
     ticks, fused = make_trajectories(scenario), sample_records(scenario, (3.0,))[:, 0]
     columns = scenario.layout("m").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
@@ -140,7 +140,7 @@ ORDERS = (LifeOrder.STOP, LifeOrder.RELEASED, LifeOrder.HELD, LifeOrder.ENABLE)
 @pytest.mark.parametrize("orders", list(product(ORDERS, repeat=3)))
 def test_released_arms_stay_braked_until_allowed(orders: tuple[LifeOrder, ...]) -> None:
     """After a release no further stop opens the brakes, and only `enable` ends a stop."""
-    site = Site(glide().setup("s"))
+    site = Site(make_glide_scenario().setup("s"))
     is_stopped = False
     is_released = False
     for tick, order in enumerate(orders):

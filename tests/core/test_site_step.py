@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.builders import VECTORS, describe_bits, make_arrival, make_site_setup, step_site
-from tests.core.compiled import run_program
+from tests.core.compiled import run_python
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
@@ -68,18 +68,19 @@ def test_records_hold_their_ticks_state_and_inputs() -> None:
 
 
 _PROGRAM = """
-from tests.core.sites import executed
+from tests.core.builders import execute_as_text
 for scheme in ("second_order", "digital"):
-    print("\\n".join(executed("asymmetric", scheme=scheme, duration_s=0.25, link__delay_ms=20,
-                              links={"m2->m1": {"delay_ms": 33.5}})))
+    keys = {"scheme": scheme, "duration_s": 0.25, "link__delay_ms": 20}
+    records = execute_as_text("asymmetric", links={"m2->m1": {"delay_ms": 33.5}}, **keys)
+    print("\\n".join(records))
 """
 
 
 @pytest.mark.push
 def test_uncompiled_runs_have_the_same_bits() -> None:
-    plain = run_program(_PROGRAM, compiled=False)
+    plain = run_python(_PROGRAM, compiled=False)
     assert plain.count("\n") == 2 * 3 * 250
-    assert plain == run_program(_PROGRAM, compiled=True)
+    assert plain == run_python(_PROGRAM, compiled=True)
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])

@@ -19,7 +19,7 @@ MS = 1_000_000
 RULE = StaleRule(StaleAction.HOLD, 20 * MS, 30 * MS)
 
 
-def site(
+def make_stale_site(
     rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0
 ) -> Site:
     """Returns a site with two peers behind 5 ms; the samples of its peers come from `moving`."""
@@ -52,7 +52,7 @@ def cut_ticks(count: int = 200) -> list[TickInput]:
 
 def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
     """Returns the records of a site during that cut."""
-    return step_site(site(rule), cut_ticks(count))
+    return step_site(make_stale_site(rule), cut_ticks(count))
 
 
 def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
@@ -102,7 +102,7 @@ def test_staleness_during_a_return_is_held() -> None:
         )
         for k in range(200)
     ]
-    outputs = step_site(site(RULE._replace(return_ns=50 * MS)), ticks)
+    outputs = step_site(make_stale_site(RULE._replace(return_ns=50 * MS)), ticks)
     assert runs_of(outputs) == [
         (Mode.RUN, 0),
         (Mode.HOLD, 70),
@@ -114,20 +114,20 @@ def test_staleness_during_a_return_is_held() -> None:
 
 
 def test_an_unheard_peer_has_the_runs_age() -> None:
-    outputs = step_site(site(RULE), [TickInput(k) for k in range(40)])
+    outputs = step_site(make_stale_site(RULE), [TickInput(k) for k in range(40)])
     assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
 
 
 def test_peers_without_share_may_be_stale() -> None:
     ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
-    assert runs_of(step_site(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
-    assert runs_of(step_site(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
+    assert runs_of(step_site(make_stale_site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
+    assert runs_of(step_site(make_stale_site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
 
 
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     """A diverged record holds no reference."""
-    stale_site = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
+    stale_site = make_stale_site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
     outputs = step_site(
         stale_site,
         [
@@ -164,7 +164,7 @@ def test_modes_and_references_follow_the_law(
     shares: tuple[float, float],
 ) -> None:
     """For any pattern of arrivals: the edges of `Mode`, and the reference of each mode."""
-    stale_site = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
+    stale_site = make_stale_site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
     mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
     for k, flags in enumerate(heard):
         output = stale_site.step(
@@ -222,7 +222,7 @@ def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
     """In any mode, because the records hold the site's memory."""
     rule = RULE._replace(action=action)
     whole = cut(rule)
-    stale_site = site(rule)
+    stale_site = make_stale_site(rule)
     last = whole[k - 1]
     in_use = [moving(j, m) for j, m in enumerate(last.used)]
     heard = [

@@ -37,7 +37,7 @@ def place_row(arrays: SiteArrays, q: Array, qd: Array) -> Row:
     return s
 
 
-def draw(seed: int) -> tuple[SiteArrays, Array, Array]:
+def draw_state(seed: int) -> tuple[SiteArrays, Array, Array]:
     rng = np.random.default_rng(seed)
     arrays = make_task_arrays(POSE if seed % 2 else PLACE)
     q = arrays.site[0].q + rng.normal(0.0, 0.2, 7)
@@ -80,7 +80,7 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 
 @given(seed=seeds)
 def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
-    arrays, q, qd = draw(seed)
+    arrays, q, qd = draw_state(seed)
     h, m = 1e-6, arrays.site[0].shared
     before, after = (
         np.array(place_row(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0)
@@ -98,7 +98,7 @@ def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
 @given(seed=seeds)
 def test_r_follows_the_task_in_any_posture(seed: int) -> None:
     """J r = x' + Lambda e wherever no axis is damped."""
-    arrays, q, qd = draw(seed)
+    arrays, q, qd = draw_state(seed)
     s = place_row(arrays, q, qd)
     s.q_des = np.array(s.x) + 0.01
     s.qd_des = 0.02
@@ -143,7 +143,7 @@ def test_damping_begins_below_its_singular_value() -> None:
 
 @given(seed=seeds)
 def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
-    arrays, q, qd = draw(seed)
+    arrays, q, qd = draw_state(seed)
     s = place_row(arrays, q, qd)
     s.q_des = s.x
     update_task_errors(s)

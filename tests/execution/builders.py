@@ -1,8 +1,8 @@
 """Builders of runs in virtual time: their records as arrays, their logs, and compiled runs."""
 
+import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -100,18 +100,17 @@ def sample_records(scenario: Scenario, times_s: Array | tuple[float, ...]) -> Ar
     return np.stack(rows, axis=1)
 
 
-@cache
-def _make_shipped_trajectories(
-    name: str, overrides: tuple[tuple[str, Any], ...]
-) -> Trajectories:
-    return make_trajectories(load_scenario(name, dict(overrides)))
+_trajectories: dict[str, Trajectories] = {}
 
 
 def make_shipped_trajectories(
     name: str, overrides: Mapping[str, Any] | None = None
 ) -> Trajectories:
     """Returns the records of a shipped scenario as arrays, simulated once per process."""
-    return _make_shipped_trajectories(name, tuple(sorted((overrides or {}).items())))
+    key = json.dumps([name, overrides or {}], sort_keys=True)
+    if key not in _trajectories:
+        _trajectories[key] = make_trajectories(load_scenario(name, dict(overrides or {})))
+    return _trajectories[key]
 
 
 def make_log_with_commands(

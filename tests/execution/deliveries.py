@@ -25,7 +25,9 @@ never = st.frozensets(samples, max_size=40)
 site_sets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
 
 
-def gaps(size: int, least: int = 1, most: int = 3) -> st.SearchStrategy[dict[str, set[int]]]:
+def draw_gaps(
+    size: int, least: int = 1, most: int = 3
+) -> st.SearchStrategy[dict[str, set[int]]]:
     """Draws ticks without a record, of some sites; the last tick has a record."""
     lost = st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=size)
     return st.dictionaries(st.sampled_from(SITES), lost, min_size=least, max_size=most)
@@ -43,7 +45,7 @@ def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
     return held
 
 
-def delivered(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
+def make_delivered_bytes(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
     """Returns a log of a run whose samples take the given numbers of ticks, one by default, or are lost."""
     at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}
     for receiver, peer, tick in itertools.product(SCENARIO.names, (0, 1), range(TICKS)):

@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.execution.builders import make_log_without
-from tests.execution.deliveries import SITES, TICKS, delivered
+from tests.execution.deliveries import SITES, TICKS, make_delivered_bytes
 from tests.log.builders import (
     drop_records,
     edit_log_bytes,
@@ -18,7 +18,7 @@ from tests.log.builders import (
     make_log_bytes,
     open_bytes,
 )
-from tests.log_surgery import Pieces, Stored, repacked, taken_apart
+from tests.log.surgery import Pieces, Stored, repack_message, take_apart
 from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.log_checks import LogCheckReport
@@ -35,12 +35,12 @@ LATE = {("m1", 0, 20): 35, ("m2", 1, 30): 38, ("s", 0, 25): 39}
 
 
 @cache
-def run(*, other: bool = False) -> bytes:
-    return delivered(LATE if other else {})
+def make_run_bytes(*, other: bool = False) -> bytes:
+    return make_delivered_bytes(LATE if other else {})
 
 
 def pieces(*, chained: bool, other: bool = False) -> Pieces:
-    taken = taken_apart(run(other=other))
+    taken = take_apart(make_run_bytes(other=other))
     return taken if chained else taken.without_chain()
 
 
@@ -56,8 +56,8 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
 
 
 def test_rewriting_without_changes_keeps_the_file() -> None:
-    assert taken_apart(run()).bytes() == run()
-    log = open_bytes(run())
+    assert take_apart(make_run_bytes()).bytes() == make_run_bytes()
+    log = open_bytes(make_run_bytes())
     assert judge_integrity(log).state is DigestState.INTACT
     assert LogCheckReport.of_log(log, virtual=True).passed
     old = open_bytes(pieces(chained=False).bytes())
@@ -90,7 +90,7 @@ def remove(draw: Callable, taken: Pieces) -> None:
 def splice(draw: Callable, taken: Pieces) -> None:
     """Returns a log that continues with another run from some tick on, over a gap or none."""
     k, gap = draw(st.integers(TICKS // 2, TICKS - 5)), draw(st.integers(0, 3))
-    other = taken_apart(run(other=True)).messages
+    other = take_apart(make_run_bytes(other=True)).messages
     topics = taken.topics()
 
     def is_record(m: Stored) -> bool:
@@ -115,7 +115,7 @@ def replay(draw: Callable, taken: Pieces) -> None:
     for message in again:
         tick = message.sequence + len(ticks)
         taken.messages.append(
-            repacked(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000)
+            repack_message(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000)
         )
 
 
@@ -123,7 +123,7 @@ def renumber(draw: Callable, taken: Pieces) -> None:
     by = draw(st.integers(-40, 40).filter(bool))
     for n in places(taken, draw(sites), draw(stretches)):
         tick = taken.messages[n].sequence + by
-        taken.messages[n] = repacked(taken.messages[n], tick=tick)
+        taken.messages[n] = repack_message(taken.messages[n], tick=tick)
 
 
 def change_metadata(draw: Callable, taken: Pieces) -> None:
@@ -166,7 +166,7 @@ def change_message(draw: Callable, taken: Pieces) -> None:
     message = taken.messages[n]
     match draw(st.sampled_from(["log_ns", "publish_ns", "telemetry", "out"])):
         case "telemetry" if "late_us" in msgpack.unpackb(message.payload):
-            taken.messages[n] = repacked(message, late_us=77)
+            taken.messages[n] = repack_message(message, late_us=77)
         case "out":
             del taken.messages[n]
         case "publish_ns":
@@ -208,7 +208,7 @@ def test_of_500_changed_logs_none_passes(chained: bool, changes: list[Callable])
 def test_two_runs_over_a_gap_are_refused() -> None:
     """The same experiment and the same starts of its sites: another run follows the gap."""
     taken = pieces(chained=False)
-    other = taken_apart(run(other=True)).messages
+    other = take_apart(make_run_bytes(other=True)).messages
     topics = taken.topics()
     taken.messages = [
         m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
@@ -293,7 +293,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
 
 def test_lost_samples_excuse_virtual_time_afterwards() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
-    log = open_bytes(delivered({}, lost))
+    log = open_bytes(make_delivered_bytes({}, lost))
     report = LogCheckReport.of_log(log, virtual=True)
     assert report.passed, report.findings
     assert (
@@ -306,7 +306,7 @@ def test_lost_samples_excuse_virtual_time_afterwards() -> None:
         return {**r, "tau": [r["tau"][0], r["tau"][1] + 1e-12]} if r["tick"] == 30 else r
 
     changed = LogCheckReport.of_log(
-        open_bytes(edit_log_bytes(delivered({}, lost), record=record)), virtual=True
+        open_bytes(edit_log_bytes(make_delivered_bytes({}, lost), record=record)), virtual=True
     )
     assert not changed.findings[-1].passed
 

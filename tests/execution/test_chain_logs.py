@@ -20,12 +20,12 @@ N, TICKS = 6, 80
 
 
 @cache
-def record_chain_log() -> bytes:
+def make_chain_bytes() -> bytes:
     """Returns a run in which every link delays by 20 ms."""
     return simulate_bytes(parse_scenario(six_joint_text(TICKS / 1000)))
 
 
-def changed(field: str, numbers: int) -> Log:
+def make_changed_log(field: str, numbers: int) -> Log:
     """Returns the log whose slave has that many numbers in a vector of one record."""
 
     def change(record: Record) -> Record:
@@ -33,11 +33,11 @@ def changed(field: str, numbers: int) -> Log:
             record[field] = (record[field] * 2)[:numbers]
         return record
 
-    return open_bytes(edit_log_bytes(record_chain_log(), record=change))
+    return open_bytes(edit_log_bytes(make_chain_bytes(), record=change))
 
 
 def test_six_joints_executed_again_equal_virtual_time() -> None:
-    log = open_bytes(record_chain_log())
+    log = open_bytes(make_chain_bytes())
     verdict, twins = verify(log), compare_with_virtual(log)
     assert verdict.passed, str(verdict.first)
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -51,7 +51,7 @@ def test_six_joints_executed_again_equal_virtual_time() -> None:
 def test_two_records_resume_six_joints() -> None:
     log = open_bytes(
         edit_log_bytes(
-            record_chain_log(),
+            make_chain_bytes(),
             record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r,
         )
     )
@@ -64,7 +64,7 @@ def test_two_records_resume_six_joints() -> None:
     ("field", "numbers"), [("q", 5), ("q", 7), ("tau", 2), ("theta_hat", 5)]
 )
 def test_records_with_other_joints_are_refused(field: str, numbers: int) -> None:
-    log = changed(field, numbers)
+    log = make_changed_log(field, numbers)
     with pytest.raises(
         LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"
     ):
@@ -79,7 +79,7 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
             record["qd"][N - 1] = math.nextafter(record["qd"][N - 1], math.inf)
         return record
 
-    first = verify(open_bytes(edit_log_bytes(record_chain_log(), record=change))).first
+    first = verify(open_bytes(edit_log_bytes(make_chain_bytes(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.core.compiled import run_program
+from tests.core.compiled import run_python
 from tests.execution.builders import execute_ticks, run_fused
 from tests.execution.varying_links import VARYING_LINKS
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
@@ -39,7 +39,7 @@ LINKS: tuple[dict[str, Any], ...] = (
 )
 
 
-def floats(output: TickRecord) -> list[float]:
+def list_floats(output: TickRecord) -> list[float]:
     o = output
     return [
         *o.q,
@@ -55,7 +55,7 @@ def floats(output: TickRecord) -> list[float]:
     ]
 
 
-def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
+def compute_buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
     maxima = np.full(
         (len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0
@@ -68,14 +68,16 @@ def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     return maxima
 
 
-def agree(scenario: Scenario) -> None:
+def assert_agreement(scenario: Scenario) -> None:
     expected = execute_ticks(scenario)
     fused = run_fused(scenario)
     for record, outputs in zip(fused.records, expected.values(), strict=True):
-        last = floats(outputs[-1])
+        last = list_floats(outputs[-1])
         np.testing.assert_array_equal(record[: len(last)], last)
     for maximum, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
-        np.testing.assert_array_equal(maximum, buckets(outputs, scenario.sites[name].rate_hz))
+        np.testing.assert_array_equal(
+            maximum, compute_buckets(outputs, scenario.sites[name].rate_hz)
+        )
     stops = [
         o.t_ns * 1e-9
         for outputs in expected.values()
@@ -88,7 +90,7 @@ def agree(scenario: Scenario) -> None:
 @pytest.mark.parametrize("name", list_shipped())
 def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
     scenario = load_scenario(name)
-    agree(load_scenario(name, {"duration_s": min(scenario.duration_s, 2.0)}))
+    assert_agreement(load_scenario(name, {"duration_s": min(scenario.duration_s, 2.0)}))
 
 
 @settings(max_examples=12, deadline=None)
@@ -107,12 +109,12 @@ def test_any_links_rates_and_schemes_agree(
         for site, rate in zip(("m1", "m2", "s"), rates, strict=True)
     }
     run = {"duration_s": 0.4, "seed": seed, "scheme": scheme}
-    agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
+    assert_agreement(load_scenario(load_scenario(name), {**changes, **run, **link}))
 
 
 def test_diverging_runs_end_with_that_tick() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
-    agree(scenario)
+    assert_agreement(scenario)
     fused = run_fused(scenario, 1.0)
     assert fused.diverged_s is not None
     before = fused.records
@@ -208,9 +210,9 @@ for scheme in ("second_order", "digital"):
 
 @pytest.mark.long
 def test_without_the_compiler_it_has_the_same_bits() -> None:
-    plain = run_program(_PROGRAM, compiled=False)
+    plain = run_python(_PROGRAM, compiled=False)
     assert plain.count("\n") == 8
-    assert plain == run_program(_PROGRAM, compiled=True)
+    assert plain == run_python(_PROGRAM, compiled=True)
 
 
 def test_unsupported_runs_are_refused() -> None:

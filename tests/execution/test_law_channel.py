@@ -27,13 +27,13 @@ DELAY_TICKS = 20
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0, "control.law": LAW}
 
 
-def talk(**more: Any) -> bytes:
+def make_talking_bytes(**more: Any) -> bytes:
     return make_log_bytes("paper", {**SHORT, **more})
 
 
 def test_peers_get_own_and_common_vectors() -> None:
     """The energy that a site states, from the records of its peers alone, without the parts for others."""
-    log = open_bytes(talk())
+    log = open_bytes(make_talking_bytes())
     alpha = log.scenario.dominance
     for site in SITES:
         energy = np.zeros(TICKS)
@@ -54,7 +54,7 @@ def test_peers_get_own_and_common_vectors() -> None:
 
 
 def test_messages_are_executed_again_like_virtual_time() -> None:
-    log = open_bytes(talk())
+    log = open_bytes(make_talking_bytes())
     verdict = verify(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -68,7 +68,7 @@ def test_messages_are_executed_again_like_virtual_time() -> None:
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_behind_gaps_messages_continue_from_records(session: dict[str, str] | None) -> None:
     """As much can be judged as without messages between laws, and all of it agrees."""
-    verdict = verify(make_log_without({"s": range(50, 61)}, talk(), session))
+    verdict = verify(make_log_without({"s": range(50, 61)}, make_talking_bytes(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
     data = make_log_bytes("paper", {**SHORT, "control.law": "tests.laws:Adaptive"})
@@ -89,7 +89,9 @@ def test_a_changed_number_shows_at_its_own_tick(
             r["ch"][place] += 1e-3
         return r
 
-    first = verify(open_bytes(edit_log_bytes(talk(), record=record, session=session))).first
+    first = verify(
+        open_bytes(edit_log_bytes(make_talking_bytes(), record=record, session=session))
+    ).first
     assert first is not None
     assert first[:3] == ("m2", 40, f"ch.{name}")
 
@@ -103,14 +105,17 @@ def test_arrival_sums_cover_exactly_the_received_numbers(place: int, differing: 
             r["ch"][place] += 1e-3
         return r
 
-    assert verify(open_bytes(edit_log_bytes(talk(), record=record))).differing == differing
+    assert (
+        verify(open_bytes(edit_log_bytes(make_talking_bytes(), record=record))).differing
+        == differing
+    )
 
 
 def test_records_with_wrong_law_messages_are_unreadable() -> None:
     def record(r: Record) -> Record:
         return {**r, "ch": r["ch"][:-1]}
 
-    log = open_bytes(edit_log_bytes(talk(), record=record))
+    log = open_bytes(edit_log_bytes(make_talking_bytes(), record=record))
     with pytest.raises(LogError, match="ch has 4 numbers, not 5"):
         log["m1"].ch  # noqa: B018
 
@@ -146,7 +151,7 @@ def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
 
 
 def test_tables_name_messages_with_their_units() -> None:
-    log = open_bytes(talk())
+    log = open_bytes(make_talking_bytes())
     table = log.table("m2", "state")
     columns = {
         column.source: column for column in table.columns if column.source.startswith("ch.")

@@ -18,7 +18,7 @@ LAWS = ("Line", "CompiledLine")
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
-def plugged(law: str) -> bytes:
+def make_plugged_bytes(law: str) -> bytes:
     return make_log_bytes("paper", {**SHORT, "control.law": f"tests.plugged_laws:{law}"})
 
 
@@ -27,7 +27,7 @@ def plugged(law: str) -> bytes:
 def test_plugged_laws_verify_whole_and_behind_gaps(
     law: str, session: dict[str, str] | None
 ) -> None:
-    data = plugged(law)
+    data = make_plugged_bytes(law)
     verdict = verify(open_bytes(data))
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -40,7 +40,7 @@ def test_plugged_laws_verify_whole_and_behind_gaps(
 
 @pytest.mark.parametrize("law", LAWS)
 def test_any_record_resumes_the_whole_run(law: str) -> None:
-    log = open_bytes(plugged(law))
+    log = open_bytes(make_plugged_bytes(law))
     samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
     ends = dict.fromkeys(log.sites, TICKS - 1)
     for name in log.sites:
@@ -59,7 +59,7 @@ def test_any_record_resumes_the_whole_run(law: str) -> None:
 
 
 def test_a_changed_gain_changes_only_its_effect() -> None:
-    log = open_bytes(plugged("CompiledLine"))
+    log = open_bytes(make_plugged_bytes("CompiledLine"))
     same = rerun(log, closed_loop=True)
     assert all(effect.identical == effect.executed == TICKS for effect in same.sites.values())
     changed = rerun(log, ["s"], {"sites.s.control.K": 25.0})

@@ -65,7 +65,7 @@ def test_both_ways_agree_on_arms_outside() -> None:
     assert assert_same_result(make_external_arm_bytes()).identical > 0
 
 
-def spoil(record: Record, draws: random.Random) -> None:
+def spoil_record(record: Record, draws: random.Random) -> None:
     """Changes a field of a record."""
     name = draws.choice(FIELDS.split())
     value = record[name]
@@ -109,7 +109,7 @@ def test_both_ways_agree_on_spoiled_records(seed: int) -> None:
         if place in dropped:
             return None
         if place in spoiled or (is_lasting and record["tick"] > 200 and place[0] == "m1"):
-            spoil(record, draws)
+            spoil_record(record, draws)
         return record
 
     assert_same_result(

@@ -13,7 +13,7 @@ from tests.execution.deliveries import (
     SITES,
     TICKS,
     Sample,
-    delivered,
+    make_delivered_bytes,
     never,
     site_sets,
     under_way,
@@ -73,13 +73,15 @@ def test_reruns_of_every_log_version_are_equal(path: Path, replace: list[str]) -
 def test_recorded_delivery_is_repeated_exactly(
     delays: dict[Sample, int], lost: frozenset[Sample], replace: list[str]
 ) -> None:
-    assert all_identical(rerun(open_bytes(delivered(delays, lost)), replace))
+    assert all_identical(rerun(open_bytes(make_delivered_bytes(delays, lost)), replace))
 
 
 def test_a_changed_site_sees_recorded_samples() -> None:
     """By hand: the site of the changed scenario receives the samples that its records list."""
     log = open_bytes(
-        delivered({("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)})
+        make_delivered_bytes(
+            {("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)}
+        )
     )
     changes = {
         "sites.s.control.Kd": 7.0,
@@ -136,7 +138,9 @@ def test_closed_loop_changes_equal_the_changed_experiment(
 
 
 def test_longer_delays_make_late_samples_harmless() -> None:
-    log = open_bytes(delivered({("m2", 1, 40): 25, ("s", 0, 50): 31, ("s", 1, 51): 30}))
+    log = open_bytes(
+        make_delivered_bytes({("m2", 1, 40): 25, ("s", 0, 50): 31, ("s", 1, 51): 30})
+    )
     again = rerun(log, [], {"link.delay_ms": 31.0}, closed_loop=True)
     twin = make_log("free", {"duration_s": 0.12, "link.delay_ms": 31.0})
     assert all(
@@ -145,7 +149,7 @@ def test_longer_delays_make_late_samples_harmless() -> None:
 
 
 def test_on_measured_links_only_arrivals_count() -> None:
-    log = open_bytes(delivered({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
+    log = open_bytes(make_delivered_bytes({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
     again = rerun(log, ["s"], {"link.model": "measured"})
     assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == (
         (20.0, 9.0),

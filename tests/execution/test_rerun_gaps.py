@@ -9,9 +9,9 @@ from tests.execution.deliveries import (
     SITES,
     TICKS,
     Sample,
-    delivered,
+    draw_gaps,
     first_in_first_out,
-    gaps,
+    make_delivered_bytes,
     site_sets,
     under_way,
 )
@@ -21,11 +21,11 @@ from trilat_net.execution.what_if import rerun
 
 
 @settings(max_examples=15)
-@given(lost=gaps(25), replace=site_sets, delays=under_way)
+@given(lost=draw_gaps(25), replace=site_sets, delays=under_way)
 def test_reruns_continue_behind_a_gap(
     lost: dict[str, set[int]], replace: list[str], delays: dict[Sample, int]
 ) -> None:
-    log = make_log_without(lost, delivered(first_in_first_out(delays)))
+    log = make_log_without(lost, make_delivered_bytes(first_in_first_out(delays)))
     again = rerun(log, replace)
     assert again.identical
     for name, effect in again.sites.items():

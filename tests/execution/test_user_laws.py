@@ -35,7 +35,7 @@ LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
-def record_own_law(law: str = LAW, **more: Any) -> bytes:
+def make_own_law_bytes(law: str = LAW, **more: Any) -> bytes:
     return make_log_bytes("paper", {**SHORT, "control.law": law, **more})
 
 
@@ -58,7 +58,7 @@ def test_own_paper_law_gives_equal_bits(name: str) -> None:
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> None:
     """As much can be judged as of a shipped law."""
-    verdict = verify(make_log_without({"s": range(50, 61)}, record_own_law(), session))
+    verdict = verify(make_log_without({"s": range(50, 61)}, make_own_law_bytes(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
     ours = verify(
@@ -71,7 +71,7 @@ def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
     """If no memory has to be restored the law passes; behind a gap, or tick by tick, it does not."""
-    data = record_own_law("tests.laws:Forgetful")
+    data = make_own_law_bytes("tests.laws:Forgetful")
     assert verify(open_bytes(data)).passed
     verdict = verify(make_log_without({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
@@ -99,7 +99,7 @@ def test_restarted_sites_are_the_same(law: str) -> None:
 
 
 def test_hidden_memory_shows_at_a_restart() -> None:
-    log = open_bytes(record_own_law("tests.laws:Forgetful"))
+    log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
     verification = verify(log, resume_every=40)
@@ -108,7 +108,7 @@ def test_hidden_memory_shows_at_a_restart() -> None:
 
 
 def test_reports_explain_hidden_memory() -> None:
-    log = open_bytes(record_own_law("tests.laws:Forgetful"))
+    log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
     (law,) = find_user_laws(log.scenario)[:1]
 
     def find_text(**settings: int) -> str:
@@ -137,7 +137,7 @@ def test_changed_memory_shows_at_its_tick() -> None:
             r["mem"][4] += 1e-3
         return r
 
-    verdict = verify(open_bytes(edit_log_bytes(record_own_law(), record=record)))
+    verdict = verify(open_bytes(edit_log_bytes(make_own_law_bytes(), record=record)))
     assert verdict.differing == 1
     assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
 
@@ -154,13 +154,13 @@ def file(
     return file
 
 
-def log_of(file: Path) -> io.BytesIO:
+def make_log_stream(file: Path) -> io.BytesIO:
     overrides = {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}
     return io.BytesIO(simulate_bytes(load_scenario("two_sites", overrides)))
 
 
 def test_changed_files_are_judged_on_request(file: Path) -> None:
-    stream = log_of(file)
+    stream = make_log_stream(file)
     log = open_log(stream)
     (law,) = find_user_laws(log.scenario)
     assert (law.sites, law.allowed, law.changed) == (("m", "s"), True, "")
@@ -177,19 +177,19 @@ def test_changed_files_are_judged_on_request(file: Path) -> None:
         False,
     )
     with pytest.raises(UsageError, match="is not the file that ran"):
-        reopened(stream, law=file)
-    assert verify(reopened(stream, law=file, other_version=True)).passed
+        reopen_log(stream, law=file)
+    assert verify(reopen_log(stream, law=file, other_version=True)).passed
     file.write_text(file.read_text().replace("pass", "def memory(self): return [1.0]"))
-    assert verify(reopened(stream, law=file, other_version=True)).first.field == "mem"
+    assert verify(reopen_log(stream, law=file, other_version=True)).first.field == "mem"
 
 
-def reopened(stream: io.BytesIO, **how: Any) -> Log:
+def reopen_log(stream: io.BytesIO, **how: Any) -> Log:
     stream.seek(0)
     return open_log(stream, **how)
 
 
 def test_a_missing_file_names_the_remedy(file: Path) -> None:
-    log = open_log(log_of(file))
+    log = open_log(make_log_stream(file))
     file.unlink()
     (law,) = find_user_laws(log.scenario)
     assert str(law).endswith("external code, which may not run; if you trust it: --law FILE")
@@ -197,7 +197,7 @@ def test_a_missing_file_names_the_remedy(file: Path) -> None:
 
 
 def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
-    stream = log_of(file)
+    stream = make_log_stream(file)
     wrong = "1 / 0 if now.k == 7 and self._facts.site == 's'"
     failing = f"def torque(self, now): return {wrong} else super().torque(now)"
     file.write_text(file.read_text().replace("pass", failing))

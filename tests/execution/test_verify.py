@@ -13,9 +13,9 @@ from tests.execution.deliveries import (
     SITES,
     TICKS,
     Sample,
-    delivered,
+    draw_gaps,
     first_in_first_out,
-    gaps,
+    make_delivered_bytes,
     never,
     under_way,
 )
@@ -36,12 +36,14 @@ VECTORS = Layout().lengths()
 ticks = st.one_of(st.sampled_from([0, 1, 2, TICKS - 2, TICKS - 1]), st.integers(0, TICKS - 1))
 
 
-def flipped(value: float, bit: int) -> float:
+def flip_bit(value: float, bit: int) -> float:
     (bits,) = struct.unpack("<Q", struct.pack("<d", value))
     return float(struct.unpack("<d", struct.pack("<Q", bits ^ (1 << bit)))[0])
 
 
-def at(site: str, tick: int, change: Callable[[Record], Any]) -> Callable[[Record], Record]:
+def change_tick(
+    site: str, tick: int, change: Callable[[Record], Any]
+) -> Callable[[Record], Record]:
     """Changes one record in place."""
 
     def record(r: Record) -> Record:
@@ -52,7 +54,7 @@ def at(site: str, tick: int, change: Callable[[Record], Any]) -> Callable[[Recor
     return record
 
 
-def first_difference(name: str = "paper", **changes: Any) -> RecordDifference:
+def find_first_difference(name: str = "paper", **changes: Any) -> RecordDifference:
     """The first difference of the log of a scenario that was changed as `edited` says."""
     first = verify(open_bytes(edit_log_bytes(make_log_bytes(name), **changes))).first
     assert first is not None
@@ -99,9 +101,9 @@ def test_one_changed_vector_bit_is_named(
     index = entry % VECTORS[field]
 
     def change(r: Record) -> None:
-        r[field][index] = flipped(r[field][index], bit)
+        r[field][index] = flip_bit(r[field][index], bit)
 
-    first = first_difference(record=at(site, tick, change))
+    first = find_first_difference(record=change_tick(site, tick, change))
     assert first[:3] == (site, tick, f"{field}[{index}]")
     assert first.logged.hex() != first.computed.hex()
 
@@ -114,14 +116,18 @@ def test_a_changed_bit_of_used_is_named(site: str, tick: int, peer: int, bit: in
     def change(r: Record) -> None:
         r["used"][name] ^= 1 << bit
 
-    assert first_difference(record=at(site, tick, change))[:3] == (site, tick, f"used[{name}]")
+    assert find_first_difference(record=change_tick(site, tick, change))[:3] == (
+        site,
+        tick,
+        f"used[{name}]",
+    )
 
 
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize("tick", [0, 1, 50, TICKS - 1])
 def test_a_changed_mode_is_found_and_named(site: str, tick: int) -> None:
-    record = at(site, tick, lambda r: r.update(mode="diverged"))
-    assert first_difference(record=record)[:3] == (site, tick, "mode")
+    record = change_tick(site, tick, lambda r: r.update(mode="diverged"))
+    assert find_first_difference(record=record)[:3] == (site, tick, "mode")
 
 
 @settings(max_examples=20)
@@ -137,7 +143,7 @@ def test_one_changed_arrival_tick_is_named(
     def change(r: Record) -> None:
         r["rx"][arrival][1] ^= 1 << bit
 
-    first = first_difference(record=at(site, tick, change))
+    first = find_first_difference(record=change_tick(site, tick, change))
     assert first[:2] == (site, tick)
     assert first.field.startswith("rx")
 
@@ -156,7 +162,7 @@ def test_one_changed_arrival_tick_is_named(
 )
 @pytest.mark.parametrize("tick", [1, 50, TICKS - 1])
 def test_other_arrivals_are_found_and_named(change: Callable[[Record], Any], tick: int) -> None:
-    first = first_difference(record=at("m2", tick, change))
+    first = find_first_difference(record=change_tick("m2", tick, change))
     assert first[:2] == ("m2", tick)
     assert first.field.startswith("rx")
 
@@ -164,8 +170,8 @@ def test_other_arrivals_are_found_and_named(change: Callable[[Record], Any], tic
 @pytest.mark.parametrize("field", ["cmd", "mem", "t_ns", "boot"])
 def test_fields_that_nothing_computes_from_are_compared_too(field: str) -> None:
     value = {"cmd": ["stop"], "mem": [1.0], "t_ns": 50_000_001, "boot": 1}[field]
-    record = at("m2", 50, lambda r: r.update({field: value}))
-    assert first_difference(record=record)[:3] == ("m2", 50, field)
+    record = change_tick("m2", 50, lambda r: r.update({field: value}))
+    assert find_first_difference(record=record)[:3] == ("m2", 50, field)
 
 
 @pytest.mark.parametrize(
@@ -188,10 +194,10 @@ def test_another_scenario_number_is_found(old: str, new: str) -> None:
         assert old in text
         return text.replace(old, new, 1)
 
-    assert first_difference("free", scenario=scenario).tick <= 25
+    assert find_first_difference("free", scenario=scenario).tick <= 25
 
 
-def ranges(lost: set[int]) -> list[tuple[int, int]]:
+def list_ranges(lost: set[int]) -> list[tuple[int, int]]:
     starts = sorted(t for t in lost if t - 1 not in lost)
     ends = sorted(t for t in lost if t + 1 not in lost)
     return list(zip(starts, ends, strict=True))
@@ -214,11 +220,13 @@ def ranges(lost: set[int]) -> list[tuple[int, int]]:
 def test_execution_resumes_behind_a_reported_gap(site: str, lost: set[int]) -> None:
     verdict = verify(make_log_without({site: lost}))
     assert verdict.agreed, str(verdict.first)
-    assert verdict.gaps == [(site, first, last) for first, last in ranges(lost)]
+    assert verdict.gaps == [(site, first, last) for first, last in list_ranges(lost)]
     assert verdict.records == 3 * TICKS - len(lost)
     assert verdict.identical + verdict.unjudged == verdict.records
     # two records to resume from at the site itself, and at each peer no more than what was lost
-    assert verdict.unjudged <= sum(3 + 2 * (last - first + 4) for first, last in ranges(lost))
+    assert verdict.unjudged <= sum(
+        3 + 2 * (last - first + 4) for first, last in list_ranges(lost)
+    )
 
 
 @pytest.mark.parametrize("site", SITES)
@@ -245,7 +253,7 @@ def test_gaps_are_never_a_false_alarm(
         make_log_without({site: lost}, session={} if whole_run else OTHER_PLATFORM)
     )
     assert verdict.agreed, str(verdict.first)
-    assert [gap[1:] for gap in verdict.gaps] == ranges(lost)
+    assert [gap[1:] for gap in verdict.gaps] == list_ranges(lost)
     assert verdict.identical + verdict.unjudged == verdict.records
 
 
@@ -254,12 +262,12 @@ def test_gaps_are_never_a_false_alarm(
 def test_scattered_samples_are_no_difference(
     delays: dict[Sample, int], never: frozenset[Sample]
 ) -> None:
-    verdict = verify(open_bytes(delivered(delays, never)))
+    verdict = verify(open_bytes(make_delivered_bytes(delays, never)))
     assert verdict.identical == verdict.records == 3 * TICKS
 
 
 @settings(max_examples=20)
-@given(delays=under_way, never=never, lost=gaps(30, least=0), whole_run=st.booleans())
+@given(delays=under_way, never=never, lost=draw_gaps(30, least=0), whole_run=st.booleans())
 def test_gaps_with_lost_samples_are_no_difference(
     delays: dict[Sample, int],
     never: frozenset[Sample],
@@ -267,7 +275,7 @@ def test_gaps_with_lost_samples_are_no_difference(
     whole_run: bool,
 ) -> None:
     """On links that keep their order, as those of a session do."""
-    data = delivered(first_in_first_out(delays), never)
+    data = make_delivered_bytes(first_in_first_out(delays), never)
     verdict = verify(make_log_without(lost, data, {} if whole_run else OTHER_PLATFORM))
     assert verdict.agreed, str(verdict.first)
     assert {gap[0] for gap in verdict.gaps} == set(lost)
@@ -276,7 +284,7 @@ def test_gaps_with_lost_samples_are_no_difference(
 def test_gaps_among_reordered_samples_are_no_difference() -> None:
     """Sample 45 comes at 53, after newer ones; record 50 is missing, and the first to be listed is 45."""
     delays = {("m2", peer, tick): way for peer in (0, 1) for tick, way in ((45, 8), (52, 5))}
-    data = delivered(delays)
+    data = make_delivered_bytes(delays)
     verdict = verify(open_bytes(edit_log_bytes(data, record=drop_records("m2", {50}))))
     assert verdict.agreed, str(verdict.first)
 
@@ -284,17 +292,17 @@ def test_gaps_among_reordered_samples_are_no_difference() -> None:
 def test_a_change_behind_a_gap_is_still_found() -> None:
     def record(r: Record) -> Record | None:
         if r["site"] == "m2" and r["tick"] == 90:
-            r["tau"][0] = flipped(r["tau"][0], 0)
+            r["tau"][0] = flip_bit(r["tau"][0], 0)
         return drop_records("m2", {40, 41})(r)
 
-    assert first_difference(record=record)[:3] == ("m2", 90, "tau[0]")
+    assert find_first_difference(record=record)[:3] == ("m2", 90, "tau[0]")
 
 
 def test_a_record_that_stands_twice_is_found() -> None:
     def record(r: Record) -> Record:
         return {**r, "tick": 50} if r["site"] == "m2" and r["tick"] == 51 else r
 
-    assert first_difference(record=record)
+    assert find_first_difference(record=record)
 
 
 @pytest.mark.parametrize("name", list_shipped())
@@ -312,7 +320,9 @@ def test_other_platforms_find_changes_beyond_tolerance(field: str, tick: int) ->
     def change(r: Record) -> None:
         r[field][1] += 1e-6 * (1 + abs(r[field][1]))
 
-    first = first_difference("free", record=at("m2", tick, change), session=OTHER_PLATFORM)
+    first = find_first_difference(
+        "free", record=change_tick("m2", tick, change), session=OTHER_PLATFORM
+    )
     assert first[:3] == ("m2", tick, f"{field}[1]")
 
 

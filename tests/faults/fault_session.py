@@ -15,7 +15,7 @@ from unittest import mock
 
 import msgpack
 
-from tests.log.disks import SmallDisk, file_on
+from tests.log.disks import SmallDisk, open_file_on
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.errors import WireError
@@ -337,7 +337,7 @@ class FaultSession(Session):
 
 
 def _file_on(disk: SmallDisk, path: Path, **_: Any) -> LogFile:
-    return file_on(disk, path)
+    return open_file_on(disk, path)
 
 
 def run_faults(

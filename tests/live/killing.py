@@ -34,7 +34,7 @@ class Killed:
     lost_ms: float
 
 
-def killed(stage: Stage, after_s: float, *more: str) -> Killed:
+def kill_recorder(stage: Stage, after_s: float, *more: str) -> Killed:
     """Runs the paper's experiment, kills its recorder some time after its first records, ends the sites.
 
     Args:

@@ -13,7 +13,9 @@ from contextlib import contextmanager, suppress
 from itertools import combinations, count
 from typing import Self
 
-from .processes import FOLLOWS, GLIDE, PAPER, Session, Stage, connections
+from tests.live.processes import connection_options
+
+from .processes import FOLLOWS, GLIDE, PAPER, Session, Stage
 
 _numbers = count()
 ALL = (*PAPER, "recorder")
@@ -26,7 +28,7 @@ class NoNamespaces(Exception):  # noqa: N818 - it names a reason
     """Why there can be none here."""
 
 
-def ip(*words: str) -> None:
+def run_ip(*words: str) -> None:
     done = subprocess.run(["ip", *words], capture_output=True, text=True, timeout=30)
     if done.returncode:
         raise NoNamespaces(f"ip {' '.join(words)}: {done.stderr.strip()}")
@@ -49,12 +51,12 @@ class Machines:
 
     def add(self, name: str) -> None:
         space = f"trilat-{os.getpid()}-{next(_numbers)}"
-        ip("netns", "add", space)
+        run_ip("netns", "add", space)
         self._spaces[name] = space
         self.ip(name, "link", "set", "lo", "up")
 
     def ip(self, name: str, *words: str) -> None:
-        ip("-n", self._spaces[name], *words)
+        run_ip("-n", self._spaces[name], *words)
 
     def cable(self, one: str, other: str) -> tuple[str, str]:
         number = next(_numbers)
@@ -115,7 +117,7 @@ class Machines:
         """Removes all; cables go with their machines."""
         for space in self._spaces.values():
             with suppress(NoNamespaces):
-                ip("netns", "del", space)
+                run_ip("netns", "del", space)
 
 
 @contextmanager
@@ -140,7 +142,7 @@ def machines() -> Iterator[Machines]:
         made.remove()
 
 
-def bridged(made: Machines, names: Sequence[str]) -> None:
+def connect_by_bridge(made: Machines, names: Sequence[str]) -> None:
     """Machines at one switch, which is a machine too; everybody reaches everybody."""
     made.add("switch")
     made.ip("switch", "link", "add", "bridge", "type", "bridge")
@@ -152,7 +154,7 @@ def bridged(made: Machines, names: Sequence[str]) -> None:
         _number(made, name, end, f"10.77.0.{number}")
 
 
-def starred(made: Machines, centre: str, names: Sequence[str]) -> None:
+def connect_as_star(made: Machines, centre: str, names: Sequence[str]) -> None:
     """Machines that reach the one in the centre and nobody else: each is in a network of its own."""
     made.add(centre)
     for number, name in enumerate(names, 1):
@@ -169,7 +171,7 @@ def _number(made: Machines, name: str, end: str, address: str) -> None:
     made.address[name], made.end[name] = address, end
 
 
-def reaches(made: Machines, name: str, address: str) -> bool:
+def can_reach(made: Machines, name: str, address: str) -> bool:
     """Whether a machine has a way to an address: a refused connection is an answer."""
     program = f"import socket; socket.create_connection(({address!r}, 1), 1)"
     knock = [*made.on(name), sys.executable, "-c", program]
@@ -178,7 +180,7 @@ def reaches(made: Machines, name: str, address: str) -> bool:
     return "refused" in done.stderr
 
 
-def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+def list_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     return [pair for two in combinations(names, 2) for pair in (two, two[::-1])]
 
 
@@ -200,7 +202,7 @@ class Apart(Session):
         return [
             *clock,
             *listen,
-            *connections([f"tcp/{self._apart.address[other]}:7447" for other in others]),
+            *connection_options([f"tcp/{self._apart.address[other]}:7447" for other in others]),
         ]
 
     @classmethod

@@ -132,7 +132,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def gone(pid: int) -> bool:
+def is_gone(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -179,7 +179,7 @@ class Session:
         """The options by which a member meets the others: each listens, and connects to those before it."""
         place = self.sites.index(name) if name in self.sites else len(self.sites)
         own = [*self.endpoints, self.recorder_endpoint][place]
-        return ["--listen", own, *connections(self.endpoints[:place])]
+        return ["--listen", own, *connection_options(self.endpoints[:place])]
 
     def site(self, name: str, *more: str, called: str = "") -> Process:
         words = ("site", name, "--scenario", self._scenario, *self._options)
@@ -211,9 +211,9 @@ class Session:
 
     def is_reproduced(self) -> Log:
         self.ends_well()
-        log = whole(self.log)
-        executed_again(log)
-        equal_to_virtual_time(log)
+        log = open_whole_log(self.log)
+        assert_executed_again(log)
+        assert_equals_virtual_time(log)
         return log
 
     def begun(self) -> None:
@@ -221,28 +221,28 @@ class Session:
             process.prints(BEGUN)
 
     def recording(self) -> None:
-        recorded(self.log)
+        wait_for_records(self.log)
 
     def codes(self) -> dict[str, int]:
         return {name: process.code() for name, process in self.processes.items()}
 
 
-def recorded(log: Path) -> None:
-    until(lambda: size(log) > 60_000, PATIENCE_S)  # its head is a third of that
+def wait_for_records(log: Path) -> None:
+    until(lambda: measure_log_size(log) > 60_000, PATIENCE_S)  # its head is a third of that
 
 
-def size(log: Path) -> int:
+def measure_log_size(log: Path) -> int:
     for path in (active_path(log), log):
         with contextlib.suppress(FileNotFoundError):
             return path.stat().st_size
     return 0
 
 
-def connections(endpoints: Sequence[str]) -> list[str]:
+def connection_options(endpoints: Sequence[str]) -> list[str]:
     return [word for endpoint in endpoints for word in ("--connect", endpoint)]
 
 
-def whole(*paths: Path, in_full: bool = True) -> Log:
+def open_whole_log(*paths: Path, in_full: bool = True) -> Log:
     log = open_log(*paths)
     assert log.complete
     for name in log.sites:
@@ -260,23 +260,23 @@ def whole(*paths: Path, in_full: bool = True) -> Log:
     return log
 
 
-def with_own_laws(log: Log) -> Log:
+def allow_own_laws(log: Log) -> Log:
     """A log of which the laws may run: it is of a session of the test."""
     allow_own_code(log.scenario)
     return log
 
 
-def executed_again(log: Log) -> None:
+def assert_executed_again(log: Log) -> None:
     """Every record is what its inputs give."""
-    verdict = verify(with_own_laws(log))
+    verdict = verify(allow_own_laws(log))
     assert verdict.whole_run
     assert verdict.first is None
     assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
 
 
-def equal_to_virtual_time(log: Log) -> None:
+def assert_equals_virtual_time(log: Log) -> None:
     """Fed with its arrivals: always and everywhere. Plain: until a sample was late or lost, if one was."""
-    twins = compare_with_virtual(with_own_laws(log))
+    twins = compare_with_virtual(allow_own_laws(log))
     records = sum(len(log[name]) for name in log.sites)
     assert twins.fed.first is None
     assert twins.fed.identical == twins.fed.records == records

@@ -4,10 +4,11 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
+from tests.live.processes import assert_executed_again, connection_options, open_whole_log
 from trilat_net.core.step.ticks import Mode
 from trilat_net.errors import RunFailed
 
-from .processes import PAPER, Session, Stage, connections, executed_again, whole
+from .processes import PAPER, Session, Stage
 
 SCRIPT = """
 timeline=[
@@ -53,7 +54,7 @@ def test_changes_in_a_session_are_answered_and_reproduced(
     session.all()
     session.begun()
     session.recording()
-    to = ("set", "--session", "t", *connections(session.endpoints))
+    to = ("set", "--session", "t", *connection_options(session.endpoints))
     link = trilat(
         *to, "link", "m1->s", "--delay", "350ms", "--loss", "5%", cwd=stage.folder
     ).succeeds()
@@ -92,8 +93,8 @@ def test_python_and_commands_change_sessions_alike(stage: Stage) -> None:
     assert {row["member"] for row in session.ping(count=5).to_rows()} >= set(PAPER)
     session.end()
     running.ends_well()
-    log = whole(running.log, in_full=False)
-    executed_again(log)
+    log = open_whole_log(running.log, in_full=False)
+    assert_executed_again(log)
     taken = [text for texts in log.changes("s").values() for text in texts]
     for kind, text in zip(("link", "dominance", "stop", "enable"), taken, strict=True):
         assert f'"{kind}"' in text

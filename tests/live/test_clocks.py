@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from tests.cli.running import trilat
+from tests.live.processes import connection_options
 from tests.truth import judge_link, members, offset_errors
 
-from .processes import PAPER, Session, Stage, connections
+from .processes import PAPER, Session, Stage
 
 SKEWS = {
     "m2": ("--clock-offset-s", "3", "--clock-drift-ppm", "100"),
@@ -31,7 +32,12 @@ def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
         session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
     session.begun()
     seen = trilat(
-        "ping", "--session", "t", "--json", *connections(session.endpoints), cwd=stage.folder
+        "ping",
+        "--session",
+        "t",
+        "--json",
+        *connection_options(session.endpoints),
+        cwd=stage.folder,
     )
     log = session.is_reproduced()
     for site in PAPER:
@@ -71,7 +77,7 @@ def test_waiting_sessions_answer_pings_without_joining(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
     waiting = session.site("s")
     waiting.prints("waiting for")
-    to = connections(session.endpoints)
+    to = connection_options(session.endpoints)
     seen = trilat("ping", "--session", "t", "--count", "10", *to, cwd=stage.folder).succeeds()
     assert "session t waits for its members" in seen
     assert "the same clock" in seen

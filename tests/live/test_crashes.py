@@ -6,25 +6,27 @@ import signal
 import pytest
 from mcap.reader import make_reader
 
+from tests.live.killing import kill_recorder
+from tests.live.processes import assert_executed_again
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.recovery import recover
 
-from .killing import SITES, killed
-from .processes import Session, Stage, executed_again
+from .killing import SITES
+from .processes import Session, Stage
 from .small_disks import NoSmallDisk, SmallDisk, small_disk
 
 
 @pytest.mark.parametrize("durable", [False, True])
 @pytest.mark.long
 def test_a_killed_recorder_keeps_all_flushed_messages(durable: bool, stage: Stage) -> None:
-    done = killed(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
+    done = kill_recorder(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
     assert done.recovery.lossless, done.recovery.lost
     assert done.kept == done.flushed
     assert done.log.complete
     assert all(len(done.log[name]) for name in SITES)
-    executed_again(done.log)
+    assert_executed_again(done.log)
     # no bar, which stands in the benchmarks: a second would mean that flushing was forgotten
     assert done.lost_ms < 1000
 
@@ -95,4 +97,4 @@ def test_a_restarted_recorder_writes_the_next_part(stage: Stage) -> None:
     with second.open("rb") as stream:
         metadata = {entry.name: entry.metadata for entry in make_reader(stream).iter_metadata()}
     assert metadata["trilat.part"] == {"index": "2", "previous": "run.mcap"}
-    executed_again(log)
+    assert_executed_again(log)

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 
 import pytest
 
+from tests.live.processes import wait_for_records
 from trilat_net.log.log_reader import Log, open_log
 
-from .processes import PAPER, Process, Session, Stage, pause, recorded
+from .processes import PAPER, Process, Session, Stage, pause
 
 LONGEST_FREEZE_S = 5.0
 LEASE_S = 5.0
@@ -69,7 +70,7 @@ def interrupt_demo(stage: Stage, freeze: Freeze) -> tuple[Log, dict[str, int]]:
     """One command that has started all members."""
     folder = stage.folder / "run"
     demo = stage.start("demo", "demo", "paper", "--duration", "60", "-o", str(folder))
-    recorded(folder / "run.mcap")
+    wait_for_records(folder / "run.mcap")
     pause(freeze.run_s)
     recorder = find_recorder(demo)
     os.kill(recorder, signal.SIGSTOP)

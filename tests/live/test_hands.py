@@ -11,13 +11,15 @@ import pytest
 
 import trilat_net
 from tests.cli.running import trilat
+from tests.live.namespaces import connect_by_bridge
+from tests.live.processes import connection_options
 from tests.net.waiting import until
 from trilat_net.analysis.certificate.stability_certificate import BROKEN_BALANCE_SHARE
 from trilat_net.log.log_reader import Log
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
-from .namespaces import Machines, bridged
-from .processes import PAPER, Holder, Session, Stage, assert_let_go, connections
+from .namespaces import Machines
+from .processes import PAPER, Holder, Session, Stage, assert_let_go
 
 
 class Circling(threading.Thread):
@@ -43,7 +45,7 @@ class Circling(threading.Thread):
                 self._wait.wait(1.0 / 60.0)
 
 
-def held(
+def hold_session(
     session: Session, seconds: float, orders: Sequence[Sequence[str]], page_moves: int = 0
 ) -> Log:
     """A session whose masters two programs hold, while links and shares are changed; it is reproduced.
@@ -56,7 +58,7 @@ def held(
     hands = [Circling(session, "m1", seconds, 2.0), Circling(session, "m2", seconds, 3.1)]
     for hand in hands:
         hand.start()
-    to = ("set", "--session", "t", *connections(session.endpoints))
+    to = ("set", "--session", "t", *connection_options(session.endpoints))
     for order in orders:
         trilat(*to, *order, cwd=session.log.parent).succeeds()
     if page_moves:
@@ -74,7 +76,7 @@ def held(
 
 def hold_by_page(session: Session, moves: int) -> None:
     server = session.stage.start(
-        "page", "live", "--session", "t", "--no-browser", *connections(session.endpoints)
+        "page", "live", "--session", "t", "--no-browser", *connection_options(session.endpoints)
     )
     with browser_page(page_address(server)) as page:
         shows(page, "trilat.frame && trilat.takesPart")
@@ -93,7 +95,7 @@ SHARES = ("dominance", "s", "m1=0.8", "m2=0.2", "--ramp", "1s")
 
 @pytest.mark.long
 def test_sessions_of_two_programs_verify_and_repeat(stage: Stage) -> None:
-    log = held(Session(stage, "play", PAPER, "--duration", "6"), 2.5, [DELAY, SHARES])
+    log = hold_session(Session(stage, "play", PAPER, "--duration", "6"), 2.5, [DELAY, SHARES])
     assert [len(log.changes(name)) for name in PAPER] == [0, 0, 2]
 
 
@@ -111,7 +113,7 @@ def test_a_minute_of_hands_verifies_and_repeats(stage: Stage) -> None:
         ("dominance", "s", f"m1={share}", f"m2={1 - share:.1f}", "--ramp", "0s")
         for share in SHARED
     ]
-    log = held(
+    log = hold_session(
         Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=500"),
         40.0,
         orders,
@@ -149,7 +151,7 @@ def test_a_program_cut_off_leaves_no_force(
     stage: Stage, tmp_path: Path, apart: Machines
 ) -> None:
     """The session is on one machine, the program on another; no tick is missing because of the cut."""
-    bridged(apart, ("lab", "holder"))
+    connect_by_bridge(apart, ("lab", "holder"))
     session = Session(stage, "play", PAPER, "--duration", "15", "--insecure")
     session.before = dict.fromkeys((*PAPER, "recorder"), apart.on("lab"))
     session.endpoints = [

@@ -8,12 +8,13 @@ import pytest
 from sites.site_parts import warm_up
 from tests.control_laws.law_settings import LAWS
 from tests.energy_runs import FOLLOWER
-from tests.unit_arm import H50, hand, unit_text
+from tests.live.processes import assert_executed_again, open_whole_log
+from tests.unit_arm import H50, make_spring_hand, unit_text
 from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, ObservedFinding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import load_scenario
 
-from .processes import Session, Stage, executed_again, whole
+from .processes import Session, Stage
 
 pytestmark = pytest.mark.long
 PAIR = ("m", "s")
@@ -33,12 +34,12 @@ def run_live(stage: Stage, scenario: str, sites: tuple[str, ...], *options: str)
     session = Session(stage, scenario, sites, *options)
     session.all()
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     return open_log(session.log)
 
 
-def on_unit_arms(
+def run_unit_arms(
     stage: Stage, control: dict[str, Any], slave: dict[str, Any], **more: Any
 ) -> Log:
     sites = {"m": {"hands": [H50]}, "s": {"control": {**control, **slave}}}
@@ -50,7 +51,7 @@ def on_unit_arms(
 
 
 def test_waves_through_200_ms(stage: Stage) -> None:
-    log = on_unit_arms(stage, {"law": "wave"}, FOLLOWER)
+    log = run_unit_arms(stage, {"law": "wave"}, FOLLOWER)
     m, s = log["m"], log["s"]
     assert [m.q[-1, 0], s.q[-1, 0]] == pytest.approx([0.3, 0.3], abs=2e-3)
     assert np.abs(m.q - s.q)[:, 0].max() == pytest.approx(0.0476, rel=0.01)
@@ -61,7 +62,7 @@ def test_waves_through_200_ms(stage: Stage) -> None:
 def test_passivity_control_through_50_ms(stage: Stage) -> None:
     link = {"model": "constant", "delay_ms": 50.0}
     leads = {"law": "tdpa", **PUBLISHED, "K": 0.0, "B": 0.0}
-    log = on_unit_arms(stage, leads, FOLLOWER, link=link)
+    log = run_unit_arms(stage, leads, FOLLOWER, link=link)
     assert log["m"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert log["s"].q[-1, 0] == pytest.approx(0.2864, abs=5e-5)
     least = min(
@@ -78,10 +79,13 @@ def test_four_channels_transmit_through_20_ms(stage: Stage) -> None:
         "frequencies_hz": [1.0],
         "end_s": 1000.0,
     }
-    sites = {"m": {"hands": [drive, hand(0.0)]}, "s": {"hands": [hand(0.0, 500.0, 5.0)]}}
+    sites = {
+        "m": {"hands": [drive, make_spring_hand(0.0)]},
+        "s": {"hands": [make_spring_hand(0.0, 500.0, 5.0)]},
+    }
     law = {"law": "four_channel", "K": 100.0, "B": 20.0}
     link = {"model": "constant", "delay_ms": 20.0}
-    m = on_unit_arms(stage, law, {}, sites=sites, duration_s=9.0, link=link)["m"]
+    m = run_unit_arms(stage, law, {}, sites=sites, duration_s=9.0, link=link)["m"]
     turn = np.exp(-2j * np.pi * m.t_s[-1000:])
     felt = abs((m.tau_x[-1000:, 0] @ turn) / (m.qd[-1000:, 0] @ turn))
     assert felt / abs(500.0 / (2j * np.pi) + 5.0) == pytest.approx(0.650, rel=0.01)

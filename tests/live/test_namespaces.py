@@ -7,34 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from tests.live.namespaces import can_reach, connect_as_star, connect_by_bridge, list_pairs
+from tests.live.processes import assert_executed_again, open_whole_log
 from tests.truth import Member, again, judge_link, members, offset_errors
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 
-from .namespaces import (
-    ALL,
-    CLOCKS,
-    PORT,
-    Apart,
-    Machines,
-    NoNamespaces,
-    bridged,
-    pairs,
-    reaches,
-    starred,
-)
-from .processes import (
-    JOINS,
-    PAPER,
-    Stage,
-    engaged_after_s,
-    executed_again,
-    pause,
-    ticks_to_hold,
-    whole,
-)
+from .namespaces import ALL, CLOCKS, PORT, Apart, Machines, NoNamespaces
+from .processes import JOINS, PAPER, Stage, engaged_after_s, pause, ticks_to_hold
 
 
 def clocks_as_injected(log: Log) -> None:
@@ -43,7 +25,7 @@ def clocks_as_injected(log: Log) -> None:
     for name, (offset_s, drift_ppm) in CLOCKS.items():
         assert clocks[name].offset_ns == offset_s * 1e9
         assert float(clocks[name].rate - 1) * 1e6 == pytest.approx(drift_ppm)
-    for site, peer in pairs(PAPER):
+    for site, peer in list_pairs(PAPER):
         link = judge_link(log, site, peer)
         assert link.inside >= 0.999
         assert link.tick.size >= 0.5 * len(log[site])
@@ -65,7 +47,7 @@ def clocks_as_injected(log: Log) -> None:
 def test_three_machines_in_any_order_of_starts(
     order: tuple[str, ...], stage: Stage, apart: Machines
 ) -> None:
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart(stage, apart, "--duration", "3")
     session.all(*order)
     log = session.is_reproduced()
@@ -74,9 +56,11 @@ def test_three_machines_in_any_order_of_starts(
 
 @pytest.mark.long
 def test_unreachable_machines_meet_at_a_router(stage: Stage, apart: Machines) -> None:
-    starred(apart, "centre", ALL)
-    assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
-    assert not any(reaches(apart, one, apart.address[other]) for one, other in pairs(ALL))
+    connect_as_star(apart, "centre", ALL)
+    assert all(can_reach(apart, name, apart.centre[name]) for name in ALL)
+    assert not any(
+        can_reach(apart, one, apart.address[other]) for one, other in list_pairs(ALL)
+    )
     session = Apart(stage, apart, "--duration", "3")
     for name in ("m1", "recorder"):
         session.all(name)
@@ -107,7 +91,7 @@ class Heard:
     outages: list[tuple[int, int]]
 
 
-def heard(log: Log, site: str, peer: str) -> Heard:
+def list_heard(log: Log, site: str, peer: str) -> Heard:
     states, place = log[site].states, log.scenario.peers(site).index(peer)
     arrivals = [
         (state.tick, tick) for state in states for index, tick, _ in state.rx if index == place
@@ -123,7 +107,7 @@ def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None
 
     One direction measures, the other delays by 200 ms.
     """
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart(stage, apart, "--duration", "13", "--set", 'links.m2->m1.model="measured"')
     session.all()
     session.begun()
@@ -135,12 +119,12 @@ def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None
         clock.sleep_until(begun_ns + round(ends_s * 1e9))
         apart.mend("m1", "m2")
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     fed = compare_with_virtual(log).fed
     assert fed.first is None
     assert fed.identical == fed.records == 39_000
-    for site, peer in pairs(PAPER):
+    for site, peer in list_pairs(PAPER):
         used = [state.used[peer] for state in log[site].states]
         assert used == sorted(used)
     lost = [(event.member, event.about) for event in log.events if event.kind == "lost"]
@@ -148,7 +132,9 @@ def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None
     back_to_nominal(log, "m1", "m2", delay=0, nominal=5)
     back_to_nominal(log, "m2", "m1", delay=200, nominal=202)
     counted = log.link_stats("m2")[-1]
-    late = [tick for tick, sample in heard(log, "m2", "m1").arrivals if tick > sample + 200]
+    late = [
+        tick for tick, sample in list_heard(log, "m2", "m1").arrivals if tick > sample + 200
+    ]
     assert len(late) > 300
     assert counted.late["m1"] == sum(tick <= counted.tick for tick in late)
 
@@ -156,7 +142,7 @@ def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None
 @pytest.mark.long
 def test_machines_hold_during_cuts_and_return(stage: Stage, apart: Machines) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart.following(stage, apart, 40)
     apart.part("m1", "m2")
     pause(6.0)
@@ -191,7 +177,7 @@ def test_one_way_cuts_hold_both_ends(stage: Stage, apart: Machines) -> None:
     m2 holds at once. Nor do TCP's acknowledgements reach it: what it sends goes on for 0.1 to 0.2 s, until
     its retransmission timer runs out; then m1 hears nothing either, and holds too.
     """
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart.following(stage, apart, 36)
     for cut_s in (2.5, 8.0):
         try:
@@ -202,17 +188,17 @@ def test_one_way_cuts_hold_both_ends(stage: Stage, apart: Machines) -> None:
         apart.deafen("m2", "m1", ends=True)
         pause(5.0)
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     for site, peer in (("m1", "m2"), ("m2", "m1")):
-        assert len(heard(log, site, peer).outages) == 2
+        assert len(list_heard(log, site, peer).outages) == 2
         said = [
             one.text
             for one in log.events
             if one.member == site and "a peer is silent" in one.text
         ]
         assert len(said) >= 2
-    deaf, dumb = heard(log, "m2", "m1").outages, heard(log, "m1", "m2").outages
+    deaf, dumb = list_heard(log, "m2", "m1").outages, list_heard(log, "m1", "m2").outages
     assert all(first <= last + 100 for (first, _), (last, _) in zip(deaf, dumb, strict=True))
     assert max(max(found, default=0) for found in ticks_to_hold(log).values()) <= 21
     lost = {(event.member, event.about) for event in log.events if event.kind == "lost"}
@@ -233,7 +219,7 @@ def began_ns(log: Log, name: str, clock: Member) -> list[int]:
 def back_to_nominal(log: Log, site: str, peer: str, delay: int, nominal: int) -> None:
     """While the way is cut the age grows, by record and by statistics; then it is nominal within two ticks
     of the first fresh arrival, or of when that one is due."""
-    link = heard(log, site, peer)
+    link = list_heard(log, site, peer)
     assert len(link.outages) == 2
     for before, after in link.outages:
         # a sample may come within the tick in which it was made: its age begins at 0

@@ -6,21 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.live.processes import assert_executed_again, open_whole_log
 from trilat_net.execution.virtual import execute_virtual
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
 
-from .processes import (
-    OUTSIDE,
-    PATIENCE_S,
-    PLAIN,
-    TALKING,
-    Session,
-    Stage,
-    executed_again,
-    whole,
-)
+from .processes import OUTSIDE, PATIENCE_S, PLAIN, TALKING, Session, Stage
 
 ARM = Path(__file__).parents[2] / "examples" / "external_arm.py"
 SLOW = """
@@ -57,7 +49,7 @@ def test_slow_laws_end_sessions_in_order(stage: Stage, monkeypatch: pytest.Monke
     assert log.complete
     assert [event.member for event in log.events if event.kind == "failed"] == ["s"]
     assert 400 < len(log["s"]) < 500
-    executed_again(log)
+    assert_executed_again(log)
 
 
 def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
@@ -68,8 +60,8 @@ def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
     session.processes["s"].prints("waiting for its arm on trilat/t/s/measured")
     assert "over: the arm is at " in drive_arm(session, "two_sites")
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert compare_with_virtual(log).fed.identical == 3000 - log["s"].skipped
     assert log["m1"].sent["target[s]"].any()
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations
@@ -125,8 +117,8 @@ def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
         wrong.wait()
     assert drive_arm(session, "seven_joints", "--sensor").count(",") == 6
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert compare_with_virtual(log).fed.identical == 9000 - log["s"].skipped
     felt = log["s"].tau_x
     # somebody leans on the first joint with a half sine of 0.5 N m

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import pytest
 
+from tests.live.processes import assert_executed_again
 from tests.log.builders import make_log_bytes
-from tests.recorder.play.logs import session_payloads
+from tests.recorder.play.logs import read_session_payloads
 from tests.sites.sessions import Session as Sites
-from tests.sites.sessions import gliding
+from tests.sites.sessions import make_gliding_scenario
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import Process, Session, Stage, executed_again
+from .processes import Process, Session, Stage
 
 
 class Again:
@@ -43,14 +44,14 @@ class Again:
         )
 
 
-def numbered(log: Path) -> dict[str, list[bytes]]:
+def sort_payloads(log: Path) -> dict[str, list[bytes]]:
     """What sites published, per channel in an order that does not depend on the file's."""
-    return {key: sorted(found) for key, found in session_payloads(log).items()}
+    return {key: sorted(found) for key, found in read_session_payloads(log).items()}
 
 
 @pytest.mark.parametrize("live", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_replayed_and_recorded_logs_are_equal_bytewise(live: bool, stage: Stage) -> None:
-    path = virtual_log(stage.folder)
+    path = write_virtual_log(stage.folder)
     if live:
         session = Session(stage, "two_sites", ("m", "s"), "--duration", "1.5")
         session.all()
@@ -62,13 +63,13 @@ def test_replayed_and_recorded_logs_are_equal_bytewise(live: bool, stage: Stage)
     assert (replay.code(), recorder.code()) == (0, 0)
     assert "none dropped" in replay.text()
     assert "the recorder has everything" in replay.text()
-    assert session_payloads(second) == session_payloads(path)
+    assert read_session_payloads(second) == read_session_payloads(path)
     log = open_log(second)
-    executed_again(log)
+    assert_executed_again(log)
     assert "missing 0" in log.account("s")
 
 
-def virtual_log(folder: Path) -> Path:
+def write_virtual_log(folder: Path) -> Path:
     path = folder / "virtual.mcap"
     path.write_bytes(make_log_bytes("two_sites", {"duration_s": 1.0}))
     return path
@@ -77,7 +78,7 @@ def virtual_log(folder: Path) -> Path:
 @pytest.mark.long
 def test_latecomers_to_a_replay_get_everything(stage: Stage) -> None:
     """Round after round, so that nobody is too late; until Ctrl-C."""
-    path = virtual_log(stage.folder)
+    path = write_virtual_log(stage.folder)
     again = Again(stage, path)
     replay = again.replay("--loop")
     replay.prints("playing")
@@ -93,7 +94,7 @@ def test_latecomers_to_a_replay_get_everything(stage: Stage) -> None:
     assert other.code() == 2
     assert "session 'again' already exists and is running" in other.text()
     assert recorder.code() == 0
-    assert numbered(second) == numbered(path)
+    assert sort_payloads(second) == sort_payloads(path)
     replay.signal(signal.SIGINT)
     assert replay.code() == 130
     assert "interrupted" in replay.text()
@@ -101,19 +102,19 @@ def test_latecomers_to_a_replay_get_everything(stage: Stage) -> None:
 
 @pytest.mark.long
 def test_a_fast_replay_to_another_process_loses_nothing(stage: Stage) -> None:
-    path = virtual_log(stage.folder)
+    path = write_virtual_log(stage.folder)
     again = Again(stage, path)
     second = stage.folder / "second.mcap"
     recorder = again.recorder(second)
     replay = again.replay("--rate", "max", "--preload", "0", "--needs-recorder")
     assert (replay.code(), recorder.code()) == (0, 0)
-    assert numbered(second) == numbered(path)
+    assert sort_payloads(second) == sort_payloads(path)
 
 
 @pytest.mark.long
 def test_logs_of_restarted_sites_are_played_whole(stage: Stage) -> None:
     """Each start numbers its events from 0; they are played start after start, and none is lost."""
-    session = Sites.whole(gliding(5.0), stage.folder, ends={})
+    session = Sites.whole(make_gliding_scenario(5.0), stage.folder, ends={})
     session.clocks["m"].dies_ns = 3_000_000_000
     session.site("m", at_ns=4_000_000_000)
     path = session.run().source
@@ -121,6 +122,6 @@ def test_logs_of_restarted_sites_are_played_whole(stage: Stage) -> None:
     second = stage.folder / "second.mcap"
     recorder, replay = again.recorder(second), again.replay("--needs-recorder")
     assert (replay.code(), recorder.code()) == (0, 0), (replay, recorder)
-    assert numbered(second) == numbered(Path(path))
+    assert sort_payloads(second) == sort_payloads(Path(path))
     assert open_log(second).starts["m"] == open_log(path).starts["m"]
-    executed_again(open_log(second))
+    assert_executed_again(open_log(second))

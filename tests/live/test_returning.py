@@ -23,7 +23,7 @@ from .processes import (
 )
 
 
-def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
+def kill_and_restart_sites(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
     """The paper's session: one site after the other is killed and started again, then one stopped for 1 s."""
     session = Session(stage, "paper", PAPER, "--duration", "600", *GLIDE)
     session.all()
@@ -54,7 +54,7 @@ def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Sess
 def test_restarted_sites_follow_within_two_seconds(
     victims: Sequence[str], stage: Stage
 ) -> None:
-    session, log = killed_and_started_again(stage, victims)
+    session, log = kill_and_restart_sites(stage, victims)
     took_s = engaged_after_s(log)
     assert len(took_s) == len(victims)
     assert max(took_s) <= 2.0, took_s

@@ -16,20 +16,11 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 import trilat_net as tn
+from tests.live.processes import assert_executed_again, connection_options, open_whole_log
 from tests.net.waiting import until
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import (
-    OUTSIDE,
-    PAPER,
-    Session,
-    Stage,
-    assert_let_go,
-    connections,
-    executed_again,
-    pause,
-    whole,
-)
+from .processes import OUTSIDE, PAPER, Session, Stage, assert_let_go, pause
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
@@ -110,7 +101,7 @@ class Stranger:
         self._session.close()
 
 
-def pose(x: float, y: float) -> Any:
+def make_pose_message(x: float, y: float) -> Any:
     types = ROS.types
     stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
@@ -132,7 +123,7 @@ def joint_state(names: Sequence[str], q: Sequence[float], qd: Sequence[float]) -
     )
 
 
-def shares(*numbers: float) -> Any:
+def make_shares_message(*numbers: float) -> Any:
     layout = ROS.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     return ROS.types["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array(numbers))
 
@@ -146,7 +137,13 @@ def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, An
     session.all()
     session.begun()
     bridge = stage.start(
-        "ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints)
+        "ros2",
+        "ros2",
+        "--session",
+        "t",
+        "--ros",
+        router,
+        *connection_options(session.endpoints),
     )
     bridge.prints("is in the graph of ROS 2")
     stranger = Stranger(router)
@@ -162,12 +159,14 @@ def test_strangers_lead_and_stop_arms_and_verify(stage: Stage) -> None:
     with bridged_session(stage, 25) as (session, bridge, ros):
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for n in range(150):
-            goal = pose(start.x - 0.15 * min(1.0, n / 60.0), start.y)
+            goal = make_pose_message(start.x - 0.15 * min(1.0, n / 60.0), start.y)
             ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", goal)
             pause(1.0 / 60.0)
         led = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         assert led.x - start.x == pytest.approx(-0.15, abs=0.05)
-        ros.publish("t/s/set_dominance", "std_msgs/msg/Float64MultiArray", shares(0.9, 0.1))
+        ros.publish(
+            "t/s/set_dominance", "std_msgs/msg/Float64MultiArray", make_shares_message(0.9, 0.1)
+        )
         assert ros.call("t/s/stop")[0]
         assert ros.call("t/s/reset") == (
             False,
@@ -207,7 +206,7 @@ def test_a_killed_bridge_leaves_no_force(stage: Stage) -> None:
             ros.publish(
                 "t/m1/target_pose",
                 "geometry_msgs/msg/PoseStamped",
-                pose(start.x - 0.1, start.y),
+                make_pose_message(start.x - 0.1, start.y),
             )
             pause(1.0 / 60.0)
         bridge.signal(signal.SIGKILL)
@@ -222,7 +221,13 @@ def test_late_routers_are_joined_and_latecomers_see(stage: Stage) -> None:
     session.all()
     session.begun()
     bridge = stage.start(
-        "ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints)
+        "ros2",
+        "ros2",
+        "--session",
+        "t",
+        "--ros",
+        router,
+        *connection_options(session.endpoints),
     )
     bridge.prints(f"no router of ROS answers at {router}: waiting for it")
     first = stage.start("router", "router", "--listen", router)
@@ -247,7 +252,7 @@ def test_late_routers_are_joined_and_latecomers_see(stage: Stage) -> None:
         assert services["/t/end"] == ["std_srvs/srv/Trigger"]
         assert ros.call("t/end")[0]
         session.ends_well()
-        executed_again(whole(session.log, in_full=False))
+        assert_executed_again(open_whole_log(session.log, in_full=False))
         assert bridge.code() == 0
     finally:
         ros.close()
@@ -278,7 +283,7 @@ def test_ros_robots_brake_when_their_site_is_silent(stage: Stage) -> None:
         router,
         "--names",
         "robot.toml",
-        *connections(session.endpoints),
+        *connection_options(session.endpoints),
     )
     bridge = stage.start("ros2", "ros2", *words)
     running.prints("listening at")
@@ -300,26 +305,26 @@ def test_ros_robots_brake_when_their_site_is_silent(stage: Stage) -> None:
             if not frozen and len(got) > 1000 and "session begins" in site.text():
                 frozen = True
                 site.signal(signal.SIGSTOP)
-                until(lambda: commands(ros)[-1] == SAFE)
+                until(lambda: list_commands(ros)[-1] == SAFE)
                 site.signal(signal.SIGCONT)
             pause(0.002)
         session.ends_well()
         assert bridge.code() == 0
         assert frozen
-        assert commands(ros)[-1] == SAFE
+        assert list_commands(ros)[-1] == SAFE
     finally:
         ros.close()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert {tuple(q) for q in log["s"].q.tolist()} <= {tuple(q) for q in said}
     torques = {tuple(tau) for tau in log["s"].tau.tolist()}
-    assert {(shoulder, elbow) for elbow, shoulder in commands(ros)} - torques <= {
+    assert {(shoulder, elbow) for elbow, shoulder in list_commands(ros)} - torques <= {
         (SAFE[1], SAFE[0])
     }
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01
 
 
-def commands(ros: Stranger) -> list[list[float]]:
+def list_commands(ros: Stranger) -> list[list[float]]:
     """All that the robot's controller got."""
     got = ros.heard["effort_controller/commands"]
     return [torques_of(data) for data, _ in list(got)]

@@ -5,6 +5,12 @@ import signal
 import pytest
 
 from sites.site_parts import warm_up
+from tests.live.processes import (
+    assert_equals_virtual_time,
+    assert_executed_again,
+    connection_options,
+    open_whole_log,
+)
 from tests.net.waiting import until
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import find_absent_samples
@@ -15,17 +21,7 @@ from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario
 
-from .processes import (
-    BEGUN,
-    PAPER,
-    TALKING,
-    Session,
-    Stage,
-    connections,
-    equal_to_virtual_time,
-    executed_again,
-    whole,
-)
+from .processes import BEGUN, PAPER, TALKING, Session, Stage
 
 
 @pytest.mark.long  # on a push `make live` does the same with the commands
@@ -79,7 +75,7 @@ def test_garbage_is_counted_and_changes_nothing(stage: Stage) -> None:
             "--listen",
             elsewhere,
         ),
-        *connections(session.endpoints),
+        *connection_options(session.endpoints),
     )
     junk = [b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000]
     clock = SystemClock()
@@ -134,8 +130,8 @@ def test_needed_recorders_may_come_last(stage: Stage) -> None:
         session.all(name)
         session.processes["s"].prints("waiting for")
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     started = [event for event in log.events if event.kind == "start"]
     assert [event.member for event in started] == ["m"]
     assert set(started[0].boots) == {"recorder", "m", "s"}
@@ -156,10 +152,10 @@ def test_two_sessions_without_endpoints_do_not_meet(stage: Stage) -> None:
     for member in members:
         assert member.code() == 0, member
     for name in names:
-        log = whole(stage.folder / f"{name}.mcap")
+        log = open_whole_log(stage.folder / f"{name}.mcap")
         assert log.session["session"] == name
-        executed_again(log)
-        equal_to_virtual_time(log)
+        assert_executed_again(log)
+        assert_equals_virtual_time(log)
         assert "lost" not in {event.kind for event in log.events}
 
 

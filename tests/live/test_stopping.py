@@ -14,13 +14,14 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.cli.running import COMMAND, PLAIN
+from tests.live.processes import assert_executed_again
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import list_shipped, load_scenario
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
 from .page_client import PageClient, page_client
-from .processes import Process, Stage, executed_again
+from .processes import Process, Stage
 
 HELD = [
     name
@@ -31,7 +32,7 @@ HELD = [
 
 
 @contextmanager
-def watching(stage: Stage, session: str) -> Iterator[int]:
+def watch_session(stage: Stage, session: str) -> Iterator[int]:
     """`trilat watch` with a terminal, whose keys are pressed at the other end, once it shows the session."""
     keys, terminal = pty.openpty()
     printed, words = stage.folder / "watch.printed", [*COMMAND, "watch", "--session", session]
@@ -59,53 +60,53 @@ def own_terminal() -> None:
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
-def live(stage: Stage, scenario: str, *options: str) -> Process:
+def start_live(stage: Stage, scenario: str, *options: str) -> Process:
     """A session with a page, at a rate that leaves time to its page on a machine that others use too."""
     rate = ("--set", "rate_hz=100")
     out = str(stage.folder / "out")
     return stage.start("live", "live", scenario, "--no-browser", "--out", out, *rate, *options)
 
 
-def run(stage: Stage, *words: str) -> Process:
+def run_command(stage: Stage, *words: str) -> Process:
     done = stage.start(f"{words[0]}-{len(list(stage.folder.iterdir()))}", *words)
     assert done.code() == 0, done
     return done
 
 
-def enabled(stage: Stage, page: PageClient) -> None:
+def enable_sites(stage: Stage, page: PageClient) -> None:
     page.shows("stopped")
-    run(stage, "enable", "--session", page.hello["session"])
+    run_command(stage, "enable", "--session", page.hello["session"])
     page.shows("run")
 
 
 @pytest.mark.parametrize("scenario", HELD)
 def test_every_arm_stops_from_everywhere_and_returns(scenario: str, stage: Stage) -> None:
-    running = live(stage, scenario)
+    running = start_live(stage, scenario)
     with page_client(page_address(running)) as page:
         page.shows("run")
         session = page.hello["session"]
-        stop = run(stage, "stop", "--session", session).text()
+        stop = run_command(stage, "stop", "--session", session).text()
         assert stop.startswith(f"stopping every arm of session {session} ...\n")
         assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(
             page.frame["sites"]
         )
-        enabled(stage, page)
+        enable_sites(stage, page)
         page.send(do="stop")
-        enabled(stage, page)
-        with watching(stage, session) as keys:
+        enable_sites(stage, page)
+        with watch_session(stage, session) as keys:
             os.write(keys, b"s")
-            enabled(stage, page)
+            enable_sites(stage, page)
         page.send(do="end")
         running.prints("checking the log")  # as `demo` does
     running.signal(signal.SIGINT)
     assert running.code() == 130
-    executed_again(open_log(stage.folder / "out" / "run.mcap"))
+    assert_executed_again(open_log(stage.folder / "out" / "run.mcap"))
 
 
 @needs_browser
 @pytest.mark.long
 def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
-    running = live(stage, "play")
+    running = start_live(stage, "play")
     modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
     with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && " + modes("run"))
@@ -114,7 +115,7 @@ def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
             shows(page, modes("stopped"))
             if "TRILAT_PICTURES" in os.environ:
                 page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stop.png")
-            run(stage, "enable", "--session", page.evaluate("trilat.hello.session"))
+            run_command(stage, "enable", "--session", page.evaluate("trilat.hello.session"))
             shows(page, modes("run"))
     running.signal(signal.SIGINT)
     running.prints("checking the log")
@@ -140,7 +141,7 @@ def is_asked(first: Page, second: Page) -> bool:
 @needs_browser
 @pytest.mark.long
 def test_holders_are_asked_before_others_take_part(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")
+    running = start_live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as first:
         shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")

@@ -9,9 +9,10 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from tests.cli.running import trilat
+from tests.live.processes import open_whole_log
 from tests.log.programs import rerun_faults
 
-from .processes import Session, Stage, whole
+from .processes import Session, Stage
 
 BUCKET_NS = 20_000_000
 
@@ -22,7 +23,7 @@ def test_a_recorded_session_is_read_by_everybody(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "1.5")
     session.all()
     session.ends_well()
-    log = whole(session.log)
+    log = open_whole_log(session.log)
     shown: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
     epoch_ns = int(log.session["epoch_unix_ns"])
     with session.log.open("rb") as stream:

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from tests.log.builders import make_log_bytes
-from tests.log.dealt import Message, messages
+from tests.log.split_logs import Message, read_messages
 from trilat_net.errors import LogError, NothingSaved
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
@@ -22,7 +22,7 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 DAMAGES = ("none", "zeroed", "stale", "misdirected", "random")
 
 
-def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
+def rewrite_as_other_program(data: bytes, chunk_bytes: int, **options: object) -> bytes:
     """A log as another program writes it: its definitions in the first chunk, without a digest chain."""
     reader, stream = make_reader(io.BytesIO(data)), io.BytesIO()
     writer = Writer(stream, chunk_size=chunk_bytes, **options)  # type: ignore[arg-type]
@@ -56,7 +56,7 @@ def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
     return stream.getvalue()
 
 
-def shelf() -> dict[str, bytes]:
+def make_log_collection() -> dict[str, bytes]:
     """Whole logs of every kind of writer: live and virtual ones, and as other programs write them."""
     long = make_log_bytes("paper", {"duration_s": 1.5})
     live = (GOLDEN / "live-paper.mcap").read_bytes()
@@ -66,11 +66,13 @@ def shelf() -> dict[str, bytes]:
         "another run": make_log_bytes("paper", {"duration_s": 1.5, "seed": 5}),
         "live": live,
         "live elsewhere": (GOLDEN / "live-4g.mcap").read_bytes(),
-        "unpacked": rewritten(long, 50_000, compression=CompressionType.NONE),
-        "lz4": rewritten(long, 400_000, compression=CompressionType.LZ4),
-        "zstd": rewritten(live, 400_000),
-        "without checksums": rewritten(live, 50_000, enable_crcs=False),
-        "without chunks": rewritten(make_log_bytes("paper"), 0, use_chunking=False),
+        "unpacked": rewrite_as_other_program(long, 50_000, compression=CompressionType.NONE),
+        "lz4": rewrite_as_other_program(long, 400_000, compression=CompressionType.LZ4),
+        "zstd": rewrite_as_other_program(live, 400_000),
+        "without checksums": rewrite_as_other_program(live, 50_000, enable_crcs=False),
+        "without chunks": rewrite_as_other_program(
+            make_log_bytes("paper"), 0, use_chunking=False
+        ),
     }
 
 
@@ -84,7 +86,7 @@ class DamagedFile:
     pages: tuple[tuple[str, int], ...]
 
 
-def damaged(
+def draw_damaged_file(
     files: Mapping[str, bytes], names: Sequence[str], draw: random.Random
 ) -> DamagedFile:
     """One of some logs with up to two bad pages, in six of ten cases cut off anywhere."""
@@ -147,15 +149,15 @@ def recovered_all(
     verified: bool = True,
 ) -> RecoveryTally:
     """Recovers files one after the other, and compares what is in them with the undamaged ones."""
-    truth = {name: Counter(messages(data)) for name, data in files.items()}
+    truth = {name: Counter(read_messages(data)) for name, data in files.items()}
     tally = RecoveryTally(Counter(), [], [], [], [])
     for case in cases:
-        outcome = _recovered(case, truth[case.name], folder, tally, verified)
+        outcome = _judge_recovery(case, truth[case.name], folder, tally, verified)
         tally.outcomes[outcome] += 1
     return tally
 
 
-def _recovered(
+def _judge_recovery(
     case: DamagedFile,
     truth: Counter[Message],
     folder: Path,
@@ -168,7 +170,7 @@ def _recovered(
         result = recover(source, output, force=True)
     except NothingSaved:
         return "nothing to save"
-    if Counter(messages(output.read_bytes())) - truth:
+    if Counter(read_messages(output.read_bytes())) - truth:
         tally.invented.append(case)
     try:
         log = open_log(output)

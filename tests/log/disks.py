@@ -69,7 +69,7 @@ class SmallRoom(DiskReserve):
         self._disk.kept = 0
 
 
-def file_on(disk: SmallDisk, path: Path, room: bool = True) -> LogFile:
+def open_file_on(disk: SmallDisk, path: Path, room: bool = True) -> LogFile:
     return LogFile(path, room=SmallRoom(disk, room), opened=disk.opened)
 
 
@@ -77,12 +77,12 @@ Sent = tuple[int, int, bytes, int, int]
 """Channel, log time, payload, publish time, sequence."""
 
 
-def sent(count: int) -> list[Sent]:
+def draw_messages(count: int) -> list[Sent]:
     """Messages that cannot be packed."""
     return [(1 + n % 2, 10 * n, os.urandom(40), 10 * n + 1, n) for n in range(count)]
 
 
-def begun(file: LogFile) -> McapWriter:
+def begin_container(file: LogFile) -> McapWriter:
     """A file with two channels, flushed."""
     container = McapWriter(file, "lib")
     schema = container.register_schema("S", "jsonschema", b"{}")

@@ -9,7 +9,7 @@ RERUN = (sys.executable, "-m", "rerun")
 PYMCAP = (str(Path(sys.executable).with_name("pymcap-cli")),)  # GPL
 
 
-def printed(*command: str) -> str:
+def run_program(*command: str) -> str:
     """What a program prints, if it ends well."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -19,7 +19,7 @@ def printed(*command: str) -> str:
 def rerun_faults(path: Path, *options: str) -> list[str]:
     """The channels with which `rerun mcap check` finds fault, and why."""
     table = (
-        printed(*RERUN, "mcap", "check", *options, str(path))
+        run_program(*RERUN, "mcap", "check", *options, str(path))
         .partition("Status")[2]
         .splitlines()[2:]
     )

@@ -21,7 +21,7 @@ KINDS = ("virtual", "live", "first part", "last part", "recovered")
 VIEWS_HZ = 100.0
 
 
-def live(storage: LogStorage) -> None:
+def record_live_file(storage: LogStorage) -> None:
     """Records a session as the recorder does: records that were sent late and came later."""
 
     def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
@@ -47,7 +47,7 @@ def live(storage: LogStorage) -> None:
             state = decode(payload, State)
             log.add(f"trilat/lab/{name}/state", payload, sent_ns, log_ns, k, state)
             if k % 100 == 0:
-                stats = statistics(name, step.site.peers[0], k, t_ns)
+                stats = make_link_stats(name, step.site.peers[0], k, t_ns)
                 log.add(f"trilat/lab/{name}/link", encode(stats), t_ns, log_ns, k, stats)
                 log.flush()
         for n, name in enumerate(SCENARIO.names):
@@ -70,7 +70,7 @@ def live(storage: LogStorage) -> None:
         log.finish({})
 
 
-def statistics(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
+def make_link_stats(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
     """Statistics of a site with one peer, as a live loop publishes them."""
     counts = {name: {peer: 0} for name in ("accepted", "late", "duplicate", "refused")}
     measured = {"offset_us": {peer: -120}, "bound_us": {peer: 40}, "rtt_us": {peer: 400}}
@@ -88,13 +88,13 @@ def statistics(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
     return LinkStats(**facts, **loop, **delays, **measured, **counts)
 
 
-def made(folder: Path) -> dict[str, Path]:
+def write_standard_files(folder: Path) -> dict[str, Path]:
     """Makes every kind of file, and the bag of the live one."""
     whole = folder / "virtual.mcap"
     with whole.open("wb") as stream:
         virtual.write_virtual_log(SCENARIO, stream, views_hz=VIEWS_HZ)
-    live(LogStorage(folder / "live.mcap"))
-    live(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
+    record_live_file(LogStorage(folder / "live.mcap"))
+    record_live_file(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
     parts = sorted(folder.glob("parts-*.mcap"))
     torn = folder / "torn.mcap"
     torn.write_bytes(

@@ -29,7 +29,7 @@ floats = st.floats(width=64) | st.sampled_from([0.0, -0.0, math.nan, math.inf, 5
 stamps_ns = st.integers(0, (1 << 31) * 10**9 - 1)
 
 
-def decoded(name: str, data: bytes) -> Any:
+def decode_cdr(name: str, data: bytes) -> Any:
     """By mcap-ros2-support, from the schema text that stands in our files."""
     schema = Schema(id=1, name=name, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[name])
     decoder = DecoderFactory().decoder_for("cdr", schema)
@@ -42,7 +42,7 @@ def by_rosbags(name: str, data: bytes) -> Any:
     return STORE.deserialize_cdr(data, name)
 
 
-def serialized(name: str, message: Any) -> bytes:
+def serialize_cdr(name: str, message: Any) -> bytes:
     return bytes(STORE.serialize_cdr(message, name))
 
 
@@ -50,12 +50,12 @@ def type_of(name: str) -> Any:
     return STORE.types[name]
 
 
-def header(stamp_ns: int, frame_id: str) -> Any:
+def make_header(stamp_ns: int, frame_id: str) -> Any:
     time = type_of("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
     return type_of("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
 
 
-def bits(numbers: Any) -> list[bytes]:
+def pack_numbers(numbers: Any) -> list[bytes]:
     """So that NaN equals itself and -0.0 is not 0.0."""
     return [struct.pack("<d", number) for number in numbers]
 
@@ -86,53 +86,53 @@ def joint_states(draw: st.DrawFn) -> SimpleNamespace:
 @given(joint_states())
 def test_joint_states_are_read_as_they_were_written(case: SimpleNamespace) -> None:
     data = case.packer.pack(case.stamp_ns, case.position, case.velocity, case.effort)
-    for message in (decoded(cdr.JOINT_STATE, data), by_rosbags(cdr.JOINT_STATE, data)):
+    for message in (decode_cdr(cdr.JOINT_STATE, data), by_rosbags(cdr.JOINT_STATE, data)):
         stamp = message.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == case.stamp_ns
         assert (message.header.frame_id, list(message.name)) == ("", case.names)
-        assert bits(message.position) == bits(case.position)
-        assert bits(message.velocity) == bits(case.velocity)
-        assert bits(message.effort) == bits(case.effort)
+        assert pack_numbers(message.position) == pack_numbers(case.position)
+        assert pack_numbers(message.velocity) == pack_numbers(case.velocity)
+        assert pack_numbers(message.effort) == pack_numbers(case.effort)
     own = type_of(cdr.JOINT_STATE)(
-        header=header(case.stamp_ns, ""),
+        header=make_header(case.stamp_ns, ""),
         name=case.names,
         position=np.array(case.position),
         velocity=np.array(case.velocity),
         effort=np.array(case.effort),
     )
-    assert data == serialized(cdr.JOINT_STATE, own)
+    assert data == serialize_cdr(cdr.JOINT_STATE, own)
 
 
 @st.composite
-def arrays(draw: st.DrawFn) -> tuple[list[tuple[str, int]], list[float]]:
+def draw_array(draw: st.DrawFn) -> tuple[list[tuple[str, int]], list[float]]:
     dimensions = draw(st.lists(st.tuples(words, st.integers(0, 3)), max_size=3))
     count = math.prod(size for _, size in dimensions)
     return dimensions, draw(st.lists(floats, min_size=count, max_size=count))
 
 
-@given(arrays())
+@given(draw_array())
 def test_arrays_are_read_as_they_were_written(
     case: tuple[list[tuple[str, int]], list[float]],
 ) -> None:
     dimensions, numbers = case
     data = make_float_array_packer(*dimensions)(*numbers)
     strides = [math.prod(size for _, size in dimensions[n:]) for n in range(len(dimensions))]
-    for message in (decoded(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
-        assert bits(message.data) == bits(numbers)
+    for message in (decode_cdr(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
+        assert pack_numbers(message.data) == pack_numbers(numbers)
         shape = [(d.label, d.size, d.stride) for d in message.layout.dim]
         assert shape == [(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
     one = type_of("std_msgs/msg/MultiArrayDimension")
     dims = [one(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
     layout = type_of("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
     own = type_of(cdr.FLOAT64_ARRAY)(layout=layout, data=np.array(numbers))
-    assert data == serialized(cdr.FLOAT64_ARRAY, own)
+    assert data == serialize_cdr(cdr.FLOAT64_ARRAY, own)
 
 
 @given(words)
 def test_a_string_is_read_as_it_was_written(text: str) -> None:
     data = pack_string(text)
-    assert decoded(cdr.STRING, data).data == by_rosbags(cdr.STRING, data).data == text
-    assert data == serialized(cdr.STRING, type_of(cdr.STRING)(data=text))
+    assert decode_cdr(cdr.STRING, data).data == by_rosbags(cdr.STRING, data).data == text
+    assert data == serialize_cdr(cdr.STRING, type_of(cdr.STRING)(data=text))
 
 
 @given(stamps_ns, st.sampled_from(RosLogLevel), words, words)
@@ -140,7 +140,7 @@ def test_log_lines_are_read_as_written(
     stamp_ns: int, level: RosLogLevel, name: str, text: str
 ) -> None:
     data = pack_log(stamp_ns, level, name, text)
-    for message in (decoded(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
+    for message in (decode_cdr(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
         assert message.stamp.sec * 10**9 + message.stamp.nanosec == stamp_ns
         assert (message.level, message.name, message.msg, message.line) == (
             level,
@@ -153,7 +153,7 @@ def test_log_lines_are_read_as_written(
     own = type_of(cdr.LOG)(
         stamp=time, level=level.value, name=name, msg=text, file="", function="", line=0
     )
-    assert data == serialized(cdr.LOG, own)
+    assert data == serialize_cdr(cdr.LOG, own)
 
 
 def test_stamps_beyond_ros_2_become_its_last() -> None:
@@ -163,21 +163,23 @@ def test_stamps_beyond_ros_2_become_its_last() -> None:
     assert message.header.stamp.sec == 2**31 - 1
 
 
-def pose(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
+def make_pose(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
     point, turn = type_of("geometry_msgs/msg/Point"), type_of("geometry_msgs/msg/Quaternion")
     where = type_of("geometry_msgs/msg/Pose")(
         position=point(*numbers[:3]), orientation=turn(*numbers[3:])
     )
-    return type_of("geometry_msgs/msg/PoseStamped")(header=header(stamp_ns, frame), pose=where)
+    return type_of("geometry_msgs/msg/PoseStamped")(
+        header=make_header(stamp_ns, frame), pose=where
+    )
 
 
-def wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
+def make_wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
     vector = type_of("geometry_msgs/msg/Vector3")
     pull = type_of("geometry_msgs/msg/Wrench")(
         force=vector(*numbers[:3]), torque=vector(*numbers[3:])
     )
     return type_of("geometry_msgs/msg/WrenchStamped")(
-        header=header(stamp_ns, frame), wrench=pull
+        header=make_header(stamp_ns, frame), wrench=pull
     )
 
 
@@ -185,13 +187,13 @@ def wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
 def test_poses_and_wrenches_are_those_of_rosbags(
     stamp_ns: int, frame: str, numbers: list[float]
 ) -> None:
-    for kind, make, count in (("PoseStamped", pose, 7), ("WrenchStamped", wrench, 6)):
+    for kind, make, count in (("PoseStamped", make_pose, 7), ("WrenchStamped", make_wrench, 6)):
         data = cdr.pack_frame_vectors(stamp_ns, frame, *numbers[:count])
-        assert data == serialized(
+        assert data == serialize_cdr(
             f"geometry_msgs/msg/{kind}", make(stamp_ns, frame, numbers[:count])
         )
         named, read = cdr.read_frame_vectors(data, count)
-        assert (named, bits(read)) == (frame, bits(numbers[:count]))
+        assert (named, pack_numbers(read)) == (frame, pack_numbers(numbers[:count]))
 
 
 @given(stamps_ns, words, st.lists(words, max_size=4), st.booleans())
@@ -200,13 +202,13 @@ def test_joint_states_of_others_are_read(
 ) -> None:
     speeds = [0.5] * len(names) if moves else []
     message = type_of(cdr.JOINT_STATE)(
-        header=header(stamp_ns, frame),
+        header=make_header(stamp_ns, frame),
         name=names,
         position=np.arange(len(names), dtype=np.float64),
         velocity=np.array(speeds),
         effort=np.zeros(0),
     )
-    found = cdr.read_joint_state(serialized(cdr.JOINT_STATE, message))
+    found = cdr.read_joint_state(serialize_cdr(cdr.JOINT_STATE, message))
     assert found == (stamp_ns, names, tuple(range(len(names))), tuple(speeds), ())
 
 
@@ -232,10 +234,10 @@ def test_diagnostics_are_those_of_rosbags(stamp_ns: int, parts: list[tuple[Any, 
         for n, name, text, values in parts
     ]
     kind = "diagnostic_msgs/msg/DiagnosticArray"
-    message = type_of(kind)(header=header(stamp_ns, ""), status=theirs)
-    assert cdr.pack_diagnostics(stamp_ns, [cdr.Diagnosis(*one) for one in parts]) == serialized(
-        kind, message
-    )
+    message = type_of(kind)(header=make_header(stamp_ns, ""), status=theirs)
+    assert cdr.pack_diagnostics(
+        stamp_ns, [cdr.Diagnosis(*one) for one in parts]
+    ) == serialize_cdr(kind, message)
 
 
 @given(st.booleans(), words)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.analysis.builders import make_busy_run, make_short_log
 from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes, rewrite_log
-from tests.log.dealt import a_file, changed, messages
+from tests.log.split_logs import change_message, make_bytes_of_messages, read_messages
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
@@ -30,12 +30,12 @@ STATE_VECTORS = Layout().lengths()
 
 
 @cache
-def paper() -> Log:
+def make_paper_log() -> Log:
     return make_log("paper")
 
 
 LOGS = {
-    "paper": paper,
+    "paper": make_paper_log,
     "busy": lambda: make_busy_run().log,
     "four": lambda: make_short_log("four"),
 }
@@ -68,7 +68,7 @@ def test_column_names_are_unique_with_units(which: str) -> None:
 )
 def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:
     """In virtual time nothing is under way: a sample's delay there is no network's."""
-    table = build_arrivals_table(paper()["m1"], "run.mcap", live=live)
+    table = build_arrivals_table(make_paper_log()["m1"], "run.mcap", live=live)
     (delay,) = (one for one in table.columns if one.name == "delay_us")
     assert delay.meaning.startswith(said)
 
@@ -152,7 +152,7 @@ def test_a_row_of_statistics_is_its_message() -> None:
 
 def test_empty_statistics_have_the_same_columns() -> None:
     some = make_log("paper")
-    none = open_bytes(a_file(make_log_bytes("paper"), []))
+    none = open_bytes(make_bytes_of_messages(make_log_bytes("paper"), []))
     for kind in ("state", "link", "arrivals"):
         assert [c.name for c in none.table("m1", kind).columns] == [
             c.name for c in some.table("m1", kind).columns
@@ -162,7 +162,7 @@ def test_empty_statistics_have_the_same_columns() -> None:
 
 
 def test_events_are_in_their_order_of_arrival() -> None:
-    log = paper()
+    log = make_paper_log()
     told = [
         Event(member="s", boot=2**64 - 1, kind="epoch", text="an epoch", boots={"m1": 5}, n=0),
         Event(member="m1", boot=1, kind="mode", text="holds, and says so", t_ns=7_000_000, n=0),
@@ -175,15 +175,15 @@ def test_events_are_in_their_order_of_arrival() -> None:
         ("s", None, 2**64 - 1),
     ]
     assert sorted(rows["boots"]) == ["", '{"m1": 5}']
-    every = messages(make_log_bytes("paper"))
+    every = read_messages(make_log_bytes("paper"))
     ends = [m for m in every if m[0].endswith("/event")]
     late = [
         (topic, payload, 10**9 - n, sent, number)
         for n, (topic, payload, _, sent, number) in enumerate(ends)
     ]
-    assert open_bytes(a_file(make_log_bytes("paper"), late)).table("events")["member"].rows(
-        0, 3
-    ) == [
+    assert open_bytes(make_bytes_of_messages(make_log_bytes("paper"), late)).table("events")[
+        "member"
+    ].rows(0, 3) == [
         "s",
         "m2",
         "m1",
@@ -191,7 +191,7 @@ def test_events_are_in_their_order_of_arrival() -> None:
 
 
 def test_missing_tables_name_the_existing_ones() -> None:
-    log = paper()
+    log = make_paper_log()
     with pytest.raises(KeyError, match="m1, m2, s"):
         log.table("m3")
     with pytest.raises(KeyError, match="state, link, arrivals"):
@@ -211,9 +211,13 @@ def test_arrivals_of_missing_peers_are_refused() -> None:
 
 
 def test_numbers_beyond_64_bits_are_refused() -> None:
-    every = messages(make_log_bytes("paper"))
+    every = read_messages(make_log_bytes("paper"))
     event = next(m for m in every if m[0].endswith("/event"))
-    log = open_bytes(a_file(make_log_bytes("paper"), [changed(event, ticks=2**64 - 1)]))
+    log = open_bytes(
+        make_bytes_of_messages(
+            make_log_bytes("paper"), [change_message(event, ticks=2**64 - 1)]
+        )
+    )
     with pytest.raises(LogError, match="ticks has a number that is out of range"):
         log.table("events")
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
-from tests.log.hostility import CHANGES, chunk, mangled, read_by_all
+from tests.log.hostility import CHANGES, make_chunk, mangle_log, read_by_all
 from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.verification import verify
@@ -53,11 +53,11 @@ def test_any_change_gets_a_sentence_as_answer(
 def test_several_changes_get_an_answer(seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "changed.mcap"
-        path.write_bytes(mangled(DATA, random.Random(seed)))
+        path.write_bytes(mangle_log(DATA, random.Random(seed)))
         read_by_all(path)
 
 
-def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
+def _make_file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
     """A log of a mebibyte whose site m1 has these records, and as many of them as a reader may be given."""
     log = edit_log_bytes(
         WHOLE,
@@ -79,14 +79,15 @@ def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> byte
         for _, payload in zip(range(most), messages, strict=False)
     ]
     packed = [
-        chunk(names + b"".join(records[k : k + 20_000])) for k in range(0, len(records), 20_000)
+        make_chunk(names + b"".join(records[k : k + 20_000]))
+        for k in range(0, len(records), 20_000)
     ]
     return (
         log[: first.offset] + struct.pack("<BQ", 9, len(content)) + content + b"".join(packed)
     )
 
 
-def _records(**fields: Any) -> Iterator[bytes]:
+def _make_records(**fields: Any) -> Iterator[bytes]:
     """Records of m1 that are valid, small, and say what is given besides."""
     zeros = {"q": 2, "qd": 2, "q_des": 2, "qd_des": 2, "tau": 2, "tau_x": 2, "theta_hat": 5}
     about = {
@@ -111,10 +112,10 @@ def _records(**fields: Any) -> Iterator[bytes]:
 
 
 HUGE: dict[str, Callable[[], bytes]] = {
-    "records that take in what nobody sent": lambda: _file(
-        _records(rx=[[0, 0, 0]] * 30), 23_000
+    "records that take in what nobody sent": lambda: _make_file(
+        _make_records(rx=[[0, 0, 0]] * 30), 23_000
     ),
-    "messages without a byte": lambda: _file(iter(lambda: b"", None), 100_000),
+    "messages without a byte": lambda: _make_file(iter(lambda: b"", None), 100_000),
 }
 
 

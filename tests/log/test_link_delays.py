@@ -33,7 +33,7 @@ def delay_us(peer: str, site: str, tick: int) -> int:
     return -500 if (peer, tick) == ("m1", 40) else int(drawn)
 
 
-def log_bytes() -> bytes:
+def make_delayed_bytes() -> bytes:
     """A session in which every sample of every link but the lost ones came after its known delay."""
     scenario = load_scenario("paper", OVERRIDES)
     peers = {name: scenario.peers(name) for name in scenario.names}
@@ -55,7 +55,7 @@ def log_bytes() -> bytes:
 
 @pytest.fixture(scope="module")
 def data() -> bytes:
-    return log_bytes()
+    return make_delayed_bytes()
 
 
 @pytest.fixture

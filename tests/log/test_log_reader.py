@@ -18,7 +18,7 @@ from tests.log.builders import (
     open_bytes,
     simulate_bytes,
 )
-from tests.log.dealt import foreign
+from tests.log.split_logs import make_foreign_bytes
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
@@ -238,7 +238,7 @@ def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
 
 def test_an_mcap_file_of_others_is_refused() -> None:
     with pytest.raises(LogError, match=r"not a log of trilat-net"):
-        open_bytes(foreign())
+        open_bytes(make_foreign_bytes())
 
 
 def test_mcap_files_using_our_names_are_refused() -> None:

@@ -36,7 +36,7 @@ def signed(tmp_path: Path) -> tuple[Path, Path]:
     return path, public
 
 
-def problem(path: Path, key: Path) -> str:
+def find_problem(path: Path, key: Path) -> str:
     found = check_signatures([path], key)
     assert found.passed == (not found.places)
     return "" if found.passed else found.text
@@ -45,7 +45,7 @@ def problem(path: Path, key: Path) -> str:
 def test_signatures_hold_without_touching_the_log(signed: tuple[Path, Path]) -> None:
     path, key = signed
     assert path.read_bytes() == make_log_bytes("paper")
-    assert problem(path, key) == ""
+    assert find_problem(path, key) == ""
 
 
 def test_signatures_follow_rfc_8032_over_digests(signed: tuple[Path, Path]) -> None:
@@ -88,7 +88,7 @@ def test_any_change_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) 
         file.unlink()
     else:
         file.write_text("signed, honestly")
-    assert problem(path, key)
+    assert find_problem(path, key)
 
 
 def test_only_logs_agreeing_with_chains_are_signed(tmp_path: Path) -> None:
@@ -98,9 +98,9 @@ def test_only_logs_agreeing_with_chains_are_signed(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"is not signed: .*trilat log recover"):
         sign_log(path, private)
     made = recover(path).output
-    assert problem(made, key) == f"there is no signature file {made}.sig"
+    assert find_problem(made, key) == f"there is no signature file {made}.sig"
     sign_log(made, private)
-    assert problem(made, key) == ""
+    assert find_problem(made, key) == ""
 
 
 def test_invalid_or_open_keys_are_refused(signed: tuple[Path, Path], tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from tests.log.disks import open_file_on
 from trilat_net.app.cli.members import parse_split
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_file import LogFile
@@ -20,7 +21,7 @@ from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.scenario import load_scenario
 
-from .disks import SmallDisk, file_on
+from .disks import SmallDisk
 
 SCENARIO = load_scenario("two_sites")
 KEYS = [topics.key("t", site, channel) for site in ("m", "s") for channel in ("state", "event")]
@@ -31,11 +32,11 @@ Message = tuple[str, bytes, int, int]
 pytestmark = pytest.mark.usefixtures("unsynced")
 
 
-def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+def begin_writer(stream: Sink, part: Mapping[str, str]) -> LogWriter:
     return LogWriter(stream, SCENARIO, "t", "live", 10**18, collect_provenance(), part=part)
 
 
-def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
+def read_file(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert [attachment.name for attachment in reader.iter_attachments()] == [
@@ -51,7 +52,7 @@ def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
 
 
 def written(place: LogStorage, messages: list[Message], flush_every: int = 7) -> None:
-    with LogParts(place, begin) as log:
+    with LogParts(place, begin_writer) as log:
         log.current_accounts = lambda: {"so far": "yes"}
         for n, (key, payload, log_ns, number) in enumerate(messages):
             log.add(key, payload, 0, log_ns, number)
@@ -93,14 +94,14 @@ def test_joined_parts_are_the_unsplit_file(
     parts = find_parts(path)
     if not place.splits:
         assert list(tmp_path.iterdir()) == [path]
-        assert read(path)[0] == messages
-        assert "trilat.part" not in read(path)[1]
+        assert read_file(path)[0] == messages
+        assert "trilat.part" not in read_file(path)[1]
         return
     assert sorted(tmp_path.iterdir()) == [part_path(path, n) for n in range(1, len(parts) + 1)]
     found: list[Message] = []
     previous = digest = ""
     for number, part in sorted(parts.items()):
-        own, metadata = read(part)
+        own, metadata = read_file(part)
         found += own
         assert metadata["trilat.session"]["session"] == "t"
         follows = {"previous_records": digest} if digest else {}
@@ -157,7 +158,7 @@ def test_continuing_writes_the_next_part(
         tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None
     )
     written(place, [(KEYS[0], b"\x80", 10**18, 0)])
-    _, metadata = read(tmp_path / expected)
+    _, metadata = read_file(tmp_path / expected)
     assert metadata.get("trilat.part", {}).get("previous") == previous
     for name in there:
         assert (tmp_path / name).read_bytes() == b"precious"
@@ -170,7 +171,7 @@ def test_taken_names_are_refused_unless_replaceable(there: str, tmp_path: Path) 
     (tmp_path / there).write_bytes(b"precious")
     place = LogStorage(tmp_path / "run.mcap", split_ns=1)
     with pytest.raises(UsageError, match=f"{there}.* exists.*force=True"):
-        LogParts(place, begin)
+        LogParts(place, begin_writer)
     assert (tmp_path / there).read_bytes() == b"precious"
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
     written(LogStorage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
@@ -194,7 +195,7 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
     written(place, messages)
     assert sorted(find_parts(place.path)) == [1, 2, 3]
     assert [
-        message for path in find_parts(place.path).values() for message in read(path)[0]
+        message for path in find_parts(place.path).values() for message in read_file(path)[0]
     ] == messages
 
 
@@ -209,17 +210,17 @@ def test_continuing_and_replacing_at_once_is_refused(tmp_path: Path) -> None:
         LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).find_first_part()
 
 
-def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]:
+def write_on_disk(room: int, path: Path, messages: list[Message]) -> list[Message]:
     """Writes messages in parts onto a disk with so much room; returns those that were given to it."""
     taken: list[Message] = []
     disks = [SmallDisk(room)]
 
     def opened(part: Path) -> LogFile:
         disks.append(SmallDisk(disks[-1].capacity - disks[-1].written))
-        return file_on(disks[-1], part)
+        return open_file_on(disks[-1], part)
 
     def record() -> None:
-        with LogParts(LogStorage(path, split_ns=5 * 10**8), begin, opened) as log:
+        with LogParts(LogStorage(path, split_ns=5 * 10**8), begin_writer, opened) as log:
             try:
                 for message in messages:
                     key, payload, log_ns, number = message
@@ -242,18 +243,20 @@ def test_full_disks_at_seams_keep_earlier_parts(tmp_path: Path) -> None:
     messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
     for room in range(80_000, 200_000, 7900):
         path = cleared(tmp_path)
-        taken = recorded_on(room, path, messages)
+        taken = write_on_disk(room, path, messages)
         found = [
-            message for _, part in sorted(find_parts(path).items()) for message in read(part)[0]
+            message
+            for _, part in sorted(find_parts(path).items())
+            for message in read_file(part)[0]
         ]
         assert found == taken
         assert all(part.name.endswith(".mcap") for part in tmp_path.iterdir())
 
 
 def test_adding_after_the_end_is_refused(tmp_path: Path) -> None:
-    with LogParts(LogStorage(tmp_path / "run.mcap"), begin) as log:
+    with LogParts(LogStorage(tmp_path / "run.mcap"), begin_writer) as log:
         log.finish({})
         with pytest.raises(LogRefused, match="is finished"):
             log.add(KEYS[0], b"", 0, 0, 0)
         log.finish({})
-    assert read(tmp_path / "run.mcap")[0] == []
+    assert read_file(tmp_path / "run.mcap")[0] == []

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from tests.log.builders import edit_log_bytes, make_log_bytes
-from tests.log.hostility import chunk
+from tests.log.hostility import make_chunk
 from trilat_net.errors import LogError
 from trilat_net.log import mcap_reader, mcap_records
 from trilat_net.log.mcap_reader import McapMessage, McapReader
@@ -179,12 +179,14 @@ def test_chunks_unpack_within_their_limit(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(mcap_records, "MAX_UNPACKED_BYTES", 10_000)
     fine, bomb = bytes(10_000), bytes(1_000_000)
     for compression in ("zstd", "lz4", ""):
-        assert unpack_chunk(chunk(fine, compression=compression)[RECORD_HEAD_BYTES:]) == fine
+        assert (
+            unpack_chunk(make_chunk(fine, compression=compression)[RECORD_HEAD_BYTES:]) == fine
+        )
     for compression in ("zstd", "lz4"):
         for size in (len(bomb), 10_000, 1 << 62, 0):
             with pytest.raises(UnreadableRecord):
                 unpack_chunk(
-                    chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:]
+                    make_chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:]
                 )
 
 
@@ -218,7 +220,7 @@ def test_absurd_contents_are_refused_with_place(
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
     bombs = b"".join(
-        chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6)
+        make_chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6)
     )
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(
@@ -235,7 +237,7 @@ def test_an_absurdly_large_channel_ends_there_alone(
 ) -> None:
     """One odd channel does not make a log unreadable; what is left out of it is said, once."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 16 << 20)
-    bomb = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 80_000)
+    bomb = make_chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 80_000)
     data = DATA[: CHUNKS[1].offset] + bomb + bomb + DATA[CHUNKS[1].offset :]
     reader = McapReader(io.BytesIO(data), "file")
     read = list(reader.messages())
@@ -258,8 +260,8 @@ def test_resting_arms_are_never_absurd(
 
 
 def test_a_chunk_within_a_chunk_is_not_read() -> None:
-    inner = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0))
-    data = DATA[: CHUNKS[1].offset] + chunk(inner) + DATA[CHUNKS[1].offset :]
+    inner = make_chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0))
+    data = DATA[: CHUNKS[1].offset] + make_chunk(inner) + DATA[CHUNKS[1].offset :]
     assert walked(data)[1] == ITEMS
 
 
@@ -273,7 +275,7 @@ def test_channels_keep_their_first_definition() -> None:
 
     message = struct.pack("<BQHIQQ", 5, 23, 7, 1, 2, 3) + b"x"
     lost = struct.pack("<BQHIQQ", 5, 22, 9, 1, 2, 3)
-    data = DATA[: CHUNKS[0].offset] + chunk(
+    data = DATA[: CHUNKS[0].offset] + make_chunk(
         channel(7, b"/a") + message + channel(7, b"/b") + message + lost
     )
     _, items = walked(data)

@@ -66,7 +66,7 @@ def theirs(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
     return stream.getvalue()
 
 
-def read(data: bytes) -> dict[str, Any]:
+def read_content(data: bytes) -> dict[str, Any]:
     """All that the `mcap` package finds, by way of the index."""
     reader = make_reader(io.BytesIO(data), validate_crcs=True)
     summary = reader.get_summary()
@@ -92,7 +92,10 @@ def read(data: bytes) -> dict[str, Any]:
 def test_files_equal_those_of_mcaps_writer(
     calls: list[tuple[Any, ...]], chunk_bytes: int
 ) -> None:
-    found, expected = read(ours(calls, chunk_bytes)), read(theirs(calls, chunk_bytes))
+    found, expected = (
+        read_content(ours(calls, chunk_bytes)),
+        read_content(theirs(calls, chunk_bytes)),
+    )
     assert found == expected
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from tests.log.builders import edit_log_bytes, make_log_bytes
-from tests.log.hostility import CHANGES, mangled
+from tests.log.hostility import CHANGES, mangle_log
 from trilat_net.errors import LogError
 from trilat_net.log import mcap_reader
 from trilat_net.log.mcap_reader import ChannelMessages, McapReader
@@ -71,7 +71,7 @@ def test_blocks_of_a_changed_file_are_its_messages(change: Any, seed: int) -> No
     for data in (WHOLE, MANY_CHUNKS):
         changed = change(data, random.Random(seed))
         assert read_in_blocks(changed) == read_singly(changed)
-    changed = mangled(WHOLE, random.Random(seed))
+    changed = mangle_log(WHOLE, random.Random(seed))
     assert read_in_blocks(changed) == read_singly(changed)
 
 

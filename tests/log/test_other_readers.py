@@ -17,19 +17,21 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from tests.execution.builders import execute_ticks
+from tests.log.programs import run_program
+from tests.log.split_logs import read_messages
+from tests.log.standard_files import write_standard_files
 from trilat_net.core.step.ticks import Mode
 from trilat_net.log.log_reader import Log, open_log
 
-from .dealt import messages
-from .programs import PYMCAP, RERUN, printed, rerun_faults
-from .standard_files import EPOCH_NS, KINDS, SCENARIO, made
+from .programs import PYMCAP, RERUN, rerun_faults
+from .standard_files import EPOCH_NS, KINDS, SCENARIO
 
 BUCKET = 20
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return made(tmp_path_factory.mktemp("files"))
+    return write_standard_files(tmp_path_factory.mktemp("files"))
 
 
 @pytest.fixture(params=KINDS)
@@ -60,7 +62,7 @@ def test_mcap_reads_equal_data_without_index(log_file: Path) -> None:
     assert Counter(
         (channel.topic, *vars(message).values()) for _, channel, message in by_index
     ) == Counter(in_order)
-    times = [message.log_ns for message in messages(data)]
+    times = [message.log_ns for message in read_messages(data)]
     assert times == sorted(times)
 
 
@@ -232,8 +234,8 @@ def test_rerun_has_curves_with_the_names_of_joints(
 ) -> None:
     """Of a recording as it converts it, the names of the series and their numbers."""
     recording = tmp_path / "run.rrd"
-    printed(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
-    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
+    run_program(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
+    text = run_program(*RERUN, "rrd", "print", "-vvv", str(recording))
     for site in SCENARIO.names:
         for entity in (
             f"/viz/{site}/joint_states/position",
@@ -253,6 +255,8 @@ def test_rerun_has_curves_with_the_names_of_joints(
 @pytest.mark.push
 def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     """A program of others under another license: run, never imported."""
-    assert "passed" in printed(*PYMCAP, "doctor", "--strict-message-order", str(files[kind]))
+    assert "passed" in run_program(
+        *PYMCAP, "doctor", "--strict-message-order", str(files[kind])
+    )
     if kind == "live":
-        assert "/viz/m/joint_states" in printed(*PYMCAP, "info", str(files[kind]))
+        assert "/viz/m/joint_states" in run_program(*PYMCAP, "info", str(files[kind]))

@@ -23,7 +23,7 @@ from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5, 0.1, 1.6, 0.2]}
 
 
-def scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
+def make_robot_scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
     text = two_arm_text(f"{arm}.urdf", POSES[arm]).replace(
         "[control]", f"down = {down}\n[control]"
     )
@@ -41,7 +41,7 @@ def end_of(model: RobotModel, q) -> tuple:
 
 @pytest.mark.parametrize("arm", POSES)
 def test_last_frames_equal_pinocchios_end(arm):
-    model = RobotModel(scenario(arm), "m")
+    model = RobotModel(make_robot_scenario(arm), "m")
     reference = chain_references()[arm]
     assert model.frames[-1][1] == f"m/{reference_tip(arm)}"
     for state in reference.states:
@@ -62,7 +62,7 @@ def reference_tip(arm: str) -> str:
     "down", [(0.0, 0.0, -1.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)]
 )
 def test_bases_stand_apart_and_gravity_points_down(down):
-    models = [RobotModel(scenario(down=str([*down])), site) for site in ("m", "s")]
+    models = [RobotModel(make_robot_scenario(down=str([*down])), site) for site in ("m", "s")]
     (m, turned), (s, _) = (model.compute_transforms(POSES["arm6"])[0] for model in models)
     assert math.dist(m, s) == SPACING_M
     assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx(
@@ -71,7 +71,7 @@ def test_bases_stand_apart_and_gravity_points_down(down):
 
 
 def test_ros_decoders_read_the_message():
-    model = RobotModel(scenario(), "m")
+    model = RobotModel(make_robot_scenario(), "m")
     schema = Schema(
         id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS]
     )
@@ -88,7 +88,7 @@ def test_ros_decoders_read_the_message():
 
 
 def test_the_robot_description_has_the_links_and_shapes():
-    root = ElementTree.fromstring(RobotModel(scenario(), "s").description)
+    root = ElementTree.fromstring(RobotModel(make_robot_scenario(), "s").description)
     given = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
     names = [link.get("name") for link in root.findall("link")]
     assert names == [f"s/{link.get('name')}" for link in given.findall("link")]

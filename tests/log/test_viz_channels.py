@@ -18,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from tests.execution.builders import execute_ticks
 from tests.log.builders import simulate_bytes
-from tests.log.dealt import messages
+from tests.log.split_logs import read_messages
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
@@ -78,7 +78,7 @@ class Desk:
 
 
 @cache
-def _decoder(kind: str) -> Any:
+def _make_decoder(kind: str) -> Any:
     from mcap.records import Schema
 
     from trilat_net.log.ros2 import cdr
@@ -88,13 +88,13 @@ def _decoder(kind: str) -> Any:
 
 
 def numbers_of(kind: str, data: bytes) -> list[float]:
-    message = _decoder(kind)(data)
+    message = _make_decoder(kind)(data)
     if kind == "sensor_msgs/msg/JointState":
         return [*message.position, *message.velocity, *message.effort]
     return list(message.data)
 
 
-def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRecord:
+def make_record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRecord:
     """A record whose numbers are these, from q to theta_hat."""
     n = iter(numbers)
     vectors = [[next(n) for _ in range(size)] for size in (2, 2, 2, 2, 2, 2, 5)]
@@ -148,7 +148,7 @@ def test_an_envelope_is_the_extremes_in_their_order(
 
 
 @st.composite
-def runs(draw: st.DrawFn) -> list[TickRecord]:
+def draw_records(draw: st.DrawFn) -> list[TickRecord]:
     """Some ticks of a second, in any order, with small or arbitrary numbers."""
     ticks = draw(st.lists(st.integers(0, 450), unique=True, min_size=1, max_size=120))
     if draw(st.booleans()):
@@ -157,19 +157,19 @@ def runs(draw: st.DrawFn) -> list[TickRecord]:
     numbers = rng.integers(-3, 4, (len(ticks), 17)) * rng.choice([1.0, 1e-9, 1e5], 17)
     modes = rng.choice([Mode.RUN, Mode.HOLD, Mode.DIVERGED], len(ticks), p=[0.9, 0.05, 0.05])
     return [
-        record(tick, row.tolist(), Mode(mode))
+        make_record(tick, row.tolist(), Mode(mode))
         for tick, row, mode in zip(ticks, numbers, modes, strict=True)
     ]
 
 
-def buckets(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRecord]]:
+def group_records(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRecord]]:
     by: dict[int, list[TickRecord]] = defaultdict(list)
     for one in records:
         by[one.tick // length].append(one)
     return by
 
 
-@given(runs())
+@given(draw_records())
 def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> None:
     """In whatever order the records come."""
     desk = Desk(100.0)
@@ -183,7 +183,7 @@ def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> No
         put: dict[int, list[list[float]]] = defaultdict(list)
         for t_ns, row in arrays_of(desk):
             put[t_ns // (length * 10**6)].append(row)
-        wanted = buckets(records, length)
+        wanted = group_records(records, length)
         assert set(put) == set(wanted)
         for number, ones in wanted.items():
             columns = zip(*map(row_of, ones), strict=True)
@@ -193,7 +193,7 @@ def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> No
                 assert set(shown) <= set(column)
 
 
-@given(runs())
+@given(draw_records())
 def test_view_messages_keep_log_time_order(records: list[TickRecord]) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.take(records)
@@ -208,7 +208,7 @@ def test_view_messages_keep_log_time_order(records: list[TickRecord]) -> None:
             assert times == sorted(set(times))
 
 
-@given(runs(), st.randoms(use_true_random=False))
+@given(draw_records(), st.randoms(use_true_random=False))
 def test_disorder_within_a_bucket_is_invisible(
     records: list[TickRecord], chance: random.Random
 ) -> None:
@@ -225,7 +225,7 @@ def test_disorder_within_a_bucket_is_invisible(
 def test_live_views_have_100_messages_a_second() -> None:
     """The second message of a bucket waits half a bucket, so that curves are even over the log time, too."""
     desk = Desk(100.0)
-    desk.take(record(k, [float(k)] * 17) for k in range(1000))
+    desk.take(make_record(k, [float(k)] * 17) for k in range(1000))
     seen = [s for s in desk.seen if s.topic == "/viz/m/joint_states"]
     assert [s.publish_ns // 10**6 for s in seen] == list(range(0, 980, 10))
     assert [s.log_ns for s in seen] == list(range(20, 1000, 10))
@@ -233,7 +233,7 @@ def test_live_views_have_100_messages_a_second() -> None:
 
 @pytest.mark.parametrize("views_hz", [1000.0, 5000.0, FULL_RATE_HZ])
 def test_full_views_hold_every_record(views_hz: float) -> None:
-    records = [record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
+    records = [make_record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
     desk = Desk(views_hz)
     desk.take(records)
     desk.finish()
@@ -242,7 +242,7 @@ def test_full_views_hold_every_record(views_hz: float) -> None:
         assert slow_arrays(desk) == [(one.t_ns, slow_row(one)) for one in records]
 
 
-@given(runs())
+@given(draw_records())
 def test_wire_and_simulated_records_look_equal(records: list[TickRecord]) -> None:
     states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
     assert stack_signals(states) == stack_signals(records)
@@ -251,13 +251,13 @@ def test_wire_and_simulated_records_look_equal(records: list[TickRecord]) -> Non
 def test_waiting_records_are_bounded_by_buckets() -> None:
     """A sender that counts its ticks in leaps, back and forth, leaves nothing behind."""
     desk = Desk(100.0)
-    desk.take(record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
+    desk.take(make_record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
     (site,) = [buckets for buckets in desk.views._buckets if buckets._first_tick]
     assert len(site._records) + len(site._late_records) <= 2 * BUCKET
     assert len(site._slow_rows) <= SLOW // BUCKET * 2
 
 
-def stats(**facts: Any) -> LinkStats:
+def make_stats(**facts: Any) -> LinkStats:
     counts = {
         "accepted": {"s": 1},
         "late": {"s": 0},
@@ -277,7 +277,7 @@ def test_statistics_have_units_and_unmeasured_are_nan() -> None:
     desk = Desk(100.0)
     clocks = {"offset_us": {"s": -2000}, "bound_us": {"s": 40}}
     delays = {"delay_us": {"s": 800}, "delay_max_us": {"s": 2500}}
-    desk.take([stats(**clocks, **delays)], "trilat/lab/m/link")
+    desk.take([make_stats(**clocks, **delays)], "trilat/lab/m/link")
     shown = {seen.topic.rpartition("/")[2]: numbers_of(*seen.message) for seen in desk.seen}
     assert shown == {
         "link_age": [1.5],
@@ -287,7 +287,7 @@ def test_statistics_have_units_and_unmeasured_are_nan() -> None:
     }
     nothing = Desk(100.0)
     nothing.take(
-        [stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})],
+        [make_stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})],
         "trilat/lab/m/link",
     )
     by_topic = {
@@ -299,7 +299,7 @@ def test_statistics_have_units_and_unmeasured_are_nan() -> None:
 
 def test_virtual_time_shows_no_clocks_or_network() -> None:
     desk = Desk(100.0)
-    desk.take([stats()], "trilat/lab/m/link")
+    desk.take([make_stats()], "trilat/lab/m/link")
     assert [seen.topic for seen in desk.seen] == ["/viz/m/link_age"]
 
 
@@ -309,11 +309,11 @@ def test_events_become_text_with_levels(kind: str, level: int) -> None:
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
     desk.views.receivers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
     text, line = desk.seen
-    assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == (
+    assert (text.topic, _make_decoder(text.message[0])(text.message[1]).data) == (
         "/viz/events",
         "m: ü happened",
     )
-    shown = _decoder(line.message[0])(line.message[1])
+    shown = _make_decoder(line.message[0])(line.message[1])
     assert (line.topic, shown.level, shown.name, shown.msg) == (
         "/viz/log",
         level,
@@ -330,7 +330,7 @@ def test_early_events_have_their_arrival_time() -> None:
         Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9
     )
     kind, data = desk.seen[1].message
-    stamp = _decoder(kind)(data).stamp
+    stamp = _make_decoder(kind)(data).stamp
     assert stamp.sec * 10**9 + stamp.nanosec == EPOCH_NS - 9
 
 
@@ -338,7 +338,7 @@ def test_views_leave_other_messages_unchanged() -> None:
     own, shown = [], []
     for views_hz in (0.0, 100.0):
         scenario = load_scenario("paper", {"duration_s": 0.5})
-        every = messages(simulate_bytes(scenario, views_hz=views_hz))
+        every = read_messages(simulate_bytes(scenario, views_hz=views_hz))
         own.append([message for message in every if not message.topic.startswith("/viz")])
         shown.append(len(every) > len(own[-1]))
     assert own[0] == own[1]
@@ -381,6 +381,6 @@ def test_parts_end_with_all_extremes() -> None:
 def test_odd_rates_are_shown_as_asked() -> None:
     scenario = load_scenario("two_sites", {"sites.m.rate_hz": 333})
     desk = Desk(100.0, scenario)
-    desk.take(record(k, [0.0] * 17) for k in range(333))
+    desk.take(make_record(k, [0.0] * 17) for k in range(333))
     desk.finish()
     assert 100 <= len(desk.arrays("/viz/m/joint_states")) <= 112

@@ -84,7 +84,7 @@ class Routed(Connected):
         self._router.close()
 
 
-def encrypted(protocol: str, folder: Path) -> Mesh:
+def make_encrypted_mesh(protocol: str, folder: Path) -> Mesh:
     """Returns a mesh whose members authenticate each other, by a person's own configuration."""
     return Mesh(protocol, read_zenoh_file(Certificates(folder).zenoh_file()).settings)
 
@@ -111,6 +111,6 @@ NETWORKS: dict[str, Callable[[Path], Network]] = {
     "local": lambda _: Local(),
     "zenoh": lambda _: Mesh(),
     "router": lambda _: Routed(),
-    "tls": lambda folder: encrypted("tls", folder),
+    "tls": lambda folder: make_encrypted_mesh("tls", folder),
 }
 """All that keep the contract; each is made in a folder of its own."""

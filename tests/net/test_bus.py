@@ -28,7 +28,9 @@ def pair(network: Network) -> tuple[Bus, Bus]:
     return network.join(), network.join()
 
 
-def opened(publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[bytes]) -> None:
+def wait_until_heard(
+    publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[bytes]
+) -> None:
     deaf = list(inboxes)
 
     def heard() -> bool:
@@ -48,7 +50,7 @@ NUMBERS = [n.to_bytes(2, "big") for n in range(500)]
 def test_rings_give_messages_in_order(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
-    opened(publish, inbox)
+    wait_until_heard(publish, inbox)
     for number in NUMBERS:
         publish(number)
     assert received(inbox, len(NUMBERS)) == [("t/a", number) for number in NUMBERS]
@@ -61,7 +63,7 @@ def test_expressions_match_only_their_keys(pair: tuple[Bus, Bus]) -> None:
         key: sender.publisher(key)
         for key in ("t/b/y", "t/a/x", "t/b/b/x", "other/a/x", "t/b/x")
     }
-    opened(publishers["t/b/x"], one, any_number)
+    wait_until_heard(publishers["t/b/x"], one, any_number)
     for key, publish in publishers.items():
         publish(key.encode())
     assert [key for key, _ in received(one, 2)] == ["t/a/x", "t/b/x"]
@@ -71,8 +73,8 @@ def test_expressions_match_only_their_keys(pair: tuple[Bus, Bus]) -> None:
 def test_own_messages_never_return(pair: tuple[Bus, Bus]) -> None:
     sender, other = pair
     own, theirs, publish = sender.inbox("t/a"), other.inbox("t/a"), sender.publisher("t/a")
-    opened(publish, theirs)
-    opened(other.publisher("t/a"), own)
+    wait_until_heard(publish, theirs)
+    wait_until_heard(other.publisher("t/a"), own)
     publish(b"mine")
     other.publisher("t/a")(b"theirs")
     assert received(own, 1) == [("t/a", b"theirs")]
@@ -84,7 +86,7 @@ def test_taps_get_every_message_in_order(pair: tuple[Bus, Bus]) -> None:
     heard: list[tuple[str, bytes]] = []
     inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
     receiver.tap("t/*", lambda key, payload: heard.append((key, payload)))
-    opened(publish, inbox)
+    wait_until_heard(publish, inbox)
     until(lambda: heard and heard[-1][1] == b"last probe")
     heard.clear()
     for number in NUMBERS:
@@ -101,7 +103,7 @@ def test_patient_publishers_lose_nothing(
     heard: list[bytes] = []
     inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a", patient=True)
     receiver.tap("t/a", lambda _, payload: heard.append(payload))
-    opened(publish, inbox)
+    wait_until_heard(publish, inbox)
     until(lambda: heard and heard[-1] == b"last probe")
     heard.clear()
     said = [n.to_bytes(2, "big") * 500 for n in range(6000)]
@@ -118,7 +120,7 @@ def test_full_rings_lose_only_their_oldest(pair: tuple[Bus, Bus]) -> None:
         receiver.inbox("t/a"),
         sender.publisher("t/a"),
     )
-    opened(publish, small, large)
+    wait_until_heard(publish, small, large)
     for number in NUMBERS:
         publish(number)
     assert len(received(large, len(NUMBERS))) == len(NUMBERS)
@@ -223,7 +225,7 @@ def test_every_message_is_stamped_once_at_arrival(pair: tuple[Bus, Bus]) -> None
     sender, receiver = pair
     clock = Ticking()
     inbox, publish = receiver.stamped_inbox("t/a", clock, bytes), sender.publisher("t/a")
-    opened(publish, inbox)
+    wait_until_heard(publish, inbox)
     before = clock.readings
     for number in NUMBERS:
         publish(number)
@@ -239,8 +241,8 @@ def test_full_stamped_rings_lose_the_oldest(pair: tuple[Bus, Bus]) -> None:
         sender.publisher("t/a"),
     )
     done, finish = receiver.inbox("t/done"), sender.publisher("t/done")
-    opened(publish, inbox)
-    opened(finish, done)
+    wait_until_heard(publish, inbox)
+    wait_until_heard(finish, done)
     for number in NUMBERS:
         publish(number)
     finish(b"all")

@@ -107,7 +107,7 @@ def test_silent_members_are_named() -> None:
         site.asked("s", link="m1->s", to={"delay_ms": 350.0})
 
 
-def find(*payloads: bytes) -> list[Info]:
+def find_answering(*payloads: bytes) -> list[Info]:
     network, clock = LocalNetwork(), ManualClock()
     for n, payload in enumerate(payloads):
         network.join().respond(
@@ -118,17 +118,17 @@ def find(*payloads: bytes) -> list[Info]:
 
 
 def test_members_are_found_despite_unreadable_answers() -> None:
-    members = find(encode(answer_info("m0", 1)), b"garbage")
+    members = find_answering(encode(answer_info("m0", 1)), b"garbage")
     assert {info.member for info in members} == {"m0"}
     assert len(members) >= 2
-    assert find() == []
+    assert find_answering() == []
 
 
 def test_answers_of_other_versions_name_their_member() -> None:
     with pytest.raises(
         SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
     ):
-        find(encode(answer_info("m0", 1, v=VERSION + 1)))
+        find_answering(encode(answer_info("m0", 1, v=VERSION + 1)))
 
 
 def test_waiting_recorders_announce_themselves_first() -> None:

@@ -151,19 +151,19 @@ def test_polls_hurry_only_while_answers_travel() -> None:
     assert world.pinger.pause_ns(5_000_000) == 5_000_000
 
 
-def pong(**facts: object) -> Pong:
+def make_pong(**facts: object) -> Pong:
     return Pong(**{"member": "s", "boot": 7, "clock": "c", "came_ns": 0, "left_ns": 0, **facts})
 
 
 STRANGERS = {
     "garbage": b"\xc1",
-    "of another boot": encode(pong(boot=8)),
-    "of another member": encode(pong(member="m2")),
-    "of another version": encode(pong(v=VERSION + 1)),
-    "left before it came": encode(pong(came_ns=5, left_ns=4)),
-    "held longer than it was away": encode(pong(came_ns=0, left_ns=10**15)),
+    "of another boot": encode(make_pong(boot=8)),
+    "of another member": encode(make_pong(member="m2")),
+    "of another version": encode(make_pong(v=VERSION + 1)),
+    "left before it came": encode(make_pong(came_ns=5, left_ns=4)),
+    "held longer than it was away": encode(make_pong(came_ns=0, left_ns=10**15)),
     "beyond any clock": msgspec.msgpack.encode(
-        {**msgspec.structs.asdict(pong()), "came_ns": 2**62}
+        {**msgspec.structs.asdict(make_pong()), "came_ns": 2**62}
     ),
 }
 
@@ -182,7 +182,7 @@ def test_stepping_clocks_are_unknown_until_messages_agree() -> None:
     for n in range(PINGS):
         trips.receive(
             n * STEP_NS,
-            pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50),
+            make_pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50),
             n * STEP_NS + 100,
         )
     assert trips.is_known
@@ -191,7 +191,7 @@ def test_stepping_clocks_are_unknown_until_messages_agree() -> None:
     for n in range(PINGS, PINGS + PINGS_PER_WINDOW):
         at_ns = n * STEP_NS
         came_ns = at_ns + 50 + far_ns * (n % 2)
-        trips.receive(at_ns, pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
+        trips.receive(at_ns, make_pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
     assert not trips.is_known
     assert trips.latest == before
 

@@ -218,8 +218,8 @@ class Wire:
 
     def __init__(self, place: str) -> None:
         self.place, self.said, self._kept = place, list[str](), list[Any]()
-        self.router = opened("router", place)
-        self.stranger = opened("client", place)
+        self.router = open_zenoh("router", place)
+        self.stranger = open_zenoh("client", place)
         self.graph = Ros2Graph(
             Refusals(self.said.append), [place], "play", "trilat", SystemClock()
         )
@@ -245,7 +245,7 @@ class Wire:
         self.router.close()
 
 
-def opened(mode: ZenohMode, place: str) -> Any:
+def open_zenoh(mode: ZenohMode, place: str) -> Any:
     ends = ([], [place]) if mode == "client" else ([place], [])
     return zenoh.open(zenoh.Config.from_json5(json.dumps(make_zenoh_config(*ends, mode))))
 
@@ -336,9 +336,9 @@ def test_returning_routers_carry_every_topic_again(wire: Wire) -> None:
         wire.stranger.close()
         wire.router.close()
         until(lambda: not wire.graph.connected)
-        wire.router = opened("router", wire.place)
+        wire.router = open_zenoh("router", wire.place)
         until(lambda: wire.graph.connected)
-        wire.stranger = opened("client", wire.place)
+        wire.stranger = open_zenoh("client", wire.place)
         now = wire.hears("0/a/**")
         until(lambda: plain.has_subscribers)
         plain.put(b"now")
@@ -351,7 +351,7 @@ def test_returning_routers_carry_every_topic_again(wire: Wire) -> None:
 def test_peers_forward_nothing_and_name_the_cure() -> None:
     (endpoint,) = find_free_endpoints(1)
     with (
-        closing(opened("peer", endpoint)),
+        closing(open_zenoh("peer", endpoint)),
         pytest.raises(UsageError, match=r"is not a router.*rmw_zenohd"),
     ):
         Ros2Graph(Refusals(print), [endpoint], "play", "trilat", SystemClock())

@@ -36,7 +36,7 @@ RATE_HZ = 200
 NAMES = ("a", "b")
 
 
-def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> PeerSample:
+def make_sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> PeerSample:
     rest = {"q": [0, 0], "qd": [0, 0], "tau_x": [0, 0]}
     return PeerSample(
         v=VERSION, site="x", boot=1, tick=tick, sent_ns=sent_ns, echo=echo or [], **rest
@@ -107,7 +107,7 @@ class Session:
             self.step[n] = self.step_at[n][1]
         now_ns = site.clock.monotonic_ns() + self.step[n]
         echo = [list(entry) for entry in site.timing.pop_echo()]
-        sent = sample(k, site.timing.record_sent(k, now_ns), echo)
+        sent = make_sample(k, site.timing.record_sent(k, now_ns), echo)
         if k % (RATE_HZ // 10) == 0:
             site.stats.append(site.timing.pop_measurements(now_ns))
             site.news += site.timing.update_clocks(k + 1, now_ns)
@@ -201,14 +201,16 @@ def test_stepping_clocks_are_faults_and_found_again(step_ns: int) -> None:
         assert abs(last["offset_ns"] - sign * (3 * S + step_ns)) <= last["bound_ns"]
 
 
-def meter(estimator: OffsetEstimator | None = None) -> tuple[LinkTimingMonitor, SentStamps]:
+def make_meter(
+    estimator: OffsetEstimator | None = None,
+) -> tuple[LinkTimingMonitor, SentStamps]:
     sent_stamps = SentStamps(8)
     return LinkTimingMonitor(
         PeerClock("b", 1000, 3, exact_offset(0), estimator), sent_stamps
     ), sent_stamps
 
 
-def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
+def read_figures(link: LinkTimingMonitor) -> tuple[int, ...]:
     measured = link.pop_measurements(0)
     return tuple(
         measured[name] for name in ("delay_us", "delay_max_us", "rtt_us", "clock_faults")
@@ -216,30 +218,30 @@ def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
 
 
 def test_on_one_clock_delays_are_exact() -> None:
-    link, sent = meter()
+    link, sent = make_meter()
     sent.record(7, 5_000)
-    assert link.receive(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
-    assert figures(link) == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
+    assert link.receive(make_sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
+    assert read_figures(link) == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
     assert link.close_window(10**12, 10**12) is None
     assert link.offset.bound_ns == 0
 
 
 def test_echoes_of_forgotten_stamps_are_ignored() -> None:
-    link, sent = meter()
+    link, sent = make_meter()
     for tick in range(20):
         sent.record(tick, tick)
-    link.receive(sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
+    link.receive(make_sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
     assert link.pop_measurements(0)["rtt_us"] == -1
     assert sent.find_ns(12) == 12
     assert sent.find_ns(11) is None
 
 
 def test_figures_cover_windows_and_faults_cover_everything() -> None:
-    link, _ = meter()
+    link, _ = make_meter()
     for n, delay_ns in enumerate((3_000, 1_000, 900_000, -5_000)):
-        link.receive(sample(n, 0), 1000 + delay_ns)
-    assert figures(link) == (3, 900, -1, 1)
-    assert figures(link) == (-1, -1, -1, 1)
+        link.receive(make_sample(n, 0), 1000 + delay_ns)
+    assert read_figures(link) == (3, 900, -1, 1)
+    assert read_figures(link) == (-1, -1, -1, 1)
     assert link.worst_ns == 5_000
 
 
@@ -248,20 +250,20 @@ def test_the_newest_sample_is_echoed_once() -> None:
     timing = SiteTiming(0, 1000, peers, "a")
     one, two = timing.monitors
     for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
-        one.receive(sample(tick, 0), at_ns)
-    two.receive(sample(9, 0), 80)
+        one.receive(make_sample(tick, 0), at_ns)
+    two.receive(make_sample(9, 0), 80)
     assert timing.pop_echo() == [(0, 6, 60), (1, 9, 80)]
     assert timing.pop_echo() == []
 
 
 def test_the_first_windows_are_short() -> None:
     estimator = OffsetEstimator()
-    link, sent = meter(estimator)
+    link, sent = make_meter(estimator)
     closed = []
     for n in range(400):
         now_ns = n * 10_000_000
         sent.record(n, now_ns)
-        link.receive(sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
+        link.receive(make_sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
         if link.close_window(now_ns + 600, now_ns + 600):
             closed.append(now_ns)
     assert closed[:FIRST_WINDOWS] == [FIRST_WINDOW_NS * (n + 1) for n in range(FIRST_WINDOWS)]
@@ -271,7 +273,7 @@ def test_the_first_windows_are_short() -> None:
 def test_members_on_the_leaders_clock_need_no_steering() -> None:
     timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, exact_offset(0), None)], "a")
     for k in range(0, 5000, 100):
-        timing.monitors[0].receive(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
+        timing.monitors[0].receive(make_sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
         assert timing.update_clocks(k + 1, 5 + k * 1_000_000 + 400_000) == []
     assert timing.schedule.due_ns(10_000) == 5 + 10 * S
     assert timing.schedule.slew == 0.0

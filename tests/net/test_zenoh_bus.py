@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.net.networks import make_encrypted_mesh
 from trilat_net.errors import UsageError
 from trilat_net.net.connection import find_free_endpoints, is_loopback
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
-from .networks import Routed, encrypted, meet
+from .networks import Routed, meet
 from .waiting import query_once, received, until
 
 
@@ -63,7 +64,9 @@ def test_strangers_without_certificate_stay_outside(tmp_path: Path) -> None:
     """
     for folder in ("ours", "theirs"):
         (tmp_path / folder).mkdir()
-    ours, theirs = (encrypted("tls", tmp_path / folder) for folder in ("ours", "theirs"))
+    ours, theirs = (
+        make_encrypted_mesh("tls", tmp_path / folder) for folder in ("ours", "theirs")
+    )
     (endpoint,) = (
         free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
     )
@@ -144,7 +147,7 @@ def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_messages_travel_over_quic(tmp_path: Path) -> None:
-    network = encrypted("quic", tmp_path)
+    network = make_encrypted_mesh("quic", tmp_path)
     try:
         sender, receiver = network.join(), network.join()
         inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")

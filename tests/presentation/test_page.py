@@ -52,7 +52,7 @@ class Page(HTMLParser):
         self.texts.setdefault(self.elements[-1][0] if self.elements else "", []).append(data)
 
 
-def read(html):
+def read_page(html):
     """Returns the page, and the data of its charts."""
     data = re.search(
         r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL
@@ -60,11 +60,11 @@ def read(html):
     return html, json.loads(data)
 
 
-def page(log, twin=None):
-    return read(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
+def render_page(log, twin=None):
+    return read_page(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
 
 
-def column(table, n):
+def read_column(table, n):
     return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
 
 
@@ -85,7 +85,7 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
     facts = json.loads(paths[1].read_text())
     assert facts["checks"] == [verdict.to_row() for verdict in VERDICTS]
     assert facts["certificate"]["verdict"] == "rose"
-    html, data = read(paths[0].read_text(encoding="utf-8"))
+    html, data = read_page(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000
     body = html[html.index("</h1>") :]
     assert 0 < body.index('id="verdict"') < body.index("✗ Failed: ") < body.index('id="arms"')
@@ -98,7 +98,7 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
 
 
 def test_the_page_asks_nothing_of_any_network():
-    html, _ = page(add_clock_readings(make_short_log("four")))
+    html, _ = render_page(add_clock_readings(make_short_log("four")))
     seen = Page(html)
     for tag, attrs in seen.elements:
         assert tag not in ("link", "img", "iframe", "object", "base", "form")
@@ -117,7 +117,7 @@ def test_the_page_asks_nothing_of_any_network():
 
 def test_texts_of_a_scenario_stay_texts():
     log = make_short_log("four")
-    html, _ = page(log)
+    html, _ = render_page(log)
     seen = Page(html)
     assert sum(tag == "script" for tag, _ in seen.elements) == 3  # data, library, page
     assert not [tag for tag, _ in seen.elements if tag == "i"]
@@ -140,24 +140,24 @@ def test_a_page_holds_one_tick_spikes():
         )
 
     log = rewrite_log(make_short_log("paper"), change=spike)
-    _, data = page(log)
+    _, data = render_page(log)
     chart = next(c for c in data["charts"] if c["title"] == "s, joint 1")
     series = chart["series"][0]
     table = data["tables"][series["table"]]
-    values = column(table, series["column"])
+    values = read_column(table, series["column"])
     ticks = np.frombuffer(base64.b64decode(table["tick"]), "<i4")
     assert values.max() == 9.5
     assert ticks[values.argmax()] == 123
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
-        values = column(data["tables"][series["table"]], series["column"])
+        values = read_column(data["tables"][series["table"]], series["column"])
         assert values == pytest.approx(
             site_signals.joint_errors(log[site])[:, 1], rel=1e-6, abs=1e-12
         )
 
 
 def test_the_page_describes_links_and_events():
-    html, data = page(make_busy_run().log)
+    html, data = render_page(make_busy_run().log)
     assert (
         "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms"
         in html
@@ -185,7 +185,7 @@ def test_the_page_describes_links_and_events():
 
 
 def test_pages_of_plain_logs_have_nothing_superfluous():
-    html, data = page(make_short_log("paper"))
+    html, data = render_page(make_short_log("paper"))
     assert data["changes"] == []
     assert set(map(len, data["spans"].values())) == {0}
     assert not [c for c in data["charts"] if c["section"] == "delays"]
@@ -215,7 +215,7 @@ def test_nearly_empty_logs_have_reports(sites, tmp_path):
 @pytest.mark.parametrize("name", ["paper", "four"])
 def test_error_chart_names_its_floor(name):
     log = make_short_log(name)
-    _, data = page(log)
+    _, data = render_page(log)
     errors = [site_signals.largest_magnitude(log[site].e).min() for site in log.sites]
     chart = next(c for c in data["charts"] if c["section"] == "overview")
     assert chart["title"] == "Largest error |e| by site"
@@ -226,7 +226,7 @@ def test_error_chart_names_its_floor(name):
 
 def test_a_diverged_run_has_a_page():
     log = make_diverged_log()
-    html, _ = page(log)
+    html, _ = render_page(log)
     assert '<th scope="row">diverged</th><td>yes</td>' in html
     assert f"m1 diverged: {log.describe_divergence('m1')}." in html
 

@@ -39,11 +39,13 @@ WRONG = Finding("executed again", "7/8 records identical; 1 differs", passed=Fal
 
 
 @cache
-def short_log() -> Log:
+def make_paper_log() -> Log:
     return make_run("paper", {"duration_s": 2.0, "rate_hz": 100}).log
 
 
-def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certificate:
+def make_certificate(
+    behaviour: EndBehaviour, error_rad: float, **fields: object
+) -> Certificate:
     """Returns a certificate of a run with a proof, with the given behaviour and error at its end."""
     certificate = make_run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     end = certificate.end._replace(
@@ -53,11 +55,11 @@ def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certif
 
 
 def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> str:
-    return render_verdict(short_log(), certificate, findings)
+    return render_verdict(make_paper_log(), certificate, findings)
 
 
 def test_stable_run_names_its_proof() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 0.0012)
+    certificate = make_certificate(EndBehaviour.CONVERGED, 0.0012)
     assert certificate.stability is Stability.STABLE
     speed_rad_s = certificate.end.end_speed_rad_s
     html = verdict_text(certificate)
@@ -68,7 +70,7 @@ def test_stable_run_names_its_proof() -> None:
 
 
 def test_lasting_errors_are_explained() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
+    certificate = make_certificate(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
     assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
     html = verdict_text(certificate)
     speed_rad_s = certificate.end.end_speed_rad_s
@@ -80,25 +82,25 @@ def test_lasting_errors_are_explained() -> None:
 def test_pushing_hands_are_named() -> None:
     log = make_short_log("paper")
     pushed = rewrite_log(log, change=lambda row: replace_fields(row, tau_x=[1.0, 0.0]))
-    html = render_verdict(pushed, judge(EndBehaviour.CONVERGED, 0.4), ())
+    html = render_verdict(pushed, make_certificate(EndBehaviour.CONVERGED, 0.4), ())
     assert "not that errors vanish: hands or walls still push m1, m2 and s." in html
 
 
 def test_calm_end_of_unstable_loop_is_explained() -> None:
     growing = LoopRoots("unstable", 0.1, True, "this rest: unstable, +0.1 /s")
-    html = verdict_text(judge(EndBehaviour.CONVERGED, 0.0, roots=growing))
+    html = verdict_text(make_certificate(EndBehaviour.CONVERGED, 0.0, roots=growing))
     assert "Not stable" in html
     assert "This motion is small, but grows from small disturbances." in html
 
 
 def test_small_oscillation_is_not_called_settled() -> None:
-    html = verdict_text(judge(EndBehaviour.BOUNDED, 0.001, roots=None))
+    html = verdict_text(make_certificate(EndBehaviour.BOUNDED, 0.001, roots=None))
     assert "Not stable" in html
     assert "All errors were small then, but they do not die away." in html
 
 
 def test_an_open_run_names_its_first_reason() -> None:
-    certificate = judge(EndBehaviour.HARDLY, 0.2, roots=None)
+    certificate = make_certificate(EndBehaviour.HARDLY, 0.2, roots=None)
     assert certificate.stability is Stability.OPEN
     text = describe_basis(certificate)
     assert certificate.reasons[0] in text
@@ -106,7 +108,7 @@ def test_an_open_run_names_its_first_reason() -> None:
 
 
 def test_failed_check_puts_judgement_in_doubt() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 0.0)
+    certificate = make_certificate(EndBehaviour.CONVERGED, 0.0)
     assert "failed a check" not in verdict_text(certificate, [PASSED, EXACT])
     html = verdict_text(certificate, [PASSED, WRONG])
     assert "The log failed a check" in html

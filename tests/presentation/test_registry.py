@@ -33,12 +33,12 @@ WALLED = {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 20}
 
 
 @cache
-def walled():
+def simulate_walled():
     return trilat_net.simulate("contact", WALLED)
 
 
 @cache
-def example(name):
+def make_example_log(name):
     """Returns a log that has data for a figure: changes and marks if possible."""
     if name in ("operation", "operator_torques", "hands_moved"):
         return make_short_log("paper")
@@ -46,12 +46,12 @@ def example(name):
         return trilat_net.simulate(
             "two_sites", {"control.law": "tanks", "scheme": "digital", "duration_s": 0.3}
         )
-    return walled() if name == "contact" else add_clock_readings(make_busy_run().log)
+    return simulate_walled() if name == "contact" else add_clock_readings(make_busy_run().log)
 
 
 @cache
 def draw_example(name, width_in):
-    return figure(example(name), name, width_in)
+    return figure(make_example_log(name), name, width_in)
 
 
 @pytest.mark.parametrize(
@@ -105,14 +105,16 @@ def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
 def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
     first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
     for path in (first, second):
-        write_figure(figure(walled(), "contact"), path, FigureSize.for_print(COLUMN_IN).dpi)
+        write_figure(
+            figure(simulate_walled(), "contact"), path, FigureSize.for_print(COLUMN_IN).dpi
+        )
     assert first.read_bytes() == second.read_bytes()
     if kind == "png":
         assert int.from_bytes(first.read_bytes()[16:20], "big") == 2100  # 600 dots per inch
 
 
 def test_logs_have_the_figures_they_support():
-    have = set(list_drawable_figures(walled()))
+    have = set(list_drawable_figures(simulate_walled()))
     assert {"contact", "operation", "positions"} <= have
     assert (
         not {
@@ -138,7 +140,7 @@ def test_wall_force_equals_the_recorded_torque():
     """J'F of the drawn force along the normal is the recorded torque ON the arm, because no
     other force acts.
     """
-    log = walled()
+    log = simulate_walled()
     part, wall = log["s"], log.scenario.sites["s"].environment[0]
     above = joint_motion.draw_contact(log).axes[0]
     t_s, force = above.lines[0].get_data()
@@ -164,16 +166,16 @@ def test_wall_force_equals_the_recorded_torque():
 )
 def test_impossible_figures_are_refused_beforehand(names, options, said, tmp_path):
     with pytest.raises(UsageError, match=said):
-        write_figures(walled(), tmp_path / "new", ["positions", *names], **options)
+        write_figures(simulate_walled(), tmp_path / "new", ["positions", *names], **options)
     assert not (tmp_path / "new").exists()
 
 
 def test_files_are_replaced_only_by_force(tmp_path):
-    (path,) = write_figures(walled(), tmp_path, ["contact"], formats=["pdf"])
+    (path,) = write_figures(simulate_walled(), tmp_path, ["contact"], formats=["pdf"])
     data = path.read_bytes()
     with pytest.raises(UsageError, match="exists"):
-        write_figures(walled(), tmp_path, ["contact"], formats=["svg", "pdf"])
+        write_figures(simulate_walled(), tmp_path, ["contact"], formats=["svg", "pdf"])
     assert not path.with_suffix(".svg").exists()
     path.write_bytes(b"")
-    write_figures(walled(), tmp_path, ["contact"], formats=["pdf"], force=True)
+    write_figures(simulate_walled(), tmp_path, ["contact"], formats=["pdf"], force=True)
     assert path.read_bytes() == data

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.log.programs import RERUN, printed
+from tests.log.programs import RERUN, run_program
 from tests.log.standard_files import SCENARIO
 from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.files import format_extra_install
@@ -58,14 +58,14 @@ def run_viewer(
     return rerun, said
 
 
-def never() -> Log:
+def fail_to_read() -> Log:
     raise AssertionError("it was read")
 
 
 @pytest.mark.long
 def test_finished_logs_with_views_are_opened_directly(files: dict[str, Path]) -> None:
     rerun = Rerun()
-    open_rerun([files["live"]], never, ViewerOptions(web=True), lambda _: None, rerun)
+    open_rerun([files["live"]], fail_to_read, ViewerOptions(web=True), lambda _: None, rerun)
     assert rerun.log == files["live"]
     assert rerun.command[:3] == [sys.executable, "-m", "rerun"]
     assert rerun.command[rerun.command.index("--bind") + 1] == "127.0.0.1"
@@ -150,14 +150,16 @@ def test_rerun_takes_log_and_layout_into_one_recording(
 ) -> None:
     """The program itself: the layout is of the log's own application, so that Rerun applies it."""
     recording = tmp_path / "run.rrd"
-    open_rerun([files["live"]], never, ViewerOptions(save=recording), lambda _: None)
-    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
+    open_rerun([files["live"]], fail_to_read, ViewerOptions(save=recording), lambda _: None)
+    text = run_program(*RERUN, "rrd", "print", "-vvv", str(recording))
     stores = set(re.findall(r'(Blueprint|Recording),\s*"([^"]+)"', text))
     assert stores == {("Blueprint", "live"), ("Recording", "live")}
     assert [name for name in read_ros2_channels(files["live"]) if name not in text] == []
 
 
-def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:
+def build_layouts(
+    files: dict[str, Path],
+) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:
     return {
         kind: (read_ros2_channels(path), build_plot_layout(read_ros2_channels(path)))
         for kind, path in files.items()
@@ -165,7 +167,7 @@ def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], Pl
 
 
 def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
-    for channels, panels in boards(files).values():
+    for channels, panels in build_layouts(files).values():
         for page in panels.pages.values():
             for plot in (plot for row in page for plot in row):
                 for entity, names, visible in plot.curves:
@@ -176,7 +178,7 @@ def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
 
 
 def test_sites_are_columns_and_quantities_rows(files: dict[str, Path]) -> None:
-    channels, panels = boards(files)["live"]
+    channels, panels = build_layouts(files)["live"]
     assert list(panels.pages) == ["Motion", "Speeds, estimates", "Links, timing"]
     for page in panels.pages.values():
         for row in page:
@@ -191,7 +193,7 @@ def test_sites_are_columns_and_quantities_rows(files: dict[str, Path]) -> None:
 def test_a_bag_shows_the_reference_beside_the_joints(
     files: dict[str, Path],
 ) -> None:
-    of = boards(files)
+    of = build_layouts(files)
     bag, views = of["bag"][1].pages["Motion"], of["live"][1].pages["Motion"]
     assert [c.entity for c in bag[0][0].curves] == [
         "/lab/m/joint_states/position",
@@ -207,7 +209,7 @@ def test_a_bag_shows_the_reference_beside_the_joints(
 
 
 def test_missing_quantities_take_no_room(files: dict[str, Path]) -> None:
-    rows = boards(files)["virtual"][1].pages["Links, timing"]
+    rows = build_layouts(files)["virtual"][1].pages["Links, timing"]
     assert [row[0].title for row in rows] == ["m: age of samples in use, by peer (ms)"]
     assert build_plot_layout({}) == PlotLayout({}, "")
     assert (
@@ -219,7 +221,7 @@ def test_missing_quantities_take_no_room(files: dict[str, Path]) -> None:
 
 
 def test_two_dimensional_numbers_are_named_by_both(files: dict[str, Path]) -> None:
-    delays = boards(files)["live"][1].pages["Links, timing"][1]
+    delays = build_layouts(files)["live"][1].pages["Links, timing"][1]
     assert delays[0].curves[0].names == ("s median", "s max")
 
 

@@ -42,7 +42,9 @@ def answer_info(name: str, **facts: object) -> Info:
     return parties.answer_info(name, BOOTS[name], **{**scenario, **facts})
 
 
-def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:
+def encode_states(
+    name: str, boot: int | None = None, scenario: Scenario = SCENARIO
+) -> list[bytes]:
     site = Site(scenario.setup(name))
     boot = BOOTS[name] if boot is None else boot
     return [
@@ -51,21 +53,21 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
     ]
 
 
-def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
+def encode_statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
     site = Site(scenario.setup(name))
     stats = LoopStats(site, BOOTS[name]).pop_stats(site.step(TickInput(0)))
     t_ns = tick * S // scenario.sites[name].rate_hz
     return encode(msgspec.structs.replace(stats, tick=tick, t_ns=t_ns))
 
 
-def happening(name: str, n: int, kind: str = "mode", **facts: object) -> bytes:
+def encode_event(name: str, n: int, kind: str = "mode", **facts: object) -> bytes:
     event = Event(member=name, boot=BOOTS[name], kind=kind, text=kind, t_ns=n * MS, n=n)
     return encode(msgspec.structs.replace(event, **facts))
 
 
-def end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> bytes:
+def encode_end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> bytes:
     boot = BOOTS[name] if boot is None else boot
-    return happening(name, n, "end", boot=boot, t_ns=50 * MS, ticks=ticks)
+    return encode_event(name, n, "end", boot=boot, t_ns=50 * MS, ticks=ticks)
 
 
 class Memory:
@@ -159,9 +161,9 @@ class Desk:
 
     def whole(self, *names: str) -> None:
         for name in names:
-            self.take(name, topics.STATE, *states(name))
-            self.take(name, topics.LINK, statistics(name))
-            self.take(name, topics.EVENT, end(name))
+            self.take(name, topics.STATE, *encode_states(name))
+            self.take(name, topics.LINK, encode_statistics(name))
+            self.take(name, topics.EVENT, encode_end(name))
 
     def over(self) -> bool:
         return self.recording.is_over(self.clock.monotonic_ns())

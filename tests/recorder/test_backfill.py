@@ -13,35 +13,24 @@ from hypothesis import strategies as st
 
 from recorder.backfill import ANSWER_NS, GIVE_UP_NS, MAX_VAIN_REQUESTS, SILENT_NS
 from tests.net.manual_clock import ManualClock
+from tests.recorder.desk import encode_event, encode_states, encode_statistics
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, RecorderStats, State
 from trilat_net.net.requests import BACKFILL_MESSAGES, Backfill
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import load_scenario
 
-from .desk import (
-    BOOTS,
-    MONO_NS,
-    MS,
-    SESSION,
-    UNIX_NS,
-    Desk,
-    Memory,
-    S,
-    happening,
-    states,
-    statistics,
-)
+from .desk import BOOTS, MONO_NS, MS, SESSION, UNIX_NS, Desk, Memory, S
 
 SLOW = load_scenario("two_sites", {"duration_s": 2.0, "rate_hz": 100})
 TICKS = SLOW.ticks("m")
 EVERY = 10
 MADE = {
-    "state": states("m", scenario=SLOW),
-    "link": [statistics("m", k, SLOW) for k in range(0, TICKS, EVERY)],
+    "state": encode_states("m", scenario=SLOW),
+    "link": [encode_statistics("m", k, SLOW) for k in range(0, TICKS, EVERY)],
     "event": [
-        *(happening("m", n, "mode") for n in range(8)),
-        happening("m", 8, "end", ticks=TICKS, t_ns=2 * S),
+        *(encode_event("m", n, "mode") for n in range(8)),
+        encode_event("m", 8, "end", ticks=TICKS, t_ns=2 * S),
     ],
 }
 SENT = sorted(

@@ -17,7 +17,7 @@ from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase
 
 
-def link(keys: dict[str, Any]) -> LinkBase:
+def load_link(keys: dict[str, Any]) -> LinkBase:
     loaded: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
     return loaded
 
@@ -31,7 +31,7 @@ def refused(keys: dict[str, Any]) -> ScenarioError:
 
 @given(keys=links())
 def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
-    loaded = link(keys)
+    loaded = load_link(keys)
     mean_ms, deviation_ms = loaded.moments()
     if not loaded.measured and not math.isnan(mean_ms):
         assert 0.0 <= mean_ms <= MAX_DELAY_US / 1000
@@ -47,7 +47,7 @@ def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
 @given(keys=links())
 def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
-    loaded = link(keys)
+    loaded = load_link(keys)
     model = loaded.to_core_model()
     assert all(
         0.0 <= p <= 1.0 + 1e-12
@@ -71,15 +71,15 @@ def test_links_are_described_in_few_words() -> None:
         "outages_s": [[1, 2.5]],
         "order": "in_order",
     }
-    description = link(
+    description = load_link(
         {"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}
     ).describe()
     assert description == (
         "gamma 40 +- 10 ms, loss 5 % in bursts of 8, duplicates 1 %, cut 1-2.5 s, in order, play-out 80 ms"
     )
-    assert link({"model": "none"}).describe() == "no delay"
-    assert link({"delay_ms": 200}).describe() == "200 ms"
-    assert link({"model": "measured", "loss": 1}).describe() == "measured, loss 100 %"
+    assert load_link({"model": "none"}).describe() == "no delay"
+    assert load_link({"delay_ms": 200}).describe() == "200 ms"
+    assert load_link({"model": "measured", "loss": 1}).describe() == "measured, loss 100 %"
 
 
 def test_a_table_with_a_model_begins_anew() -> None:
@@ -236,4 +236,4 @@ def test_extreme_numbers_are_refused_or_have_moments(
 
 
 def test_traces_may_reach_the_limit() -> None:
-    assert link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None
+    assert load_link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None

@@ -6,7 +6,7 @@ import pytest
 
 import trilat_net
 from tests.scenario.builders import make_six_joint_scenario
-from tests.unit_arm import unit_scenario
+from tests.unit_arm import make_unit_scenario
 from trilat_net.app.cli.options import list_laws
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
@@ -193,7 +193,7 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
 def test_a_check_names_shares_without_effect(
     law: dict[str, object], more: dict[str, object], expected: list[str]
 ) -> None:
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         {"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more}
     )
     lines = [
@@ -206,7 +206,7 @@ def test_a_check_names_shares_without_effect(
 
 def test_lines_share_by_site_and_average_b() -> None:
     law = {"law": "wave", "b": [6.0, 3.0]}
-    scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
+    scenario = make_unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
     total = np.zeros(2)
     for name, one in zip(scenario.names, scenario.controls, strict=True):
         lines = np.array([one.find_impedances(name, peer) for peer in scenario.peers(name)])

@@ -10,7 +10,7 @@ from trilat_net.scenario import Expect, load_scenario, parse_scenario, read_temp
 from trilat_net.scenario.expect import ExpectWindow, find_expect_problem, window_quantities
 
 
-def with_expect(**keys: Any) -> Expect:
+def load_expect(**keys: Any) -> Expect:
     return load_scenario("free", {f"expect.{key}": value for key, value in keys.items()}).expect
 
 
@@ -56,7 +56,7 @@ def test_impossible_expectations_are_refused_with_their_key(
     key: str, value: Any, facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as error:
-        with_expect(**{"peak_error_max_rad": 2.0, key: value})
+        load_expect(**{"peak_error_max_rad": 2.0, key: value})
     for fact in facts:
         assert fact in str(error.value)
 
@@ -108,7 +108,7 @@ def test_invalid_windows_are_refused_with_their_key(
     changes: dict[str, Any], facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as error:
-        with_expect(windows=[{**WINDOW, **changes}])
+        load_expect(windows=[{**WINDOW, **changes}])
     for fact in facts:
         assert fact in str(error.value)
 
@@ -118,7 +118,7 @@ def test_an_empty_window_is_refused() -> None:
         ScenarioError,
         match=r"expect.windows\[0\]: expects nothing; the possible keys are error_peak_rad",
     ):
-        with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
+        load_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 
 
 def test_template_names_every_key_with_valid_values() -> None:
@@ -153,7 +153,7 @@ def test_windows_have_quantities_of_all_joints() -> None:
     with pytest.raises(
         ScenarioError, match=r"windows\[0\].q6_rad: there is no such joint: .* has 2"
     ):
-        with_expect(windows=[window])
+        load_expect(windows=[window])
 
 
 def test_windows_may_name_joints() -> None:

@@ -27,7 +27,7 @@ LINK = {"at_s": 8.0, "link": "m1->s", "to": {"delay_ms": 350.0}}
 ROW = {"at_s": 10.0, "dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 2.0}
 
 
-def scripted(*changes: Any, **overrides: Any) -> Scenario:
+def make_scripted_scenario(*changes: Any, **overrides: Any) -> Scenario:
     return load_scenario("paper", {"timeline": list(changes), **overrides})
 
 
@@ -38,7 +38,9 @@ def refused(*changes: Any, **overrides: Any) -> ScenarioError:
 
 
 def test_link_changes_hold_from_then_on() -> None:
-    setup = scripted(LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}).setup("s")
+    setup = make_scripted_scenario(
+        LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}
+    ).setup("s")
     assert setup.links[0].models == (
         LinkModel(location=200_000.0),
         LinkModel(from_ns=8 * S, location=350_000.0),
@@ -48,7 +50,9 @@ def test_link_changes_hold_from_then_on() -> None:
 
 
 def test_a_change_of_shares_is_a_ramp() -> None:
-    scenario = scripted(LINK, ROW, {"at_s": 11, "dominance": "s", "to": {"m2": 1}})
+    scenario = make_scripted_scenario(
+        LINK, ROW, {"at_s": 11, "dominance": "s", "to": {"m2": 1}}
+    )
     assert scenario.setup("s").ramps == (
         DominanceRamp(10 * S, 12 * S, (0.9, 0.1)),
         DominanceRamp(11 * S, 11 * S, (0.0, 1.0)),
@@ -67,7 +71,7 @@ def test_changes_keep_unnamed_keys() -> None:
     first = {"at_s": 1, "link": "m1->s", "to": {"deviation_ms": 5}}
     then = {"at_s": 2, "link": "m1->s", "to": {"preset": "4g"}}
     last = {"at_s": 3, "link": "m1->s", "to": {"model": "measured", "loss": 0.2}}
-    scenario = scripted(first, then, last, link=base)
+    scenario = make_scripted_scenario(first, then, last, link=base)
     assert [change.after.describe() for change in scenario.timeline] == [
         "gamma 50 +- 5 ms, loss 10 %, cut 1-2 s",
         "hyperexponential 53 +- 87.8 ms, cut 1-2 s",
@@ -82,7 +86,7 @@ def test_traces_may_end_but_not_begin() -> None:
         {"at_s": 1, "link": "m1->s", "to": {"loss": 0.5}},
         {"at_s": 2, "link": "m1->s", "to": {"preset": "lan"}},
     ]
-    links_of_s = scripted(*left, link=base).setup("s").links
+    links_of_s = make_scripted_scenario(*left, link=base).setup("s").links
     assert [model.kind for model in links_of_s[0].models] == [
         DelayKind.TRACE,
         DelayKind.TRACE,
@@ -157,7 +161,7 @@ def test_impossible_changes_are_refused_with_path(change: Any, path: str, phrase
 
 
 def test_changes_stand_in_time_order() -> None:
-    assert scripted(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
+    assert make_scripted_scenario(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
     error = refused(ROW, LINK)
     assert error.path == "timeline[1].at_s"
     assert "must not be earlier than the previous change, at 10 s" in error.problem
@@ -168,13 +172,13 @@ def test_changes_stand_in_time_order() -> None:
 # By command.
 
 
-def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
+def resolve_order(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
     return resolve_change(scenario, LinkTables(scenario.links, ()), written, from_ns)
 
 
 def test_commands_hold_from_their_tick_at_receivers() -> None:
     scenario = load_scenario("paper")
-    change = ordered(
+    change = resolve_order(
         scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
     )
     assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
@@ -183,7 +187,7 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
         0,
         LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
     )
-    change = ordered(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
+    change = resolve_order(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
     assert find_owner(change) == "m2"
     assert to_core_change(scenario, change).ramp == DominanceRamp(
         2 * S, 2_500_000_000, (0.0, 1.0)
@@ -195,7 +199,9 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
 def test_recorded_commands_are_restored(to: dict[str, Any], from_ns: int) -> None:
     scenario = load_scenario("paper")
     to.pop("outages_s", None)
-    change = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
+    change = to_core_change(
+        scenario, resolve_order(scenario, {"link": "s->m1", "to": to}, from_ns)
+    )
     assert parse_core_change(scenario, "m1", change.text) == change
     assert change.model is not None
     assert change.model.from_ns == from_ns
@@ -217,7 +223,7 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
         load_scenario("free", {**short, "timeline": [script]}),
     )
     written = {key: value for key, value in script.items() if key != "at_s"}
-    change_made = to_core_change(plain, ordered(plain, written, at_ns))
+    change_made = to_core_change(plain, resolve_order(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
     commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [change_made]}}))
     scripted_run = list(virtual.execute_virtual(planned))
@@ -241,16 +247,16 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
 )
 def test_impossible_orders_are_refused(written: dict[str, Any], phrase: str) -> None:
     with pytest.raises(ScenarioError, match=phrase):
-        ordered(load_scenario("paper"), written)
+        resolve_order(load_scenario("paper"), written)
 
 
 def test_links_with_traces_refuse_unrecordable_orders() -> None:
     scenario = load_scenario("paper", {"link": {"model": "trace", "trace": "0 7000"}})
     with pytest.raises(ScenarioError, match="can be changed only by setting another model"):
-        ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
+        resolve_order(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
     assert (
         to_core_change(
-            scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
+            scenario, resolve_order(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
         ).model
         is not None
     )

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.execution.builders import Trajectories, make_trajectories
-from trilat_net.scenario import load_scenario
+from tests.execution.builders import Trajectories, make_shipped_trajectories
 
 
 def run_shipped(name: str, overrides: dict[str, Any] | None = None) -> Trajectories:
-    return make_trajectories(load_scenario(name, {"expect": {}, **(overrides or {})}))
+    """Returns the records of a shipped scenario without its table `expect`."""
+    return make_shipped_trajectories(name, {"expect": {}, **(overrides or {})})
 
 
 def ages(run: Trajectories) -> np.ndarray:

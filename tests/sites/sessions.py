@@ -214,39 +214,74 @@ class Session:
         return open_log(self.path)
 
 
-def computed(state: State) -> bytes:
-    return msgpack.packb(
-        [
-            *(
-                state.site,
-                state.tick,
-                state.t_ns,
-                state.mode,
-                state.q,
-                state.qd,
-                state.q_des,
-                state.qd_des,
-            ),
-            *(state.tau, state.tau_x, state.theta_hat, state.used, state.ch),
-        ]
-    )
+COMPUTED = (
+    "site",
+    "tick",
+    "t_ns",
+    "mode",
+    "q",
+    "qd",
+    "q_des",
+    "qd_des",
+    "tau",
+    "tau_x",
+    "theta_hat",
+    "used",
+    "ch",
+)
+"""Fields of a record that a site computes."""
 
 
-def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
+def run_session(
+    scenario: Scenario, folder: Path, orders: Sequence[tuple[float, str]] = ()
+) -> tuple[Log, dict[str, object]]:
+    """Returns the log of a session of all sites and a recorder, and how each site ended.
+
+    Args:
+        scenario: The scenario of the session.
+        folder: Folder of the log.
+        orders: Times, in s after the start, and orders that the site `s` gets then.
+    """
+    ends: dict[str, object] = {}
+    session = Session.whole(scenario, folder, ends=ends)
+
+    def give_orders(bus: Bus, clock: Clock) -> None:
+        start_ns = clock.monotonic_ns()
+        for at_s, order in orders:
+            clock.sleep_until(start_ns + int(at_s * 1e9))
+            reach_session(bus, clock).send_order(["s"], order)
+
+    if orders:
+        session.stranger(give_orders)
+    return session.run(), ends
+
+
+def pack_computed(state: State) -> bytes:
+    """Returns the computed fields of a record as bytes, which are equal if all bits are."""
+    return msgpack.packb([getattr(state, field) for field in COMPUTED])
+
+
+def execute_packed(scenario: Scenario) -> dict[str, list[bytes]]:
+    """Returns the packed records of each site of a run in virtual time."""
     ticks: dict[str, list[bytes]] = {name: [] for name in scenario.names}
     for site, arrivals, output in virtual.execute_virtual(scenario):
         payload = encode_state(site.name, 0, site.peers, output, arrivals, 0, 0)
-        ticks[site.name].append(computed(decode(payload, State)))
+        ticks[site.name].append(pack_computed(decode(payload, State)))
     return ticks
 
 
-def in_log(log: Log) -> dict[str, list[bytes]]:
-    return {name: [computed(state) for state in log[name].states] for name in log.sites}
+def pack_log(log: Log) -> dict[str, list[bytes]]:
+    """Returns the packed records of each site of a log."""
+    return {name: [pack_computed(state) for state in log[name].states] for name in log.sites}
 
 
-def gliding(duration_s: float, scenario: str = "two_sites", **keys: Any) -> Scenario:
+def make_gliding_scenario(
+    duration_s: float, scenario: str = "two_sites", **keys: Any
+) -> Scenario:
+    """Returns a shipped scenario at 200 Hz under the rule `glide`."""
     return load_scenario(scenario, {"duration_s": duration_s, **GLIDE, **keys})
 
 
-def reached(bus: Bus, clock: Clock) -> RunningSession:
+def reach_session(bus: Bus, clock: Clock) -> RunningSession:
+    """Returns the running session as a member of its network sees it."""
     return RunningSession(SESSION, Connection(), bus, clock)

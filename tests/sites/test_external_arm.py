@@ -26,6 +26,7 @@ from tests.log.builders import rewrite_log
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.builders import make_six_joint_scenario
+from tests.sites.sessions import reach_session
 from trilat_net.analysis.file_overview import info, summarise_run
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.core.step.site_step import Site
@@ -44,7 +45,7 @@ from trilat_net.presentation.page_sites import render_loops
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, reached
+from .sessions import SESSION, Session
 
 ARM = {
     "sites.s.plant": "external",
@@ -77,7 +78,7 @@ class Pendulum:
 Act = Callable[[Bus, RelayClock], None]
 
 
-def driving(
+def make_arm_program(
     sent: list[list[float]],
     torques: list[tuple[float, ...]],
     until_ns: int = 2**62,
@@ -111,7 +112,7 @@ def driving(
     return drive
 
 
-def session_of(
+def make_external_session(
     folder: Path, act: Act | None, **overrides: object
 ) -> tuple[Session, dict[str, object]]:
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
@@ -124,7 +125,7 @@ def session_of(
 def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     sent: list[list[float]] = []
     torques: list[tuple[float, ...]] = []
-    session, ends = session_of(tmp_path, driving(sent, torques))
+    session, ends = make_external_session(tmp_path, make_arm_program(sent, torques))
     log = session.run()
     assert ends == {"m": 0, "s": 0}
     records = [[*state.q, *state.qd] for state in log["s"].states]
@@ -137,13 +138,13 @@ def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     assert set(taus[:-1]) <= set(torques)
     moved = abs(log["s"].q[-1] - log["s"].q[0]).max()
     assert moved > 0.05
-    whole(log)
+    assert_reproduced(log)
     assert any("waiting for its arm on trilat/t/s/measured" in line for line in session.said)
     assert any("0.3 rad off q0_rad" in line for line in session.said)
     assert [event.member for event in log.events if event.kind == "arm"] == ["s"]
 
 
-def whole(log: Log) -> None:
+def assert_reproduced(log: Log) -> None:
     """Asserts that the log is executed again, and equals virtual time fed with the log, bit for bit."""
     assert log.complete
     verdict = verify(log)
@@ -165,7 +166,8 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
     session = Session.whole(make_six_joint_scenario(**changes), tmp_path, ends={})
     start = make_six_joint_scenario().sites["s"].q0_rad
     session.stranger(
-        driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000
+        make_arm_program(sent, [], arm=Pendulum(start), senses=True),
+        at_ns=A_SECOND + 200_250_000,
     )
     log = session.run()
     assert set(session.ends.values()) == {0}
@@ -174,14 +176,15 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
         sent[n : n + 300] for n, record_sent in enumerate(sent) if record_sent == records[0]
     ]
     assert abs(log["s"].tau_x).min(axis=0).max() > 0.0
-    whole(log)
+    assert_reproduced(log)
 
 
 def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
     scenario = make_six_joint_scenario(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
     session.stranger(
-        driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND
+        make_arm_program([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)),
+        at_ns=A_SECOND,
     )
 
     def alone(clock: RelayClock) -> None:
@@ -200,7 +203,9 @@ def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def test_silent_arms_are_held_then_in_fault(tmp_path: Path) -> None:
-    session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_300_000_000))
+    session, ends = make_external_session(
+        tmp_path, make_arm_program([], [], until_ns=A_SECOND + 1_300_000_000)
+    )
     log = session.run()
     assert ends == {"m": 0, "s": 0}
     modes = log["s"].mode
@@ -213,7 +218,7 @@ def test_silent_arms_are_held_then_in_fault(tmp_path: Path) -> None:
         re.search("s is in FAULT from .*: its arm is silent", event.text)
         for event in log.events
     )
-    whole(log)
+    assert_reproduced(log)
 
 
 @pytest.mark.parametrize(
@@ -224,7 +229,7 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
     session = Session.whole(scenario, tmp_path, ends={})
-    session.stranger(driving([], [], poses=poses), at_ns=A_SECOND + 200_250_000)
+    session.stranger(make_arm_program([], [], poses=poses), at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].stall(at_ns, int(frozen_s * A_SECOND))
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
@@ -247,14 +252,14 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     assert np.abs(after - before).max() <= 0.01 * np.abs(before).max()
     assert np.abs(np.diff(part.tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log["m"].mode[-1] in ("run", "hold", "return")
-    whole(log)
+    assert_reproduced(log)
 
 
 def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     """Ticks that a late site skipped are named as skipped by sites, recorder, file and links."""
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 1.5})
     session = Session.whole(scenario, tmp_path, ends={})
-    session.stranger(driving([], []), at_ns=A_SECOND + 200_250_000)
+    session.stranger(make_arm_program([], []), at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].stall(2 * A_SECOND, A_SECOND // 100)
     log = session.run()
     skipped = log["s"].skipped
@@ -294,8 +299,8 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
 
 def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
     """Held from 0.2 s to 0.5 s, then silent; again from 0.8 s, and let go at 1.1 s."""
-    session, ends = session_of(
-        tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
+    session, ends = make_external_session(
+        tmp_path, make_arm_program([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
     )
     answers: list[tuple[bool, str]] = []
 
@@ -313,7 +318,7 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             answers.extend(
                 (one.accepted, one.text)
-                for one in reached(bus, clock).send_order(["s"], "enable")
+                for one in reach_session(bus, clock).send_order(["s"], "enable")
             )
 
     session.stranger(hold, at_ns=A_SECOND)
@@ -337,7 +342,7 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
         )
     ]
     assert np.abs(np.diff(log["s"].tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
-    whole(log)
+    assert_reproduced(log)
 
 
 def test_switches_need_external_arms() -> None:
@@ -442,7 +447,7 @@ def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     )
     session = Session.whole(scenario, tmp_path, ends={})
     poses: list[tuple[int, list[float]]] = []
-    drive = driving([], [], poses=poses)
+    drive = make_arm_program([], [], poses=poses)
     session.stranger(drive, at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].dies_ns = 3 * A_SECOND
     session.stranger(drive, at_ns=4 * A_SECOND + 250_000)
@@ -479,7 +484,7 @@ def test_without_an_arm_nothing_begins(tmp_path: Path) -> None:
 
 
 def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
-    session, ends = session_of(tmp_path, driving([], []))
+    session, ends = make_external_session(tmp_path, make_arm_program([], []))
 
     def shout(bus: Bus, clock: RelayClock) -> None:
         other = ArmClient(bus, clock, SESSION, "s")
@@ -495,10 +500,10 @@ def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
     assert abs(log["s"].q).max() < 2.0
     dropped = log.link_stats("s")[-1].dropped
     assert (dropped["stranger"], dropped["malformed"]) == (50, 50)
-    whole(log)
+    assert_reproduced(log)
 
 
-def measurement(**changed: object) -> bytes:
+def encode_measurement(**changed: object) -> bytes:
     fields = {
         "v": VERSION,
         "site": "s",
@@ -531,17 +536,17 @@ class Heard:
         (b"", "malformed"),
         (b"\xc1", "malformed"),
         (bytes(70_000), "oversized"),
-        (measurement(v=VERSION + 1), "version"),
-        (measurement(q=[1.0]), "of 1 joint; the scenario has 2"),
-        (measurement(qd=[1.0]), "malformed"),
-        (measurement(q=[1.0] * 13), "malformed"),
-        (measurement(q=[1.0, math.nan]), "not finite"),
-        (measurement(qd=[math.inf, 0.0]), "not finite"),
-        (measurement(tau_x=[1.0]), "malformed"),
-        (measurement(tau_x=[1.0, math.nan]), "malformed"),
-        (measurement(n=-1), "malformed"),
-        (measurement(more=1), "malformed"),
-        (measurement(site="m"), "stranger"),
+        (encode_measurement(v=VERSION + 1), "version"),
+        (encode_measurement(q=[1.0]), "of 1 joint; the scenario has 2"),
+        (encode_measurement(qd=[1.0]), "malformed"),
+        (encode_measurement(q=[1.0] * 13), "malformed"),
+        (encode_measurement(q=[1.0, math.nan]), "not finite"),
+        (encode_measurement(qd=[math.inf, 0.0]), "not finite"),
+        (encode_measurement(tau_x=[1.0]), "malformed"),
+        (encode_measurement(tau_x=[1.0, math.nan]), "malformed"),
+        (encode_measurement(n=-1), "malformed"),
+        (encode_measurement(more=1), "malformed"),
+        (encode_measurement(site="m"), "stranger"),
     ],
 )
 def test_invalid_measurements_are_counted_and_dropped(payload: bytes, reason: str) -> None:
@@ -554,11 +559,11 @@ def test_invalid_measurements_are_counted_and_dropped(payload: bytes, reason: st
 @given(order=st.permutations(range(8)), bound=st.booleans())
 def test_the_newest_measurement_counts_in_any_order(order: list[int], bound: bool) -> None:
     heard = Heard()
-    heard.hear(measurement(n=0, q=[-0.001, 0.0]))
+    heard.hear(encode_measurement(n=0, q=[-0.001, 0.0]))
     if bound:
         heard.arm.bind((-0.001, 0.0))
     for n in order:
-        heard.hear(measurement(n=n + 1, q=[n / 1000, 0.0]))
+        heard.hear(encode_measurement(n=n + 1, q=[n / 1000, 0.0]))
         assert heard.arm.newest.q[0] == max(order[: order.index(n) + 1]) / 1000
     records = sum(n > max(order[:i], default=-1) for i, n in enumerate(order))
     assert heard.arm.accepted == 1 + records
@@ -567,20 +572,20 @@ def test_the_newest_measurement_counts_in_any_order(order: list[int], bound: boo
 
 def test_a_flood_of_measurements_is_bounded_and_counted() -> None:
     heard = Heard()
-    heard.hear(measurement(n=0))
+    heard.hear(encode_measurement(n=0))
     heard.arm.bind((0.5, 0.25))
-    heard.hear(measurement(n=1), *(measurement(n=n) for n in range(2, 502)))
+    heard.hear(encode_measurement(n=1), *(encode_measurement(n=n) for n in range(2, 502)))
     assert heard.arm.accepted == 1 + MEASUREMENTS_KEPT
-    heard.hear(measurement(n=510))
+    heard.hear(encode_measurement(n=510))
     assert heard.dropped["missing measurement"] == 8
 
 
 def test_restarted_programs_count_until_the_session_begins() -> None:
     heard = Heard()
-    heard.hear(measurement(boot=1, n=900), measurement(boot=2, n=0, q=[2.0, 2.0]))
+    heard.hear(encode_measurement(boot=1, n=900), encode_measurement(boot=2, n=0, q=[2.0, 2.0]))
     assert heard.arm.newest.q == [2.0, 2.0]
     heard.arm.bind((2.0, 2.0))
-    heard.hear(measurement(boot=3, n=0))
+    heard.hear(encode_measurement(boot=3, n=0))
     assert heard.arm.newest.q == [2.0, 2.0]
     assert heard.dropped == {"stranger": 1}
 
@@ -588,7 +593,7 @@ def test_restarted_programs_count_until_the_session_begins() -> None:
 def test_silence_counts_only_hearing_time() -> None:
     """A process that slept for a minute has heard nothing, and knows nothing of the arm."""
     heard = Heard()
-    heard.hear(measurement())
+    heard.hear(encode_measurement())
     heard.arm.bind((0.5, 0.25))
     heard.clock.sleep_until(60 * A_SECOND)
     heard.hear()
@@ -602,22 +607,22 @@ def test_silence_counts_only_hearing_time() -> None:
     assert orders.index("arm_lost") == (SILENCE_LIMIT_NS - 20_000_000) // PERIOD_NS + 1
     assert heard.arm.pop_order(Mode.FAULT) == ""
     assert heard.arm.pop_order(Mode.WAITING) == "arm_lost"  # reset too early
-    heard.hear(measurement(boot=9, n=0))  # its program was started anew
+    heard.hear(encode_measurement(boot=9, n=0))  # its program was started anew
     assert heard.arm.pop_order(Mode.FAULT) == ""
     assert heard.arm.newest.q == [0.5, 0.25]
 
 
 def test_short_silences_end_with_a_measurement() -> None:
     heard = Heard()
-    heard.hear(measurement())
+    heard.hear(encode_measurement())
     heard.arm.bind((0.5, 0.25))
     for _ in range(40):
         heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
         heard.hear()
     assert heard.arm.pop_order(Mode.RUN) == "arm_silent"
-    heard.hear(measurement(boot=9, n=1))
+    heard.hear(encode_measurement(boot=9, n=1))
     assert heard.arm.pop_order(Mode.HOLD) == ""
-    heard.hear(measurement(n=1))
+    heard.hear(encode_measurement(n=1))
     assert heard.arm.pop_order(Mode.HOLD) == "arm_back"
     assert heard.arm.pop_order(Mode.RETURN) == ""
 
@@ -625,16 +630,16 @@ def test_short_silences_end_with_a_measurement() -> None:
 def test_encoder_glitches_count_as_silence() -> None:
     """The arm of two_sites may move at 100 rad/s, 0.1 rad in a period."""
     heard = Heard()
-    heard.hear(measurement(n=0))
+    heard.hear(encode_measurement(n=0))
     heard.arm.bind((0.5, 0.25))
     for n in range(1, 6):
         heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
-        heard.hear(measurement(n=n, q=[1.5, 0.25] if n == 3 else [0.5, 0.25]))
+        heard.hear(encode_measurement(n=n, q=[1.5, 0.25] if n == 3 else [0.5, 0.25]))
         assert heard.arm.newest.q == [0.5, 0.25]
     assert heard.dropped["implausible measurement"] == 1
     for n in range(6, 80):
         heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS // 10)
-        heard.hear(measurement(n=n, q=[40.0, 0.25]))
+        heard.hear(encode_measurement(n=n, q=[40.0, 0.25]))
     assert heard.arm.newest.q == [0.5, 0.25]
     assert heard.dropped["implausible measurement"] == 75
 
@@ -710,7 +715,7 @@ def test_a_missing_site_is_over() -> None:
 
 def test_the_example_of_a_message_is_one() -> None:
     message = ArmMeasurement(site="s", boot=7, n=0, q=[0.5, 0.25], qd=[1.0, 2.0], sent_ns=5)
-    assert encode(message) == measurement(tau_x=[])
+    assert encode(message) == encode_measurement(tau_x=[])
 
 
 def test_the_page_names_every_field_of_a_message() -> None:

@@ -41,7 +41,9 @@ class Felt:
         self.poses: list[tuple[float, ...]] = []
 
 
-def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) -> Any:
+def make_holding_program(
+    site: str, say: Say, felt: Felt, first: int = 12, last: int = 60
+) -> Any:
     """A program that holds an arm, sixty times a second; it lets go at the end of its context."""
 
     def act(bus: Bus, clock: RelayClock) -> None:
@@ -64,10 +66,18 @@ def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) ->
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Felt]:
     made, felt = Session.whole(SCENARIO, tmp_path_factory.mktemp("held")), Felt()
     made.stranger(
-        holding("m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt)
+        make_holding_program(
+            "m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt
+        )
     )
-    made.stranger(holding("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt()))
-    made.stranger(holding("m1", lambda hand, _: hand.move(0.0, 0.0), Felt(), first=30, last=50))
+    made.stranger(
+        make_holding_program("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt())
+    )
+    made.stranger(
+        make_holding_program(
+            "m1", lambda hand, _: hand.move(0.0, 0.0), Felt(), first=30, last=50
+        )
+    )
     return made.run(), felt
 
 
@@ -136,7 +146,7 @@ class Served:
         return HandInForce.read(self.server.track(self._site, self.k))
 
 
-def message(**fields: Any) -> bytes:
+def encode_message(**fields: Any) -> bytes:
     return encode(
         HandMessage(
             **{"site": "m1", "boot": 5, "n": 0, "target": [1.5, 0.5], "sent_ns": 0, **fields}
@@ -148,13 +158,13 @@ def message(**fields: Any) -> bytes:
     ("payload", "reason"),
     [
         (b"\xc1", "hand: malformed"),
-        (message(target=[math.nan, 0.0]), "hand: not finite"),
-        (message(target=[math.inf, 0.0]), "hand: not finite"),
-        (message(target=[1000.0, 0.0]), "hand: out of range"),
-        (message(target=[1e308, 1e308]), "hand: out of range"),
-        (message(target=[1.0, 0.0, 0.0]), "hand: no target of 2 numbers"),
-        (message(target=[], force=[1e9, 0.0]), "hand: no target of 2 numbers"),
-        (message(site="m2"), "hand: stranger"),
+        (encode_message(target=[math.nan, 0.0]), "hand: not finite"),
+        (encode_message(target=[math.inf, 0.0]), "hand: not finite"),
+        (encode_message(target=[1000.0, 0.0]), "hand: out of range"),
+        (encode_message(target=[1e308, 1e308]), "hand: out of range"),
+        (encode_message(target=[1.0, 0.0, 0.0]), "hand: no target of 2 numbers"),
+        (encode_message(target=[], force=[1e9, 0.0]), "hand: no target of 2 numbers"),
+        (encode_message(site="m2"), "hand: stranger"),
         (bytes(70_000), "hand: oversized"),
     ],
 )
@@ -167,10 +177,10 @@ def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -
 def test_floods_are_read_slowly_and_move_nobody() -> None:
     """A hundred messages a tick of others: the holder's arm stays still, and few messages are read."""
     served = Served()
-    served.take(message())
+    served.take(encode_message())
     for k in range(1, 100):
-        flood = [message(boot=100 + n, n=k, target=[9.0, 9.0]) for n in range(100)]
-        hand = served.take(*flood, message(n=k, target=[1.5, 0.5]))
+        flood = [encode_message(boot=100 + n, n=k, target=[9.0, 9.0]) for n in range(100)]
+        hand = served.take(*flood, encode_message(n=k, target=[1.5, 0.5]))
     assert hand.source == 5
     assert hand.number == 99
     assert served.dropped == {ANOTHER_HOLDS: 99 * (MESSAGES_KEPT - 1)}

@@ -5,37 +5,30 @@ from pathlib import Path
 import pytest
 
 from sites.site_parts import warm_up
+from tests.scenario.builders import make_scenario
+from tests.sites.sessions import execute_packed, pack_log, run_session
 from trilat_net.errors import LawFailed
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
-from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
-
-from .sessions import Session, in_log, in_virtual_time
-
-
-def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, object]]:
-    scenario = load_scenario(name, {"duration_s": 0.5, **overrides})
-    session = Session.whole(scenario, folder, ends={})
-    return session.run(), session.ends or {}
 
 
 def test_own_paper_law_has_live_bits(tmp_path: Path) -> None:
     law = {"law": "tests.laws:Adaptive"}
-    log, ends = lived(tmp_path, "two_sites", control=law)
+    scenario = make_scenario("two_sites", duration_s=0.5, control=law)
+    log, ends = run_session(scenario, tmp_path)
     assert ends == {"m": 0, "s": 0}
-    assert in_log(log) == in_virtual_time(log.scenario)
-    assert in_log(log) == in_virtual_time(load_scenario("two_sites", {"duration_s": 0.5}))
+    assert pack_log(log) == execute_packed(log.scenario)
+    assert pack_log(log) == execute_packed(make_scenario("two_sites", duration_s=0.5))
     verdict = verify(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 1000
 
 
 def test_law_messages_equal_those_of_virtual_time(tmp_path: Path) -> None:
-    log, _ = lived(
-        tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3
-    )
-    assert in_log(log) == in_virtual_time(log.scenario)
+    law = {"law": "tests.channel_law:Talking"}
+    log, _ = run_session(make_scenario("paper", duration_s=0.3, control=law), tmp_path)
+    assert pack_log(log) == execute_packed(log.scenario)
     assert verify(log).identical == 900
     assert log["m1"].sent["target[s]"].any()
 
@@ -43,7 +36,8 @@ def test_law_messages_equal_those_of_virtual_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", ["nan", "raises"])
 def test_failing_laws_end_the_session_in_order(how: str, tmp_path: Path) -> None:
     control = {"law": "tests.laws:Failing", "how": how, "at": 250}
-    log, ends = lived(tmp_path, "paper", **{"sites.m2.control": control})
+    scenario = make_scenario("paper", duration_s=0.5, sites__m2__control=control)
+    log, ends = run_session(scenario, tmp_path)
     assert isinstance(ends["m2"], LawFailed)
     text = str(ends["m2"])
     assert text.startswith("the law tests.laws:Failing of m2 failed at tick 250: ")

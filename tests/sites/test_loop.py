@@ -9,6 +9,7 @@ import pytest
 
 from sites.site_loop import PeerInbox, StateBlock, run_loop
 from tests.net.manual_clock import ManualClock
+from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import SessionError
@@ -22,7 +23,7 @@ from trilat_net.net.wire import decode
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, in_log, in_virtual_time
+from .sessions import SESSION, Session
 
 EPOCH_NS = 5_000_000_123
 
@@ -173,7 +174,7 @@ def test_live_loops_equal_virtual_time_bitwise(name: str, tmp_path: Path) -> Non
     assert [len(log[site]) for site in log.sites] == [
         scenario.ticks(site) for site in scenario.names
     ]
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     assert verify(log).passed
 
 
@@ -183,7 +184,7 @@ def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
     session.clocks["m2"].stall(2_000_000_000, 190_000_000)
     log = session.run()
     assert max(log["m2"].late_us) > 150_000
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
 
 
 def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
@@ -197,7 +198,7 @@ def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
     assert twins.late
     first = twins.late[0]
     assert first.peer == "m2"
-    live, plain = in_log(log), in_virtual_time(scenario)
+    live, plain = pack_log(log), execute_packed(scenario)
     for site in log.sites:
         assert live[site][: first.due_tick] == plain[site][: first.due_tick]
     assert live != plain
@@ -230,7 +231,7 @@ def test_strangers_and_their_garbage_change_no_bit(tmp_path: Path) -> None:
     session.stranger(shout)
     session.stranger(come_and_go, at_ns=2_000_000_000)
     log = session.run()
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     dropped = log.link_stats("m1")[-1].dropped
     assert dropped["malformed"] > 0
     assert dropped["oversized"] > 0

@@ -81,7 +81,7 @@ def test_an_absent_far_end_is_reported() -> None:
     assert relay.run()["near"] is False
 
 
-def row(needs, p99_ms: float, lost: int = 0) -> dict:
+def make_row(needs, p99_ms: float, lost: int = 0) -> dict:
     times = {"p50": 500 * p99_ms, "p99": 1e3 * p99_ms, "max": 2e3 * p99_ms}
     facts = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
     return {**facts, "lost": lost, "one_way_us": times}
@@ -97,15 +97,17 @@ def test_delay_margins_judge_a_network() -> None:
     ]
     edge_ms = needs.stable_ms[0][1]
     assert edge_ms == pytest.approx(229.8, abs=0.05)
-    hidden = judge_network(needs, row(needs, 150.0))
+    hidden = judge_network(needs, make_row(needs, 150.0))
     assert hidden["hidden"]
     assert (hidden["good"], hidden["age_ms"]) == (True, 200.0)
     assert hidden["spare_ms"] == pytest.approx(edge_ms - 200.0)
-    near = judge_network(needs, row(needs, 228.4))
+    near = judge_network(needs, make_row(needs, 228.4))
     assert (near["good"], near["hidden"], near["age_ms"]) == (True, False, 229.0)
-    assert not judge_network(needs, row(needs, 230.0))["good"]
-    assert not judge_network(needs, row(needs, 150.0, lost=2))["good"]
-    assert not judge_network(needs, {**row(needs, 1.0, lost=1000), "one_way_us": None})["good"]
+    assert not judge_network(needs, make_row(needs, 230.0))["good"]
+    assert not judge_network(needs, make_row(needs, 150.0, lost=2))["good"]
+    assert not judge_network(needs, {**make_row(needs, 1.0, lost=1000), "one_way_us": None})[
+        "good"
+    ]
 
 
 def test_measured_links_add_their_play_out() -> None:
@@ -113,9 +115,9 @@ def test_measured_links_add_their_play_out() -> None:
         tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40})
     )
     assert (needs.playout_ms, needs.held_ms, needs.in_use_ms) == (40.0, 40.0, None)
-    assert judge_network(needs, row(needs, 12.3))["age_ms"] == 40.0
-    assert judge_network(needs, row(needs, 41.3))["age_ms"] == 42.0
-    assert judge_network(needs, row(needs, 41.3))["playout_ms"] == 83
+    assert judge_network(needs, make_row(needs, 12.3))["age_ms"] == 40.0
+    assert judge_network(needs, make_row(needs, 41.3))["age_ms"] == 42.0
+    assert judge_network(needs, make_row(needs, 41.3))["playout_ms"] == 83
 
 
 @pytest.mark.parametrize(

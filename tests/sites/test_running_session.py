@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 
 from tests.net.waiting import until
+from tests.sites.sessions import reach_session
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import Session, reached
+from .sessions import Session
 
 
 def test_shares_are_current_for_latecomers_too(tmp_path: Path) -> None:
@@ -22,13 +23,13 @@ def test_shares_are_current_for_latecomers_too(tmp_path: Path) -> None:
             clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
 
         wait_s(1.0)
-        running = reached(bus, clock)
+        running = reach_session(bus, clock)
         with running.shares("s") as find:
             told["before"] = find()
             running.set_dominance("s", {"m1": 0.9, "m2": 0.1}, 1.0)
             until(lambda: find()["m1"] > 0.7, clock=clock)
             told["half"] = find()
-            with reached(session.join("late"), clock).shares("s") as look:
+            with reach_session(session.join("late"), clock).shares("s") as look:
                 until(lambda: look()["m1"] > 0.7, clock=clock)
                 told["late"], told["early"] = look(), find()
             wait_s(1.0)

@@ -19,7 +19,7 @@ from .sessions import SESSION, Session
 MS_NS = 1_000_000
 
 
-def watch(
+def add_watcher(
     session: Session, what: Any, first_ms: int = 2_200, every_ms: int = 33, times: int = 20
 ) -> None:
     def run(clock: RelayClock) -> None:
@@ -51,7 +51,7 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
             for way in self._ways:
                 way.__exit__(*error)
 
-    watch(session, Both)
+    add_watcher(session, Both)
     session.play()
     log = open_log(session.path)
     # it listens for longer than the delay

@@ -12,6 +12,7 @@ from trilat_people.live_page.terminal_watch import SessionWatch
 
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.sites.sessions import reach_session
 from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
@@ -20,7 +21,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, reached
+from .sessions import SESSION, Session
 
 LIVE = {"sites.m1.hands": [{"kind": "live"}]}
 
@@ -35,7 +36,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
 
     def stop(bus: Bus, clock: RelayClock) -> None:
         clock.sleep_until(clock.monotonic_ns() + 2_500_000_000)
-        said.extend(reached(bus, clock).end())
+        said.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
@@ -76,7 +77,8 @@ def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
             clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
             said.extend(
-                (one.accepted, one.text) for one in reached(bus, clock).send_order(sites, name)
+                (one.accepted, one.text)
+                for one in reach_session(bus, clock).send_order(sites, name)
             )
 
     raised: list[tuple[str, LifeAlarm]] = []
@@ -155,7 +157,7 @@ def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
         clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
         said.extend(
             one.text
-            for one in reached(bus, clock).send_order(["s"], "stop")
+            for one in reach_session(bus, clock).send_order(["s"], "stop")
             if not one.accepted
         )
 
@@ -166,7 +168,7 @@ def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
 
 def test_an_absent_session_is_not_stopped() -> None:
     with pytest.raises(SessionError, match="no site of session"):
-        reached(LocalNetwork().join(), ManualClock()).end()
+        reach_session(LocalNetwork().join(), ManualClock()).end()
 
 
 @pytest.mark.long
@@ -182,7 +184,7 @@ def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
     seen: dict[str, int] = {}
 
     def stop(bus: Bus, clock: RelayClock) -> None:
-        said.extend(reached(bus, clock).end())
+        said.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)

@@ -17,7 +17,7 @@ from .sessions import SESSION, Session
 S = 1_000_000_000
 
 
-def ending(folder: Path, stay_s: float) -> Session:
+def make_slow_session(folder: Path, stay_s: float) -> Session:
     """A session of two sites whose recorder works on for half a minute when it has every record."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
     return Session.whole(scenario, folder, stay_s=stay_s, works_ns=30 * S, ends={})
@@ -44,7 +44,7 @@ def ending(folder: Path, stay_s: float) -> Session:
 def test_how_long_a_site_stays(
     stay_s: float, after: str, least_s: int, most_s: int, tmp_path: Path
 ) -> None:
-    session = ending(tmp_path, stay_s)
+    session = make_slow_session(tmp_path, stay_s)
     session.run()
     assert session.ends == {"m": 0, "s": 0}
     for name in ("m", "s"):
@@ -52,7 +52,7 @@ def test_how_long_a_site_stays(
 
 
 def test_signals_end_waits_without_spoiling_complete_runs(tmp_path: Path) -> None:
-    session = ending(tmp_path, 120.0)
+    session = make_slow_session(tmp_path, 120.0)
 
     def ask(clock: RelayClock) -> None:
         clock.sleep_until(clock.monotonic_ns() + 10 * S)

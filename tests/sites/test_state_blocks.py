@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.scenario.builders import six_joint_text
+from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
@@ -17,7 +18,7 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, in_log, in_virtual_time
+from .sessions import SESSION, Session
 
 A_SECOND = 1_000_000_000
 
@@ -58,7 +59,7 @@ def test_samples_are_records_and_blocks_hold_10_ms(scenario: Scenario, tmp_path:
     samples, blocks = listen_to_sites(session, scenario.names)
     log = session.run()
     assert verify(log).passed
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     for name in scenario.names:
         small = [
             decode(payload, PeerSample, layout=scenario.layout(name))
@@ -122,7 +123,7 @@ def test_samples_of_long_delays_come_together(
 ) -> None:
     scenario = load_scenario("two_sites", {"duration_s": 0.5, "link.delay_ms": delay_ms})
     log = Session.whole(scenario, tmp_path).run()
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     for name in scenario.names:
         counts = [len(state.rx) for state in log[name].states if state.rx]
         assert counts[1:-1].count(together) > 0.8 * len(counts)

@@ -142,7 +142,7 @@ class DelayEquations:
         return np.hstack(parts).reshape(len(self.q0), self.width, -1).swapaxes(1, 2)
 
 
-def equations(scenario) -> DelayEquations:
+def make_equations(scenario) -> DelayEquations:
     """Returns the equations of a scenario whose arms, gains and delays are all alike."""
     specs = list(scenario.sites.values())
     assert all((spec.arm, spec.control) == (specs[0].arm, specs[0].control) for spec in specs)
@@ -184,25 +184,26 @@ def common_terms(scenario) -> dict[str, Any]:
 
 
 @cache
-def exact(name: str) -> DelayEquations:
+def solve_exactly(name: str) -> DelayEquations:
     """Returns the exact solution of a shipped scenario."""
-    return equations(load_scenario(name)).solve(DURATION_S)
+    return make_equations(load_scenario(name)).solve(DURATION_S)
 
 
 @cache
-def distance(name: str, scheme: str, rate_hz: int) -> float:
+def measure_distance(name: str, scheme: str, rate_hz: int) -> float:
     """Returns max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
     trajectory_at_times = sample_records(
         load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S
     )
     return float(
         np.abs(
-            trajectory_at_times[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]
+            trajectory_at_times[..., :2]
+            - solve_exactly(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]
         ).max()
     )
 
 
-def order(name: str, scheme: str) -> list[float]:
+def measure_orders(name: str, scheme: str) -> list[float]:
     """Returns the orders of the distance from 500 Hz to 1 kHz, and from there to 2 kHz."""
-    errors = [distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
+    errors = [measure_distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
     return [float(np.log2(coarse / fine)) for coarse, fine in pairwise(errors)]

@@ -95,7 +95,7 @@ def hold_by_spring(loop: LinearLoop, site: str, K: float, B: float = 0.0) -> Lin
     return loop._replace(A=loop.A - loop.B @ back, delayed=delayed)
 
 
-def pair(
+def make_pair(
     K: tuple[float, float] = (10.0, 10.0),
     d: tuple[float, float] = (1.0, 1.0),
     T: tuple[float, float] = (0.2, 0.2),

@@ -10,7 +10,7 @@ import sympy as sp
 from scipy.optimize import linprog
 
 from tests.execution.builders import make_shipped_trajectories
-from tests.theory.energy import balance
+from tests.theory.energy import compute_balance
 from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     find_closed_groups,
@@ -243,9 +243,9 @@ def test_sites_that_nobody_follows_still_settle() -> None:
     trajectory_of_run = make_shipped_trajectories(
         "free", {**rows, "rate_hz": 200, "duration_s": 25.0}
     )
-    locked = balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
+    locked = compute_balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
     assert np.diff(locked).max() <= 1e-6 * locked.max()
-    alone = balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V
+    alone = compute_balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V
     assert np.diff(alone).max() > 1e-6 * alone.max()
     e = np.abs(trajectory_of_run.stack("q") - trajectory_of_run.stack("q_des")).max(axis=(0, 2))
     assert e[-200:].max() < 0.02 < 0.5 < e.max()

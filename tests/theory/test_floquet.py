@@ -38,7 +38,7 @@ class Loop(NamedTuple):
         return self.found.rightmost.s.real
 
 
-def at_rest(
+def make_loop_at_rest(
     name: str, changes: Mapping[str, Any], wanted: int = 4, pose: tuple[float, ...] = POSE
 ) -> Loop:
     """Returns a scenario with all sites at rest at a pose, and its roots there."""
@@ -77,7 +77,9 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
     step_s = (loop.found.span_s or 0.05) * math.ceil(0.2 / (loop.found.span_s or 0.05))
     k = np.arange(math.ceil(from_s / step_s), math.floor((to_s - 0.1) / step_s))
     seen = []
-    for name, one, other in zip(whole.names, speeds(whole), speeds(beside), strict=True):
+    for name, one, other in zip(
+        whole.names, list_speeds(whole), list_speeds(beside), strict=True
+    ):
         ticks = np.rint(k * step_s * whole.sites[name].rate_hz).astype(int)
         seen.append(
             (one - other)[ticks] * np.exp(-loop.growth_per_s * k * step_s)[:, np.newaxis]
@@ -94,7 +96,7 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
     return loop.growth_per_s + math.log(np.abs(np.roots([1.0, *-terms[::-1]])).max()) / step_s
 
 
-def speeds(scenario: Scenario) -> list[Array]:
+def list_speeds(scenario: Scenario) -> list[Array]:
     """Returns the joint speeds of every record of each site."""
     run = run_fused(scenario, keep=max(map(scenario.ticks, scenario.names)))
     assert run.diverged_s is None
@@ -147,7 +149,7 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
     }
     for n, site in enumerate(sites):
         changes[f"sites.{site}.rate_hz"] = int(rates[n if seed % 5 < 3 else 0])
-    loop = at_rest(name, changes, 6)
+    loop = make_loop_at_rest(name, changes, 6)
     reals = [root.s.real for root in loop.found.roots]
     gap_per_s = reals[0] - next(
         (real for real in reals if real < reals[0] - 1e-3), reals[0] - 1.0
@@ -189,7 +191,7 @@ def test_one_rate_gives_companion_matrix_eigenvalues(
     law: dict[str, Any], delay_ms: float
 ) -> None:
     damped = {} if law["law"] == "adaptive" else {"d": 1.3}
-    loop = at_rest(
+    loop = make_loop_at_rest(
         "two_sites", {"rate_hz": 100, "control": {**law, **damped}, "link.delay_ms": delay_ms}
     )
     recursion = build_recursion(
@@ -214,7 +216,7 @@ def test_digital_pairs_may_grow_despite_continuous_damping(
     rates = {"sites.m.rate_hz": rates_hz[0], "sites.s.rate_hz": rates_hz[1]}
     control = {"law": "p_d", "K": 50.0, "d": 2.0}
     changes = {**rates, "scheme": "digital", "control": control, "link.delay_ms": 0.0}
-    roots = at_rest("two_sites", changes, pose=(0.0, math.pi)).found
+    roots = make_loop_at_rest("two_sites", changes, pose=(0.0, math.pi)).found
     assert roots.rightmost is not None
     assert roots.rightmost.s.real == pytest.approx(growth_per_s, abs=5e-4)
     assert roots.rightmost.s.imag == pytest.approx(9.9, abs=0.2)
@@ -231,8 +233,11 @@ def test_sinusoidal_delays_can_pump_stable_loops() -> None:
     """
     changes, straight = {"rate_hz": 200, "control.d": 1.1}, (0.1, 0.0)
     mean = {"model": "constant", "delay_ms": 202.5}
-    assert at_rest("p_d_margin", {**changes, "link": mean}, pose=straight).growth_per_s < -0.01
-    pumped = at_rest("p_d_margin", {**changes, "link": SINE}, pose=straight).found
+    assert (
+        make_loop_at_rest("p_d_margin", {**changes, "link": mean}, pose=straight).growth_per_s
+        < -0.01
+    )
+    pumped = make_loop_at_rest("p_d_margin", {**changes, "link": SINE}, pose=straight).found
     assert pumped.rightmost is not None
     assert abs(pumped.rightmost.s - complex(0.0397, math.pi / SINE_S)) <= 1e-4
     assert pumped.span_s == SINE_S
@@ -262,13 +267,13 @@ def test_drawn_delays_grow_like_their_twins() -> None:
     """From one window of 3 s to another; the span of the roots begins earlier in the same draws."""
     link = {"model": "normal", "delay_ms": 200.0, "deviation_ms": 80.0, "loss": 0.3}
     changes = {"rate_hz": 100, "control.d": 1.0, "link": link, "duration_s": 30.0}
-    loop = at_rest("p_d_margin_two", changes, 1, (0.1, 0.0))
+    loop = make_loop_at_rest("p_d_margin_two", changes, 1, (0.1, 0.0))
     assert loop.found.span_s == 30.0
     assert loop.found.deviation_per_s is not None
     assert 1e-3 < loop.found.deviation_per_s < 0.02
     beside = load_scenario(loop.scenario, {"sites.s.q0_rad": [POSE[0] + 1e-7, 0.0]})
     distances = np.hstack(
-        [a - b for a, b in zip(speeds(loop.scenario), speeds(beside), strict=True)]
+        [a - b for a, b in zip(list_speeds(loop.scenario), list_speeds(beside), strict=True)]
     )
     first, last = (np.linalg.norm(distances[from_s * 100 :][:300]) for from_s in (2, 27))
     assert math.log(last / first) / 25.0 == pytest.approx(
@@ -290,7 +295,9 @@ def test_drifting_motions_differ_from_staying_ones(
         S, {(1, 0): effect}, ("m.q1", "m.qd1", "s.q1", "s.qd1"), np.array([0, 0, 1, 1]), 0
     )
     monkeypatch.setattr(floquet, "couple_ticks", lambda *_, **__: hand_made)
-    roots = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
+    roots = make_loop_at_rest(
+        "two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}
+    ).found
     assert (roots.zeros, roots.drifting, roots.verdict) == (2, 1, "at the edge")
     assert roots.rightmost is not None
     exact = np.log(np.roots([1.0, -(2.0 - h * d), 1.0 - h * d + h * h * K]).astype(complex)) / h
@@ -299,7 +306,7 @@ def test_drifting_motions_differ_from_staying_ones(
 
 def test_thousandfold_growth_per_tick_has_its_root() -> None:
     control = {"law": "p_d", "K": 1.0, "d": 1e5}
-    loop = at_rest(
+    loop = make_loop_at_rest(
         "two_sites",
         {"rate_hz": 1000, "scheme": "digital", "control": control, "link.delay_ms": 20.0},
         1,

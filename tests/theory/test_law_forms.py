@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.transmission import PAIR, TABLE, VARIANTS, approximate_printed, balance, transmitted
-from tests.unit_arm import CLAMP, hand, two_sites, unit_scenario
+from tests.unit_arm import CLAMP, make_four_channel_pair, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
@@ -75,7 +75,7 @@ def wave_pair(wall: float = 0.0, held: bool = True) -> Scenario:
     slave = {"law": "wave", "b": b, "K": K, "B": b}
     env = [{**CLAMP, "stiffness_nm_rad": wall}] if wall else []
     sites = {"m": {"hands": [HELD] if held else []}, "s": {"hands": env, "control": slave}}
-    return unit_scenario(
+    return make_unit_scenario(
         sites, {"law": "wave", "b": b}, link={"model": "constant", "delay_ms": 1e3 * T}
     )
 
@@ -119,7 +119,7 @@ def test_wave_lines_feel_like_mass_and_spring() -> None:
 @pytest.mark.parametrize(("variant", "delay_s"), [key for key in TABLE if key[1] > 0.0])
 def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> None:
     """With accelerations and local force feedback, to the last digit of the impedance."""
-    scenario = two_sites(variant, delay_s)
+    scenario = make_four_channel_pair(variant, delay_s)
     sites = {**scenario.sites, "m": msgspec.structs.replace(scenario.sites["m"], hands=())}
     loop = loop_of(msgspec.structs.replace(scenario, sites=sites))
     ratios = [
@@ -137,7 +137,7 @@ def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> No
 @pytest.mark.parametrize("acceleration", [0.0, 0.5])
 def test_delayed_four_channel_roots_solve_equations(acceleration: float) -> None:
     law = {"force_own": (0.2, -0.5), "acceleration": acceleration}
-    scenario = two_sites("without qdd", 0.02, **law)
+    scenario = make_four_channel_pair("without qdd", 0.02, **law)
     loads = [(50.0, 10.0), (500.0, 5.0)]
 
     def f(s: complex) -> complex:
@@ -168,9 +168,13 @@ def test_six_channels_with_accelerations_share_as_published(
         site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
         for i, site in enumerate(names)
     }
-    sites: dict[str, Any] = {"u1": {}, "u2": {}, "s": {"hands": [hand(0.0, 500.0, 5.0)]}}
+    sites: dict[str, Any] = {
+        "u1": {},
+        "u2": {},
+        "s": {"hands": [make_spring_hand(0.0, 500.0, 5.0)]},
+    }
     law = {"law": "six_channel", "K": 100.0, "B": 20.0, "acceleration": 1.0}
-    loop = set_common_delay(loop_of(unit_scenario(sites, law, dominance=shares)), 0.0)
+    loop = set_common_delay(loop_of(make_unit_scenario(sites, law, dominance=shares)), 0.0)
     ratios = [
         abs(find_impedance(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 1.0)
@@ -187,7 +191,8 @@ def test_true_models_predict_roots_without_delay() -> None:
     law = {"law": "smith", "K": 100.0, "d": 5.0, "inertia": 1.0}
     sites = {"m": {"control": {**law, "predicts": True}}, "s": {}}
     roots = [
-        root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 16).roots
+        root.s
+        for root in compute_delay_spectrum(loop_of(make_unit_scenario(sites, law)), 16).roots
     ]
     for stiffness in (100.0, 200.0):
         wanted = np.roots([1.0, 5.0, stiffness]).astype(complex)[0]
@@ -206,7 +211,7 @@ def test_shared_authority_has_its_springs_roots() -> None:
     roots = [
         root.s
         for root in compute_delay_spectrum(
-            loop_of(unit_scenario(sites, law, dominance=shares)), 12
+            loop_of(make_unit_scenario(sites, law, dominance=shares)), 12
         ).roots
     ]
 
@@ -228,7 +233,8 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
     law = {"law": "impedance", "M": 2.0, "B": 10.0, "K": 50.0}
     sites = {"m": {}, "s": {"control": {**law, "follows": True}}}
     roots = [
-        root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 4).roots
+        root.s
+        for root in compute_delay_spectrum(loop_of(make_unit_scenario(sites, law)), 4).roots
     ]
     wanted = np.roots([2.0, 10.0, 50.0])[0]
     assert roots
@@ -239,7 +245,7 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
 def test_synchronised_outputs_have_consensus_roots() -> None:
     """Without gravity and with the true parameters: s = -Lambda, and m s = -K (1 -+ exp(-s T))."""
     law = {"law": "sync", "Lambda": 1.0, "K": 3.0}
-    loop = loop_of(unit_scenario({"m": {}, "s": {}}, law))
+    loop = loop_of(make_unit_scenario({"m": {}, "s": {}}, law))
     roots = [root.s for root in compute_delay_spectrum(loop, 10).roots]
     assert min(abs(root + 1.0) for root in roots) < 1e-5
 
@@ -259,7 +265,7 @@ def test_synchronised_outputs_have_consensus_roots() -> None:
 def test_energy_switching_laws_explain_missing_roots() -> None:
     for law, why in (("tanks", "tank"), ("tdpa", "second order")):
         with pytest.raises(ScenarioError, match=why):
-            loop_of(unit_scenario({"m": {}, "s": {}}, {"law": law}))
+            loop_of(make_unit_scenario({"m": {}, "s": {}}, {"law": law}))
 
 
 def test_the_analysis_of_waves_is_whole() -> None:
@@ -286,7 +292,7 @@ def test_saturating_pulls_are_linearised_below_saturation() -> None:
     """Its loop is that of P+d with the same K and d, and the analysis says so."""
     loops = []
     for law in ({"law": "saturated_pd", "P": 5.0}, {"law": "p_d"}):
-        scenario = unit_scenario(
+        scenario = make_unit_scenario(
             {"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0}
         )
         analysis = analyse_linear_loop(scenario, pose=(0.0, 0.0))

@@ -20,7 +20,7 @@ from trilat_net.scenario import load_scenario
 POSE = (-0.1236, 0.3373)
 
 
-def rightmost(overrides: dict[str, float]) -> complex:
+def find_rightmost(overrides: dict[str, float]) -> complex:
     """Returns the rightmost root of `free`."""
     scenario = load_scenario("free", overrides)
     root = compute_delay_spectrum(
@@ -85,14 +85,16 @@ def test_links_of_different_delays_have_an_entry_each() -> None:
 
 @pytest.mark.parametrize(("delay_ms", "re"), [(200.0, -0.196), (0.0, -0.163), (400.0, -0.237)])
 def test_the_rightmost_root_of_free_motion(delay_ms: float, re: float) -> None:
-    s = rightmost({"link.delay_ms": delay_ms})
+    s = find_rightmost({"link.delay_ms": delay_ms})
     assert s.real == pytest.approx(re, abs=2e-3)
     assert s.imag == pytest.approx(6.2, abs=0.2)
 
 
 @pytest.mark.parametrize(("delay_ms", "re"), [(200.0, -0.693), (0.0, -0.372), (400.0, -0.642)])
 def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
-    assert rightmost({"link.delay_ms": delay_ms, **RODS}).real == pytest.approx(re, abs=2e-3)
+    assert find_rightmost({"link.delay_ms": delay_ms, **RODS}).real == pytest.approx(
+        re, abs=2e-3
+    )
 
 
 def test_zero_delay_is_the_one_tick_limit() -> None:

@@ -81,7 +81,7 @@ HAND = {
 }
 
 
-def cartesian(law: str, space: str) -> Scenario:
+def make_cartesian_scenario(law: str, space: str) -> Scenario:
     """Returns two arms of three sliders, heavier from slider to slider, with an operator who is felt."""
     links = "\n".join(
         SLIDER.format(n=n, mass=3 - 0.5 * n, parent=f"l{n - 1}" if n else "base", axis=axis)
@@ -100,7 +100,7 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
     """Of arms that slide along x, y and z the Jacobian is 1: loop, roots, sampled roots, and ports."""
     loops = []
     for space in ("joints", "position"):
-        scenario = cartesian(law, space)
+        scenario = make_cartesian_scenario(law, space)
         rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
         conditions = OperatingConditions.derive(scenario)
         loop = linearise_loop(conditions, rest)
@@ -145,7 +145,7 @@ def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> 
     return load_scenario(scenario, changes)
 
 
-def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
+def trace_deviations(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
     """Returns deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
     run, rows = FusedRun(scenario), []
     for k in range(1, steps + 1):
@@ -167,7 +167,7 @@ def realise(outputs: Array, step_s: float, order: int) -> Array:
     return np.log(np.linalg.eigvals(step).astype(complex)) / step_s
 
 
-def settled(name: str) -> tuple[Scenario, Equilibrium]:
+def make_settled_scenario(name: str) -> tuple[Scenario, Equilibrium]:
     """Returns a scenario at the mean of its start poses, with estimates that are true."""
     texts = {"planar": planar_task_text(), "posed": posed_task_text()}
     light = {"control.Kp": 2.0, "control.Gamma": 5.0} if name == "posed" else {}
@@ -190,7 +190,7 @@ cases = pytest.mark.parametrize(
 @cases
 def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     """The companion matrix advances the deviation; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
-    (scenario, rest), rng, size = settled(name), np.random.default_rng(1), 1e-6
+    (scenario, rest), rng, size = make_settled_scenario(name), np.random.default_rng(1), 1e-6
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
     angles = [
         f"{site}.q{n + 1}"
@@ -207,7 +207,7 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     )
     X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
     X[torques] = (whole @ X)[torques]
-    motion_of_run = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
+    motion_of_run = trace_deviations(start_near(scenario, rest, off), rest, 1e-3, 300)
     places = [names.index(angle) for angle in angles]
     for row in motion_of_run:
         X = whole @ X
@@ -217,7 +217,7 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
 @cases
 def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     """Started along the vector of each of the three rightmost roots that swing."""
-    scenario, rest = settled(name)
+    scenario, rest = make_settled_scenario(name)
     conditions = OperatingConditions.derive(scenario)
     near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
     spectrum = compute_sampled_spectrum(conditions, rest, 14)
@@ -233,7 +233,7 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
         off = dict(zip(names, vector.real.tolist(), strict=True))
         step_s = 0.3 / abs(s)
         measured = realise(
-            follow(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16
+            trace_deviations(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16
         )
         assert np.abs(measured - s).min() <= 0.01 * abs(s), (s, measured)
 
@@ -241,7 +241,7 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
 @cases
 def test_the_law_is_passive_at_end_effectors(name: str) -> None:
     """Of places, also with axes left open and with redundant joints; of poses there is no proof."""
-    scenario, rest = settled(name)
+    scenario, rest = make_settled_scenario(name)
     ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
     assert (ports.proof is None) == (name == "posed")

@@ -95,7 +95,7 @@ def test_continuing_runs_change_nothing() -> None:
     )
 
 
-def scenario(**link: object) -> Scenario:
+def make_link_scenario(**link: object) -> Scenario:
     return load_scenario(
         "two_sites",
         {"duration_s": 3.0, **{f"link.{key}": value for key, value in link.items()}},
@@ -139,13 +139,15 @@ def test_the_mean_is_that_of_a_run(overrides: dict[str, object]) -> None:
 
 
 def test_play_out_makes_jitter_a_constant_delay() -> None:
-    chosen = scenario(model="uniform", delay_ms=60.0, half_width_ms=50.0, playout_ms=110.0)
+    chosen = make_link_scenario(
+        model="uniform", delay_ms=60.0, half_width_ms=50.0, playout_ms=110.0
+    )
     age = compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])
     assert np.allclose(age, 0.110)
 
 
 def test_a_link_that_delivers_nothing_is_refused() -> None:
-    chosen = scenario(loss=1.0)
+    chosen = make_link_scenario(loss=1.0)
     with pytest.raises(
         ScenarioError, match=r"links\.m->s: no sample sent over this link ever arrives"
     ):

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from tests.theory.analysed_ports import criterion
-from tests.theory.networks import Complex, Network, Wire, pair
+from tests.theory.networks import Complex, Network, Wire, make_pair
 from trilat_net.analysis.theory.frequency_search import build_frequency_grid
 from trilat_net.analysis.theory.port_passivity import (
     MAX_LLEWELLYN,
@@ -39,17 +39,17 @@ def draw_networks(seed: int, ports: int, count: int = 40) -> Complex:
 def test_undelayed_springs_and_dampers_are_absolutely_stable(
     K: float, B: float, d: float
 ) -> None:
-    assert not criterion(pair((K, K), (d, d), (0.0, 0.0), B)).below
+    assert not criterion(make_pair((K, K), (d, d), (0.0, 0.0), B)).below
 
 
 @pytest.mark.parametrize("d", [0.4, 1.0, 1.6])
 def test_delayed_p_d_fails_below_its_sine(d: float) -> None:
     """2 d^2 >= abs(z12 z21) + Re(z12 z21) = 2 K^2 sin^2(w T) / w^2."""
     edge_rad_s = brentq(lambda w: 10.0 * np.sin(0.2 * w) / w - d, 1e-6, np.pi / 0.2)
-    (span,) = criterion(pair(d=(d, d))).below[:1]
+    (span,) = criterion(make_pair(d=(d, d))).below[:1]
     assert span.from_hz == pytest.approx(1e-3)
     assert span.to_hz == pytest.approx(edge_rad_s / (2.0 * np.pi), rel=1e-5)
-    assert not criterion(pair(d=(2.02, 2.02))).below
+    assert not criterion(make_pair(d=(2.02, 2.02))).below
 
 
 @given(seed=SEEDS)

@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 
 from tests.execution.builders import run_fused, sample_records
-from tests.theory.figures_of_runs import Overrides, approximate_figure, measured, peak, value
+from tests.theory.figures_of_runs import (
+    Overrides,
+    approximate_figure,
+    find_peak,
+    find_value,
+    measure_run,
+)
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.scenario import load_scenario
@@ -103,7 +109,7 @@ def test_the_papers_hands_hardly_move_joint_1() -> None:
 
 @pytest.mark.long
 def test_without_a_box_the_slave_returns() -> None:
-    windows = measured("box", NO_BOX)
+    windows = measure_run("box", NO_BOX)
     assert windows.end_pose_rad["s"] == (
         approximate_figure(-0.011, 1e-3),
         approximate_figure(0.005, 1e-3),
@@ -112,7 +118,7 @@ def test_without_a_box_the_slave_returns() -> None:
 
 @pytest.mark.long
 def test_truth_on_edge_of_box_lets_them_sag() -> None:
-    windows = measured("box", {**EDGE, "duration_s": 20.0})
+    windows = measure_run("box", {**EDGE, "duration_s": 20.0})
     assert windows.end_pose_rad["s"][0] < -0.4
     assert windows.end_pose_rad["s"][1] < -0.7
 
@@ -122,8 +128,8 @@ def test_truth_on_edge_of_box_lets_them_sag() -> None:
 def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) -> None:
     row = {"m1": share, "m2": 1.0 - share}
     overrides: Overrides = {"timeline": [], "dominance.s": row, "duration_s": 10.0}
-    windows = measured("training", overrides, (9.9, 10.0, "s"))
-    assert value(windows, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
+    windows = measure_run("training", overrides, (9.9, 10.0, "s"))
+    assert find_value(windows, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
 
 
 HEALED = (6.0, 15.0, "s")
@@ -131,49 +137,51 @@ HEALED = (6.0, 15.0, "s")
 
 @pytest.mark.long
 def test_healing_links_kick_slaves_that_continued() -> None:
-    windows = measured("outage", {}, HEALED)
-    assert value(windows, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
-    assert value(windows, "torque_peak_nm") == approximate_figure(35.0, 1.0)
+    windows = measure_run("outage", {}, HEALED)
+    assert find_value(windows, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
+    assert find_value(windows, "torque_peak_nm") == approximate_figure(35.0, 1.0)
     assert windows.synchronised_at_s == approximate_figure(12.4, 0.1)
-    uncut = measured("outage", {"link.outages_s": []}, HEALED)
-    assert value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
+    uncut = measure_run("outage", {"link.outages_s": []}, HEALED)
+    assert find_value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
 
 
 @pytest.mark.long
 def test_ramped_returns_need_no_further_torque() -> None:
-    held = measured("outage", {"on_stale.action": "hold"}, HEALED)
-    uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
-    assert value(held, "torque_peak_nm") <= value(uncut, "torque_peak_nm")
-    assert value(held, "speed_peak_rad_s") <= value(uncut, "speed_peak_rad_s")
+    held = measure_run("outage", {"on_stale.action": "hold"}, HEALED)
+    uncut = measure_run("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
+    assert find_value(held, "torque_peak_nm") <= find_value(uncut, "torque_peak_nm")
+    assert find_value(held, "speed_peak_rad_s") <= find_value(uncut, "speed_peak_rad_s")
 
 
 LATE = (9.0, 15.0, "s")
 
 
 def test_direct_force_reflection_hammers_at_200_ms() -> None:
-    windows = measured("contact", {}, LATE)
-    assert value(windows, "wall_mean_n") == approximate_figure(8.0, 1.0)
-    assert value(windows, "wall_deviation_n") == approximate_figure(14.0, 1.0)
-    assert value(windows, "wall_peak_n") == approximate_figure(52.0, 1.0)
-    assert value(windows, "wall_hits") == 3
+    windows = measure_run("contact", {}, LATE)
+    assert find_value(windows, "wall_mean_n") == approximate_figure(8.0, 1.0)
+    assert find_value(windows, "wall_deviation_n") == approximate_figure(14.0, 1.0)
+    assert find_value(windows, "wall_peak_n") == approximate_figure(52.0, 1.0)
+    assert find_value(windows, "wall_hits") == 3
 
 
 def test_at_20_ms_there_is_one_hit() -> None:
-    windows = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
-    assert value(windows, "wall_hits") == 1
-    assert value(windows, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
-    assert value(windows, "wall_deviation_n", 1) < 0.01
+    windows = measure_run(
+        "contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s")
+    )
+    assert find_value(windows, "wall_hits") == 1
+    assert find_value(windows, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
+    assert find_value(windows, "wall_deviation_n", 1) < 0.01
 
 
 def test_a_fifth_of_the_force_settles() -> None:
-    windows = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
-    assert value(windows, "wall_mean_n") == approximate_figure(8.5, 0.1)
-    assert value(windows, "wall_deviation_n") < 0.05
+    windows = measure_run("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
+    assert find_value(windows, "wall_mean_n") == approximate_figure(8.5, 0.1)
+    assert find_value(windows, "wall_deviation_n") < 0.05
 
 
 def test_free_motion_is_calm_at_200_ms() -> None:
-    windows = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
-    assert value(windows, "speed_peak_rad_s") < 1e-6
+    windows = measure_run("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
+    assert find_value(windows, "speed_peak_rad_s") < 1e-6
     assert windows.end_error_rad is not None
     assert windows.end_error_rad < 1e-6
 
@@ -188,25 +196,25 @@ def test_free_motion_is_calm_at_200_ms() -> None:
 )
 def test_position_laws_pass_the_same_wall(law: dict[str, object]) -> None:
     """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
-    windows = measured(
+    windows = measure_run(
         "contact",
         {"control": law, "sites.m.control": {}, "sites.s.control": {}, "duration_s": 25.0},
         (24.0, 25.0, "s"),
     )
-    assert value(windows, "wall_mean_n") > 1.0
-    assert value(windows, "wall_deviation_n") < 0.05
+    assert find_value(windows, "wall_mean_n") > 1.0
+    assert find_value(windows, "wall_deviation_n") < 0.05
 
 
 @pytest.mark.long
 def test_without_learning_gravity_nothing_winds_up() -> None:
-    windows = measured(
+    windows = measure_run(
         "windup",
         {"control.Gamma": [1.0, 1.0, 1.0, 0.0, 0.0], "duration_s": 20.0},
         (10.0, 10.2, "s"),
         (19.8, 20.0, "s"),
     )
-    assert value(windows, "wall_mean_n", 1) == pytest.approx(
-        value(windows, "wall_mean_n", 0), abs=0.02
+    assert find_value(windows, "wall_mean_n", 1) == pytest.approx(
+        find_value(windows, "wall_mean_n", 0), abs=0.02
     )
 
 
@@ -285,7 +293,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     shipped = load_scenario(name)
     assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
     assert (
-        measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend
+        measure_run(name, {"control.d": d, "duration_s": 40.0}).end.error.trend
         is EnvelopeTrend.GROWS
     )
 
@@ -302,11 +310,11 @@ def test_unequal_shares_have_their_own_margin() -> None:
     assert np.linalg.eigvals(alpha).real.min() == pytest.approx(-0.8)
     changes = {"dominance": row, "duration_s": 40.0}
     assert (
-        measured("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend
+        measure_run("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend
         is EnvelopeTrend.GROWS
     )
     assert (
-        measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend
+        measure_run("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend
         is EnvelopeTrend.DECAYS
     )
 
@@ -315,8 +323,8 @@ def test_unequal_shares_have_their_own_margin() -> None:
 def test_half_of_the_margin_grows_to_10_rad() -> None:
     faster_arms = {"limits.qd_limit_rad_s": 100.0}
     changes = {"control.d": 0.5, "duration_s": 40.0, **faster_arms}
-    windows = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
-    assert [peak(windows, 0), peak(windows, 1)] == [
+    windows = measure_run("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
+    assert [find_peak(windows, 0), find_peak(windows, 1)] == [
         approximate_figure(1.6, 0.1),
         approximate_figure(10.0, 1.0),
     ]
@@ -324,20 +332,22 @@ def test_half_of_the_margin_grows_to_10_rad() -> None:
 
 @pytest.mark.long
 def test_two_and_half_margins_decay_to_milliradians() -> None:
-    windows = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
-    assert peak(windows) == approximate_figure(3e-3, 1e-3)
+    windows = measure_run(
+        "p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, "")
+    )
+    assert find_peak(windows) == approximate_figure(3e-3, 1e-3)
 
 
 @pytest.mark.long
 def test_jitter_of_equal_mean_turns_the_verdict() -> None:
-    jitter = measured("jitter", {}, (38.0, 40.0, ""))
-    constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
+    jitter = measure_run("jitter", {}, (38.0, 40.0, ""))
+    constant = measure_run("jitter", CONSTANT, (38.0, 40.0, ""))
     assert (jitter.end.error.trend, constant.end.error.trend) == (
         EnvelopeTrend.DECAYS,
         EnvelopeTrend.GROWS,
     )
-    assert peak(jitter) == approximate_figure(0.022, 0.001)
-    assert peak(constant) == approximate_figure(5.3, 0.1)
+    assert find_peak(jitter) == approximate_figure(0.022, 0.001)
+    assert find_peak(constant) == approximate_figure(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]
     assert ages == [approximate_figure(25.0, 1.0)] * len(ages)
     assert {age.mean_ms for age in constant.ages.values()} == {200.0}
@@ -346,8 +356,8 @@ def test_jitter_of_equal_mean_turns_the_verdict() -> None:
 @pytest.mark.long
 def test_play_out_makes_the_jittered_run_diverge() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
-    free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
-    assert peak(free) == approximate_figure(339.0, 1.0)
+    free = measure_run("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
+    assert find_peak(free) == approximate_figure(339.0, 1.0)
     assert {age.max_ms for age in free.ages.values()} == {400.0}
     assert free.peak_speed_rad_s is not None
     assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s

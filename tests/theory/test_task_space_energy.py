@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from tests.execution.builders import make_shipped_trajectories
-from tests.theory.energy import DURATION_S, balance, booked, left_null_vector, order
+from tests.theory.energy import (
+    DURATION_S,
+    compute_balance,
+    compute_shipped_balance,
+    left_null_vector,
+    measure_order,
+)
 
 Vector = NDArray[np.float64]
 T, G = 0.3, 9.81
@@ -131,24 +137,26 @@ RATES = pytest.mark.parametrize("rate_hz", [1000, pytest.param(2000, marks=pytes
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("asymmetric", marks=pytest.mark.long)])
 def test_the_balance_closes_to_2e_5(name: str) -> None:
-    assert booked(name).residual <= 2e-5
+    assert compute_shipped_balance(name).residual <= 2e-5
 
 
 @RATES
 @pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.long), "asymmetric"])
 def test_the_balance_error_is_second_order(name: str, rate_hz: int) -> None:
-    assert order(name, "second_order", rate_hz) == pytest.approx(2.0, abs=0.1)
+    assert measure_order(name, "second_order", rate_hz) == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.long
 @RATES
 def test_digital_closes_to_some_percent(rate_hz: int) -> None:
-    assert booked("paper", "digital").residual == pytest.approx(1.5e-2, rel=0.2)
-    assert order("paper", "digital", rate_hz) == pytest.approx(1.0, abs=0.1)
+    assert compute_shipped_balance("paper", "digital").residual == pytest.approx(
+        1.5e-2, rel=0.2
+    )
+    assert measure_order("paper", "digital", rate_hz) == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_balance_needs_the_hands_work() -> None:
-    b = booked("paper")
+    b = compute_shipped_balance("paper")
     assert np.abs(b.given).max() > 0.01 * b.V.max()
 
 
@@ -160,13 +168,13 @@ def test_beta_of_ones_usually_fails() -> None:
     one.
     """
     trajectory_of_run = make_shipped_trajectories("asymmetric", {"duration_s": DURATION_S})
-    assert balance(trajectory_of_run, np.full(3, 1 / 3)).residual > 1e-2
+    assert compute_balance(trajectory_of_run, np.full(3, 1 / 3)).residual > 1e-2
 
 
 @pytest.mark.parametrize("name", ["free", "paper"])
 def test_v_never_rises_while_nobody_pushes(name: str) -> None:
     """The theorem, in free motion; `paper` is free before its first pulse and after its last one."""
-    b = booked(name)
+    b = compute_shipped_balance(name)
     free = np.diff(b.given) == 0.0
     assert free.sum() > 8000
     rise = np.diff(b.V)[free]
@@ -175,7 +183,7 @@ def test_v_never_rises_while_nobody_pushes(name: str) -> None:
 
 @pytest.mark.long
 def test_v_rises_while_a_hand_pushes() -> None:
-    b = booked("paper_rods")
+    b = compute_shipped_balance("paper_rods")
     assert np.diff(b.V).max() > 1e-5
 
 
@@ -201,11 +209,11 @@ def test_scaled_kd_needs_beta_divided_alike() -> None:
             "duration_s": DURATION_S,
         },
     )
-    right = balance(
+    right = compute_balance(
         trajectory_of_run, left_null_vector(trajectory_of_run.scenario) / list(scale.values())
     )
     assert np.diff(right.V).max() <= 5e-8 * right.V.max()
     assert right.residual <= 5e-5
-    ones = balance(trajectory_of_run, np.ones(3)).V
+    ones = compute_balance(trajectory_of_run, np.ones(3)).V
     assert (ones - np.minimum.accumulate(ones)).max() == pytest.approx(12.3, abs=0.2)
     assert ones[0] == pytest.approx(32.8, abs=0.1)

@@ -63,7 +63,7 @@ SITES = [
 ]
 
 
-def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
+def make_task_setup(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
     """Returns a site whose torques have no limit, under a plain digital scheme."""
     control = LAWS.get(law, {"law": "p_f", "K": 30.0, "d": 4.0, "k_f": 0.4})
     given_changes = {"control": control, "scheme": "digital", **overrides}
@@ -72,7 +72,7 @@ def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
     return scenario.setup(site)._replace(tau_limit_nm=(1e9,), qd_limit_rad_s=(1e9,))
 
 
-def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array]]:
+def draw_state(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array]]:
     """Draws the state of a site, and of each peer its pose, velocity and torque, with poses
     about `apart` away.
     """
@@ -154,9 +154,9 @@ def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance:
     """Its torque, its messages, its motion and its learning, for peers that are apart and for
     peers that agree.
     """
-    site = build(text, name, law)
+    site = make_task_setup(text, name, law)
     for seed in range(3):
-        state, peers = draw(site, seed, distance)
+        state, peers = draw_state(site, seed, distance)
         rates, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
         names = {"tau": rates.tau, "x": rates.x, "xd": rates.xd, "wrench": -rates.reflected}
         for key, value in names.items():
@@ -172,9 +172,9 @@ def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance:
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
 def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str) -> None:
-    site, step = build(text, name, law), 1e-6
+    site, step = make_task_setup(text, name, law), 1e-6
     at = lay_out_arguments(site)
-    state, peers = draw(site, 4, 0.0)
+    state, peers = draw_state(site, 4, 0.0)
     x = np.concatenate([state, np.zeros(at.arguments - at.states)])
     derivative = evaluate_site_rates(site, x).x
     x[at.q_des], x[at.qd_des], x[at.peer_torque] = derivative + 0.05, 0.1, 0.3
@@ -198,7 +198,7 @@ def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rate_of_jacobian_is_its_derivative_along_motion(seed: int) -> None:
-    site = build("posed", "s", "pd_d")
+    site = make_task_setup("posed", "s", "pd_d")
     rng = np.random.default_rng(seed)
     q, qd = rng.normal(0.0, 1.0, (2, len(site.q0)))
     moved, placed_arm = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)

@@ -15,11 +15,11 @@ import pytest
 import trilat_net
 from tests.analysis.builders import JITTER, LYAPUNOV, find_relative_residual, make_run
 from tests.analysis.rough_arms import rough_log
-from tests.core.guarded_runs import adaptive_text, stopped_log
+from tests.core.guarded_runs import adaptive_text, make_stopped_log
 from tests.execution.builders import make_shipped_trajectories
 from tests.scenario.builders import planar_task_text, six_joint_text
-from tests.theory.delay_equations import DelayEquations, equations, inertia
-from tests.theory.energy import balance as balance_by_hand
+from tests.theory.delay_equations import DelayEquations, inertia, make_equations
+from tests.theory.energy import compute_balance as balance_by_hand
 from tests.theory.energy import left_null_vector
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
@@ -40,7 +40,7 @@ def of_largest_v(b: EnergyBalance) -> float:
     return float(np.abs(b.residual).max() / b.V.max())
 
 
-def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
+def measure_order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
     rates = fine_hz // 2, fine_hz
     coarse, fine = (
         of_largest_v(make_run(name, {**overrides, "rate_hz": hz}).balance) for hz in rates
@@ -53,7 +53,7 @@ def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
 )
 def test_balance_closes_to_2e_5_with_second_order(name: str) -> None:
     assert of_largest_v(make_run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
-    assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
+    assert measure_order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
 
 
 def test_balance_closes_until_both_hands_let_go() -> None:
@@ -64,7 +64,9 @@ def test_balance_closes_until_both_hands_let_go() -> None:
 def test_digital_closes_to_some_percent_with_first_order() -> None:
     b = make_run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
     assert of_largest_v(b) == pytest.approx(3.2e-2, rel=0.2)
-    assert order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
+    assert measure_order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(
+        1.0, abs=0.1
+    )
     assert np.abs(b.unexplained).max() <= 4e-5 * b.scale
 
 
@@ -79,7 +81,7 @@ def test_jitter_closes_to_1e_4_with_booked_jumps() -> None:
 def test_jitter_is_of_order_one_at_least() -> None:
     """Over some seeds together: the jumps of a run depend on its draws, and errors cancel to order 1.5."""
     seeds = [{**JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
-    orders = [order("free", 500, **overrides) for overrides in seeds]
+    orders = [measure_order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
 
 
@@ -109,7 +111,7 @@ def test_limits_of_torque_rate_and_reference_are_booked(
 
 def test_a_stop_and_restart_is_booked() -> None:
     """The torque of a stopped site is not that of the law, and the site's estimates stand still."""
-    b = compute_energy_balance(compute_site_energies(stopped_log(adaptive_text(), 3000)))
+    b = compute_energy_balance(compute_site_energies(make_stopped_log(adaptive_text(), 3000)))
     assert np.abs(b.work["torque limit"]).max() > 0.01 * b.V.max()
     assert np.abs(b.work["estimates"]).max() > 1e-3 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-4 * b.scale
@@ -205,7 +207,7 @@ def test_v_converges_to_the_exact_functional() -> None:
     of the program.
     """
     scenario = load_scenario("paper", {"duration_s": 2.0})
-    exact = equations(scenario).solve(2.0)
+    exact = make_equations(scenario).solve(2.0)
     ours = make_run("paper", {"duration_s": 2.0, "rate_hz": 1000}).balance
     for t in (0.5, 1.2, 1.9):
         k = round(t * 1000)
@@ -292,17 +294,17 @@ BAR = 5e-5
 """Largest unexplained energy as a share of the largest V."""
 
 
-def unexplained(balance: EnergyBalance) -> float:
+def find_unexplained_share(balance: EnergyBalance) -> float:
     return float(np.abs(balance.unexplained).max() / balance.V.max())
 
 
-def check_six(duration_s: float) -> LogMetrics:
+def check_six_joints(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
     certificate, metrics = certify(log), compute_log_metrics(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None
-    assert unexplained(certificate.balance) <= BAR
+    assert find_unexplained_share(certificate.balance) <= BAR
     assert np.abs(certificate.balance.residual).max() <= BAR * certificate.balance.V.max()
     for site, energy in certificate.energies.items():
         figures_of_site = metrics.sites[site]
@@ -318,7 +320,7 @@ def check_six(duration_s: float) -> LogMetrics:
 
 
 def test_six_joints_close_with_the_base_parameters() -> None:
-    metrics = check_six(2.0)
+    metrics = check_six_joints(2.0)
     estimates = metrics.estimates["s"].base
     assert estimates is not None
     assert len(estimates.parameter) == 36
@@ -339,12 +341,12 @@ def test_energy_of_seven_joints_closes() -> None:
         text = text.replace(pose, f"{pose[:-1]}, 0.4]")
     log = trilat_net.simulate(parse_scenario(text))
     balance = compute_energy_balance(compute_site_energies(log))
-    assert unexplained(balance) <= BAR
+    assert find_unexplained_share(balance) <= BAR
 
 
 @pytest.mark.long
 def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
-    check_six(10.0)
+    check_six_joints(10.0)
 
 
 def test_premises_name_joints_at_limits_and_at_stops() -> None:
@@ -390,34 +392,40 @@ def test_friction_and_stops_stand_in_arm_energies() -> None:
 """Largest residual as a share of the largest V."""
 
 
-def judge(rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object) -> Certificate:
+def certify_planar_task(
+    rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object
+) -> Certificate:
     text = planar_task_text(rate_hz=rate_hz, elbow_rad=elbow_rad)
     return certify(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
 
 
-def share(certificate: Certificate, name: str = "residual") -> float:
+def find_largest_share(certificate: Certificate, name: str = "residual") -> float:
     assert certificate.balance is not None, certificate.verdict.text
     return float(np.abs(getattr(certificate.balance, name)).max() / certificate.balance.V.max())
 
 
 def test_the_balance_closes_with_order_two() -> None:
-    certificates = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
+    certificates = {rate_hz: certify_planar_task(rate_hz) for rate_hz in (500, 1000)}
     assert all(
         certificate.verdict.finding is StabilityFinding.COVERED
         for certificate in certificates.values()
     )
-    assert share(certificates[1000]) <= BAR
-    assert share(certificates[500]) / share(certificates[1000]) == pytest.approx(4.0, rel=0.1)
+    assert find_largest_share(certificates[1000]) <= BAR
+    assert find_largest_share(certificates[500]) / find_largest_share(
+        certificates[1000]
+    ) == pytest.approx(4.0, rel=0.1)
 
 
 def test_the_balance_closes_under_jitter_and_limits() -> None:
-    jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
-    box = judge(
+    jitter = certify_planar_task(
+        **{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30}
+    )
+    box = certify_planar_task(
         **{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2}
     )
-    limit = judge(**{"limits.tau_limit_nm": 25.0})
+    limit = certify_planar_task(**{"limits.tau_limit_nm": 25.0})
     for balanced in (jitter, box, limit):
-        assert share(balanced) <= BAR
+        assert find_largest_share(balanced) <= BAR
     assert box.verdict.finding is StabilityFinding.COVERED
     assert {premise.name for premise in limit.premises if not premise.holds} == {"torque"}
     assert limit.verdict.rise is not None
@@ -425,7 +433,7 @@ def test_the_balance_closes_under_jitter_and_limits() -> None:
 
 
 def test_damping_near_a_singular_pose_fails_a_premise() -> None:
-    certificate = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
+    certificate = certify_planar_task(elbow_rad=0.15, **{"task.singular_value": 0.3})
     premise = next(listed for listed in certificate.premises if listed.name == "singular poses")
     assert premise.holds is False
     assert "s from 0 s on" in premise.text
@@ -433,7 +441,7 @@ def test_damping_near_a_singular_pose_fails_a_premise() -> None:
     assert (
         abs(certificate.balance.work["singular poses"][-1]) > 0.02 * certificate.balance.V.max()
     )
-    assert share(certificate, "unexplained") <= 2e-4
+    assert find_largest_share(certificate, "unexplained") <= 2e-4
 
 
 @pytest.mark.long
@@ -447,7 +455,7 @@ def test_the_axis_of_one_arm_dissipates() -> None:
     )
     certificate = certify(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
-    assert share(certificate) <= BAR
+    assert find_largest_share(certificate) <= BAR
     assert certificate.balance is not None
     taken = certificate.balance.dissipation["open axes"]
     assert taken[-1] > 1e-3
@@ -462,7 +470,7 @@ def test_the_axis_of_one_arm_dissipates() -> None:
 
 
 def test_following_an_axis_free_at_peers_fails() -> None:
-    certificate = judge(**{"sites.m.task.axes": ["x"]})
+    certificate = certify_planar_task(**{"sites.m.task.axes": ["x"]})
     premise = next(listed for listed in certificate.premises if listed.name == "axes")
     assert premise.holds is False
     assert "s follows m" in premise.text

@@ -34,7 +34,7 @@ EQ = SiteConstants(
 )
 
 
-def moving(
+def draw_records(
     random: np.random.Generator, site: str, used: dict[str, np.ndarray], rows: int, first: int
 ) -> AlignedRecords:
     vectors = [random.normal(size=(rows, 2)) for _ in range(6)]
@@ -49,13 +49,13 @@ class Situation:
 
     def __init__(self, seed: int, before: tuple[int, int], after: tuple[int, int]) -> None:
         random = np.random.default_rng(seed)
-        self.peers = [moving(random, name, {}, ROWS, 0) for name in ("a", "b")]
+        self.peers = [draw_records(random, name, {}, ROWS, 0) for name in ("a", "b")]
         self.alpha = random.dirichlet([1.0, 1.0])
         used = {
             name: np.array(pair)
             for name, pair in zip(("a", "b"), zip(before, after, strict=True), strict=True)
         }
-        self.track = moving(random, "s", used, 2, NOW)
+        self.track = draw_records(random, "s", used, 2, NOW)
         self.views = [
             view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers
         ]

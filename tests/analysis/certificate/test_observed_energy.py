@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from trilat_studies.tuning.tuning_report import list_energy_notes
 
-from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
+from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, make_energy_pair
 from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from tests.scenario.builders import make_scenario
-from tests.unit_arm import hand, unit_scenario
+from tests.unit_arm import make_spring_hand, make_unit_scenario
 from trilat_net.analysis.certificate.observed_energy import (
     NEGATIVE_ENERGY_MEANING,
     ObservedEnergy,
@@ -141,7 +141,7 @@ def test_the_certificate_reports_it_in_text_and_json() -> None:
 @cache
 def simulate_law(law: str) -> Log:
     """Returns the log of a law with a clamped slave and delays of 200 ms each way."""
-    return simulate_scenario(pair(LAWS[law], clamped=True, duration_s=3.0))
+    return simulate_scenario(make_energy_pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
 @pytest.mark.long
@@ -200,7 +200,7 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
 def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
     """As published: the follower's damper uses a velocity with which the follower is not moved."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
-    log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
+    log = simulate_scenario(make_energy_pair(law, clamped=False, duration_s=4.0))
     energies = ObservedEnergy.of_log(log)
     taken = next(energy for energy in energies.least if energy.name == "taken by s")
     assert energies.finding is ObservedFinding.NEGATIVE
@@ -212,7 +212,9 @@ def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
 def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
-    log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
+    log = simulate_scenario(
+        make_energy_pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits)
+    )
     energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert next(
@@ -237,10 +239,14 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
         "s": {"m1": 0.8, "m2": 0.2},
     }
     control = {**LAWS[law], **FOLLOWER}
-    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
+    sites = {
+        "m1": {"hands": [make_spring_hand(0.3)]},
+        "m2": {"hands": [make_spring_hand(-0.3)]},
+        "s": {},
+    }
     for name, beta in (("m2", 0.5), ("s", 1.5)):
         sites[name]["control"] = {**control, "beta": beta}
-    scenario = unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
+    scenario = make_unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
     energies = ObservedEnergy.of_log(simulate_scenario(scenario))
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)

@@ -14,7 +14,7 @@ from trilat_net.log.log_reader import Log
 BLOCK = 60
 
 
-def courses(
+def compute_courses(
     log: Log, *, late: int = 0, without: frozenset[int] = frozenset()
 ) -> list[EnergyCourse]:
     """Returns V of a log whose records arrive block by block, those of its last site later;
@@ -39,7 +39,7 @@ def courses(
     return courses_found
 
 
-def joined(found: list[EnergyCourse]) -> EnergyCourse:
+def join_courses(found: list[EnergyCourse]) -> EnergyCourse:
     return EnergyCourse(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
@@ -47,7 +47,7 @@ def joined(found: list[EnergyCourse]) -> EnergyCourse:
 def test_v_while_running_equals_that_of_log(late: int) -> None:
     """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
     whole = make_run("rich").balance
-    course = joined(courses(make_run("rich").log, late=late))
+    course = join_courses(compute_courses(make_run("rich").log, late=late))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert len(set(rows.tolist())) > 0.95 * len(whole.t_s)
     most = np.abs(whole.V).max()
@@ -60,7 +60,7 @@ def test_v_without_some_records_is_the_incomplete_logs() -> None:
     log = make_run("rich").log
     gap = frozenset(range(700, 760))
     whole = make_run("rich").balance
-    course = joined(courses(log, without=gap))
+    course = join_courses(compute_courses(log, without=gap))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     # the gap and the samples of it that are in use
     far = (course.t_s < 1.3) | (course.t_s > 2.2)
@@ -78,7 +78,7 @@ def test_v_begins_late_in_a_session_joined_late() -> None:
                 windows[site].receive(record)
         blocks.append(running.compute_next({site: windows[site].newest for site in log.sites}))
     assert blocks[0] is None
-    course = joined([block for block in blocks if block is not None])
+    course = join_courses([block for block in blocks if block is not None])
     assert 2.4 < course.t_s[0] < 3.2
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * np.abs(whole.V).max()

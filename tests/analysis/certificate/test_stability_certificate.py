@@ -61,7 +61,7 @@ def test_growth_alone_judges_laws_without_functional(
     assert certificate.stability is stability
 
 
-def outside(log: Log, *, known: bool) -> Log:
+def make_arm_external(log: Log, *, known: bool) -> Log:
     """Returns the same records, of a slave with an external arm."""
     spec = log.scenario.sites["s"]
     arm = msgspec.structs.replace(spec.arm, known=known)
@@ -73,14 +73,14 @@ def outside(log: Log, *, known: bool) -> Log:
     return log
 
 
-def still_free() -> Log:
+def make_free_log() -> Log:
     return rewrite_log(
         make_run("free", {"duration_s": 2.0, "rate_hz": 200}).log, lambda _: True
     )
 
 
 def test_an_arm_with_unknown_theta_has_no_v() -> None:
-    certificate = certify(outside(still_free(), known=False))
+    certificate = certify(make_arm_external(make_free_log(), known=False))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         certificate.verdict.text
@@ -89,17 +89,19 @@ def test_an_arm_with_unknown_theta_has_no_v() -> None:
 
 
 def test_external_arms_are_judged_with_identified_theta() -> None:
-    as_told = certify(outside(still_free(), known=True))
+    as_told = certify(make_arm_external(make_free_log(), known=True))
     assert as_told.verdict.finding is StabilityFinding.COVERED
     assert "no record says who pushes the arm of s" in as_told.verdict.text
     change = lambda s: replace_fields(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
-    certificate = certify(outside(rewrite_log(still_free(), change=change), known=True))
+    certificate = certify(
+        make_arm_external(rewrite_log(make_free_log(), change=change), known=True)
+    )
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert "the external arm of s does not move as its theta says" in certificate.verdict.text
 
 
 def test_a_record_without_neighbours_is_no_period() -> None:
-    certificate = certify(rewrite_log(still_free(), lambda state: state.tick % 2 == 0))
+    certificate = certify(rewrite_log(make_free_log(), lambda state: state.tick % 2 == 0))
     assert certificate.verdict.text == f"V cannot be judged: {RECORD_GAPS[RecordGap.NO_PERIOD]}"
 
 

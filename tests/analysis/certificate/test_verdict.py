@@ -21,7 +21,7 @@ from tests.log.builders import (
     replace_fields,
     rewrite_log,
 )
-from tests.log_surgery import taken_apart
+from tests.log.surgery import take_apart
 from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
@@ -307,7 +307,7 @@ def test_a_whole_log_is_stable_with_reasons() -> None:
 @pytest.mark.parametrize("cut", [range(1490, 1525), range(2965, 3000), range(35)])
 def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
     """At the end, the beginning or in between, of one site."""
-    taken = taken_apart(make_log_bytes("free", RUN)).without_chain()
+    taken = take_apart(make_log_bytes("free", RUN)).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
     topic = "/trilat/free/s/state"
     taken.messages = [
@@ -344,7 +344,7 @@ def test_only_recorded_periods_count_for_v() -> None:
 
 
 def test_no_option_accepts_a_changed_log() -> None:
-    pieces = taken_apart(make_log_bytes("free", RUN))
+    pieces = take_apart(make_log_bytes("free", RUN))
     pieces.metadata("trilat.session")["seed"] += "0"
     certificate = certify_bytes(pieces.bytes())
     assert any("changed since it was made" in why for why in certificate.reasons)

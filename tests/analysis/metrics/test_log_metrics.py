@@ -29,7 +29,7 @@ from trilat_net.log.log_reader import Log
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 
-def told(log: Log) -> dict[str, Any]:
+def check_facts(log: Log) -> dict[str, Any]:
     """Returns the facts of a log after checking the rules that all facts obey."""
     measured = compute_log_metrics(log)
     facts: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
@@ -52,17 +52,17 @@ def told(log: Log) -> dict[str, Any]:
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_every_released_version_is_measured(path: Path) -> None:
-    facts = told(trilat_net.open_log(path))
+    facts = check_facts(trilat_net.open_log(path))
     assert facts["sites"]["s"]["rms_error_rad"] > 0.0
     assert facts["sites"]["s"]["unaccounted_j"] < 1e-3
     assert facts["links"]["m2->s"]["age_mean_ms"] > 0.0
 
 
 def test_busy_and_uneven_sites_are_measured() -> None:
-    facts = told(make_busy_run().log)
+    facts = check_facts(make_busy_run().log)
     assert facts["links"]["b->a"]["burst"] > 1.0
     assert facts["links"]["b->a"]["loss"] == pytest.approx(0.2, abs=0.1)
-    told(make_short_log("four"))
+    check_facts(make_short_log("four"))
 
 
 def test_gaps_and_late_starts_are_counted() -> None:
@@ -70,18 +70,18 @@ def test_gaps_and_late_starts_are_counted() -> None:
     torn = rewrite_log(
         log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False
     )
-    facts = told(torn)
+    facts = check_facts(torn)
     assert facts["sites"]["m1"]["missing"] == 40.0
     assert facts["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert not facts["complete"]
-    late = told(rewrite_log(log, lambda state: 150 < state.tick < 400))
+    late = check_facts(rewrite_log(log, lambda state: 150 < state.tick < 400))
     assert late["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert late["run"]["spread_max_rad"] > 0.0
 
 
 def test_a_missing_site_lacks_only_its_figures() -> None:
     log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
-    facts = told(rewrite_log(log, lambda state: state.site != "m1"))
+    facts = check_facts(rewrite_log(log, lambda state: state.site != "m1"))
     assert facts["sites"]["m2"]["controller_j"] is not None
     assert facts["links"]["m2->s"]["delay_j"] is not None
     assert facts["unknown"]["sites.m1.controller_j"] == "no records of m1"
@@ -94,13 +94,13 @@ def test_a_missing_site_lacks_only_its_figures() -> None:
 @pytest.mark.parametrize("ticks", [0, 1, 2, 3])
 def test_nearly_empty_logs_are_no_error(ticks: int) -> None:
     log = make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log
-    facts = told(rewrite_log(log, lambda state: state.tick < ticks))
+    facts = check_facts(rewrite_log(log, lambda state: state.tick < ticks))
     assert (facts["sites"]["m"]["controller_j"] is None) == (ticks < 2)
     assert (facts["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
 
 
 def test_a_diverged_run_is_measured_until_divergence() -> None:
-    facts = told(make_diverged_log())
+    facts = check_facts(make_diverged_log())
     assert facts["sites"]["m1"]["unaccounted_j"] < 1e-2
 
 
@@ -117,18 +117,18 @@ def test_unphysical_numbers_are_missing_without_error(size: float) -> None:
             },
         ),
     )
-    assert told(grown)["sites"]["m"]["mechanical_j"] is None
+    assert check_facts(grown)["sites"]["m"]["mechanical_j"] is None
 
 
 def test_loops_are_reported_if_clocks_were_read() -> None:
     """Every loop late by its tick in us, every tick 7 us of work."""
     log = add_clock_readings(make_run("free", {"duration_s": 1.0, "rate_hz": 200}).log)
-    facts = told(log)["sites"]["m1"]
+    facts = check_facts(log)["sites"]["m1"]
     assert facts["late_max_us"] == 199.0
     assert facts["busy_p99_us"] == 7.0
     assert facts["overruns"] == 0.0
     assert (
-        told(make_run("free", {"duration_s": 1.0, "rate_hz": 200}).log)["sites"]["m1"][
+        check_facts(make_run("free", {"duration_s": 1.0, "rate_hz": 200}).log)["sites"]["m1"][
             "late_max_us"
         ]
         is None

@@ -22,7 +22,7 @@ damping_n_s_m = 20.0
 """
 
 
-def swinging(_: str, t_s: float) -> dict[str, list[float]]:
+def swing_arm(_: str, t_s: float) -> dict[str, list[float]]:
     """The stretched arm turns through the horizontal: its tip is at 2 cos q."""
     angle = 0.5 * math.cos(2.0 * math.pi * t_s)
     return {"q": [angle, 0.0], "qd": [-math.pi * math.sin(2.0 * math.pi * t_s), 0.0]}
@@ -30,11 +30,11 @@ def swinging(_: str, t_s: float) -> dict[str, list[float]]:
 
 def test_force_depth_and_hits_of_a_swing() -> None:
     """2 cos q > 1.9 m twice a period; K depth - B outward speed, never pulling."""
-    log = make_pair_log(swinging, more=WALL)
+    log = make_pair_log(swing_arm, more=WALL)
     figures = compute_log_metrics(log).walls["s/1"]
     force = []
     for t_s in log["s"].t_s.tolist():
-        pose = swinging("s", t_s)
+        pose = swing_arm("s", t_s)
         depth, inward = (
             2.0 * math.cos(pose["q"][0]) - 1.9,
             -2.0 * math.sin(pose["q"][0]) * pose["qd"][0],
@@ -63,7 +63,7 @@ def test_contact_from_the_first_record_is_no_hit() -> None:
 
 def test_contact_that_began_in_gaps_is_no_hit() -> None:
     """Its beginning is unknown; and missing records give no numbers."""
-    whole = make_pair_log(swinging, more=WALL)
+    whole = make_pair_log(swing_arm, more=WALL)
     torn = rewrite_log(
         whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140)
     )

@@ -10,12 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.waiting import until
+from tests.recorder.play.logs import preload_paths, write_event_log
 from trilat_net.app.play.batch import BatchBuilder, MessageBatch, PlayedMessage
 from trilat_net.app.play.message_source import MessageSource, feed_player, sort_messages
 from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from trilat_net.errors import LogError, RuntimeFault
-
-from .logs import loaded, write
 
 
 def whole(messages: list[PlayedMessage]) -> list[PlayedMessage]:
@@ -108,7 +107,7 @@ def rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
 
 
 def test_reading_processes_give_the_same_rounds(log_file: Path) -> None:
-    preloaded, block = loaded(log_file)
+    preloaded, block = preload_paths(log_file)
     with reading(log_file, loop=True) as (source, header):
         assert list(rounds(source, 3)) == [list(block.messages())] * 3
         assert header.topics == preloaded.topics
@@ -133,7 +132,7 @@ def test_unreadable_messages_are_errors_here(
     says: str,
     tmp_path: Path,
 ) -> None:
-    path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
+    path = write_event_log(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
     header, _ = preload_messages([path], PlaySelection(), 0)
     with closing(MessageSource(header, None)) as source:
         source.start_reader([path], PlaySelection(), loop=True)

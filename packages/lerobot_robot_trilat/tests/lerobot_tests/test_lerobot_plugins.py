@@ -14,7 +14,7 @@ import pytest
 
 import trilat_net
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reached
+from tests.sites.sessions import SESSION, Session, reach_session
 from trilat_net.app.running_session import open_hand
 from trilat_net.errors import UsageError
 from trilat_net.log.log_reader import Log
@@ -219,12 +219,12 @@ def test_a_person_takes_over_from_a_policy(
 
         monkeypatch.setattr(trilat_net, "hand", hold, raising=False)
         monkeypatch.setattr(
-            trilat_net, "session", lambda *_, **__: reached(bus, clock), raising=False
+            trilat_net, "session", lambda *_, **__: reach_session(bus, clock), raising=False
         )
         relayed = SimpleNamespace(sleep=wait_s, monotonic=lambda: 1e-9 * clock.monotonic_ns())
         monkeypatch.setattr(found_plugins[ROBOT], "time", relayed)
         wait_s(1.0)
-        seen.update(drive(found_plugins, reached(bus, clock), wait_s))
+        seen.update(drive(found_plugins, reach_session(bus, clock), wait_s))
 
     session.stranger(act)
     log = session.run()

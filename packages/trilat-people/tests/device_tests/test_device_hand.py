@@ -14,7 +14,7 @@ from trilat_people.devices.haply_inverse3 import SILENCE_S
 from tests.documentation import find_blocks
 from tests.sites.devices import ZERO, ScriptedDevice
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import Session, reached
+from tests.sites.sessions import Session, reach_session
 from trilat_net.app.input_device import DeviceState
 from trilat_net.core.life.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
@@ -51,7 +51,7 @@ class Led:
 
         def act(bus: Bus, clock: RelayClock) -> None:
             self.device = ScriptedDevice(clock, script, hangs_s)
-            reached(bus, clock).lead("m1", self.device, say=self.said.append)
+            reach_session(bus, clock).lead("m1", self.device, say=self.said.append)
 
         session.stranger(act)
         self.log: Log = session.run()
@@ -248,7 +248,7 @@ def test_old_records_are_not_felt(tmp_path: Path) -> None:
 
     def act(bus: Bus, clock: RelayClock) -> None:
         devices.append(ScriptedDevice(clock, moving(up, clutched)))
-        reached(bus, clock).lead("m1", devices[0], say=lambda _: None)
+        reach_session(bus, clock).lead("m1", devices[0], say=lambda _: None)
 
     session.stranger(act)
     session.clocks["m1"].stall(session.relay.now_ns + 2_300_000_000, 400_000_000)
@@ -276,7 +276,7 @@ def test_the_documented_device_leads_an_arm(tmp_path: Path) -> None:
         load_scenario("play", {"duration_s": 3.0, "rate_hz": 200}), tmp_path
     )
     session.stranger(
-        lambda bus, clock: reached(bus, clock).lead("m1", pushed, say=lambda _: None)
+        lambda bus, clock: reach_session(bus, clock).lead("m1", pushed, say=lambda _: None)
     )
     log = session.run()
     target = log["m1"].hand[log["m1"].hand[:, 2] > 0.0, 3:5]

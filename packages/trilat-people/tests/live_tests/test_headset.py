@@ -14,7 +14,7 @@ from playwright.sync_api import Page
 
 from tests.live.browsers import browser_page, needs_browser, page_address, role_address, shows
 from tests.live.page_client import with_query
-from tests.live.processes import Process, Stage, executed_again
+from tests.live.processes import Process, Stage, assert_executed_again
 from trilat_net import create_keys
 from trilat_net.log.log_reader import Log, open_log
 
@@ -84,7 +84,7 @@ def ended(running: Process, stage: Stage) -> Log:
     running.signal(signal.SIGINT)  # nobody reads its report
     running.code()
     log = open_log(stage.folder / "out" / "run.mcap")
-    executed_again(log)
+    assert_executed_again(log)
     return log
 
 

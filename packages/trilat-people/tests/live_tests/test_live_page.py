@@ -25,7 +25,14 @@ from tests.live.browsers import (
     tip_px,
 )
 from tests.live.page_client import page_client, socket_address, with_query
-from tests.live.processes import PAPER, Process, Session, Stage, connections, executed_again
+from tests.live.processes import (
+    PAPER,
+    Process,
+    Session,
+    Stage,
+    assert_executed_again,
+    connection_options,
+)
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from tests.page.whole_pages import watched_page
@@ -99,7 +106,7 @@ def test_people_see_hold_change_and_end_sessions(stage: Stage) -> None:
     running.signal(signal.SIGINT)
     assert running.code() == 130
     log = open_log(stage.folder / "out" / "run.mcap")
-    executed_again(log)
+    assert_executed_again(log)
     assert_energies_are_those_of(log, energies)
     assert len({event.command for event in log.events if event.kind == "change"}) == 6
     assert [event.text for event in log.events if event.kind == "mark"] == ["felt it"]
@@ -285,7 +292,7 @@ def test_arms_are_free_after_their_page_dies(killed: str, stage: Stage) -> None:
     """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
     session = Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=250")
     session.all()
-    ways = connections(session.endpoints)
+    ways = connection_options(session.endpoints)
     page_server = stage.start("page", "live", "--session", "t", "--no-browser", *ways)
     with sync_playwright() as playwright:
         browser = launch(playwright)
@@ -395,7 +402,7 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
         shows(page, "trilat.frame && trilat.frame.sites.s.mode === 'run'")
         assert page.locator("#alarms .raised").count() == 0
         arm = page.locator(".arm").first.bounding_box()
-        ways = connections(re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2])
+        ways = connection_options(re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2])
         name = page.evaluate("trilat.hello.session")
         stop = stage.start("stop", "stop", "--session", name, "s", *ways)
         assert stop.code() == 0, stop

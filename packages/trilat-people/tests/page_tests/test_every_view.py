@@ -20,7 +20,7 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.page.whole_pages import watched_page
 from tests.scenario.builders import planar_task_text, posed_task_text, six_joint_text
-from tests.sites.sessions import Session, gliding, reached
+from tests.sites.sessions import Session, make_gliding_scenario, reach_session
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
@@ -54,7 +54,7 @@ def give_orders(orders: Mapping[float, str], bus: Bus, clock: Clock) -> None:
     begun_ns = clock.monotonic_ns()
     for at_s, order in orders.items():
         clock.sleep_until(begun_ns + int(at_s * 1e9))
-        reached(bus, clock).send_order(["s"], order)
+        reach_session(bus, clock).send_order(["s"], order)
 
 
 def record(scenario: Scenario, user: str, orders: Mapping[float, str] = {}) -> Views:
@@ -100,9 +100,11 @@ SESSIONS: dict[str, Views] = {
         "m1",
     ),
     "wall": record(load_scenario("contact", {"duration_s": 3.0, "rate_hz": 200}), "m"),
-    "stopped": record(gliding(5.0), "m", {2.5: "stop"}),
-    "stopped and enabled": record(gliding(6.0), "m", {2.0: "stop", 3.5: "enable"}),
-    "fault": record(gliding(4.0, **{"sites.s.limits.qd_limit_rad_s": 0.1}), "m"),
+    "stopped": record(make_gliding_scenario(5.0), "m", {2.5: "stop"}),
+    "stopped and enabled": record(
+        make_gliding_scenario(6.0), "m", {2.0: "stop", 3.5: "enable"}
+    ),
+    "fault": record(make_gliding_scenario(4.0, **{"sites.s.limits.qd_limit_rad_s": 0.1}), "m"),
     "diverged": record(
         load_scenario(
             "free", {"duration_s": 4.0, "rate_hz": 200, "limits.qd_limit_rad_s": 4.5}

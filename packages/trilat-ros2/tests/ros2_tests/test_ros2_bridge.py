@@ -38,7 +38,7 @@ from trilat_ros2.ros2_bridge import (
 from trilat_ros2.ros2_topics import BridgeEnds, SiteTopics
 
 import trilat_net
-from tests.log.standard_files import made
+from tests.log.standard_files import write_standard_files
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
@@ -779,7 +779,7 @@ def list_bag(path: Path) -> dict[str, tuple[str, bool]]:
 
 
 def test_bags_have_the_topics_of_live_bridges(tmp_path: Path) -> None:
-    bag = list_bag(made(tmp_path)["bag"])
+    bag = list_bag(write_standard_files(tmp_path)["bag"])
     sites = Sites([], "two_sites", "lab")
     sites.begin(10**18)
     with sites.shown():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from trial_tests.results import QUICK
 from trilat_studies.study_commands import parse_seeds
 
-from tests.cli.running import started, trilat
+from tests.cli.running import start_command, trilat
 from tests.net.waiting import until
 from trilat_net.errors import UsageError
 from trilat_net.scenario import list_shipped, load_scenario
@@ -122,7 +122,7 @@ def test_other_texts_name_no_seeds(text: str) -> None:
 def test_ctrl_c_exits_130_and_leaves_no_process(folder: Path) -> None:
     """Ctrl-C ends the program and its worker processes without a traceback."""
     (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))
-    process = started("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
+    process = start_command("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
 
     def list_workers() -> list[Path]:
         """Returns the folders in /proc of the program's worker processes."""

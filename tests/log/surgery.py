@@ -92,7 +92,7 @@ def _write(writer: McapWriter, entry: Any) -> None:
             )
 
 
-def taken_apart(data: bytes) -> Pieces:
+def take_apart(data: bytes) -> Pieces:
     pieces, scanner = Pieces(), RecordScanner(io.BytesIO(data))
     for frame in scanner.frames():
         if frame.opcode == Opcode.DATA_END:
@@ -111,7 +111,7 @@ def taken_apart(data: bytes) -> Pieces:
     return pieces
 
 
-def repacked(message: Stored, **fields: object) -> Stored:
+def repack_message(message: Stored, **fields: object) -> Stored:
     """A message with other entries; its number in the file follows its tick."""
     record = {**msgpack.unpackb(message.payload), **fields}
     return message._replace(payload=msgpack.packb(record), sequence=record["tick"] & 0xFFFFFFFF)

@@ -24,7 +24,7 @@ class Message(NamedTuple):
     sequence: int
 
 
-def messages(data: bytes) -> list[Message]:
+def read_messages(data: bytes) -> list[Message]:
     reader = make_reader(io.BytesIO(data), validate_crcs=True)
     return [
         Message(channel.topic, m.data, m.log_time, m.publish_time, m.sequence)
@@ -32,13 +32,13 @@ def messages(data: bytes) -> list[Message]:
     ]
 
 
-def changed(message: Message, **fields: object) -> Message:
+def change_message(message: Message, **fields: object) -> Message:
     return message._replace(
         payload=msgpack.packb({**msgpack.unpackb(message.payload), **fields})
     )
 
 
-def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
+def make_foreign_bytes(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
     """A file of another program, with these messages on one channel."""
     stream = io.BytesIO()
     writer = Writer(stream, **options)
@@ -52,7 +52,7 @@ def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def a_file(
+def make_bytes_of_messages(
     data: bytes,
     chosen: Sequence[Message],
     *,
@@ -101,16 +101,18 @@ def a_file(
     return stream.getvalue()
 
 
-def dealt(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
+def make_parts(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
     """The parts of a log: file n has the messages whose places are in hand n, in their order."""
-    every = messages(data)
+    every = read_messages(data)
     return [
-        a_file(data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs)  # type: ignore[arg-type]
+        make_bytes_of_messages(
+            data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs
+        )  # type: ignore[arg-type]
         for n, hand in enumerate(hands)
     ]
 
 
-def split(folder: Path, *, refilled: range) -> list[Path]:
+def write_late_parts(folder: Path, *, refilled: range) -> list[Path]:
     """A log in three parts, into which some records of `s` came later than others, out of its memory."""
     data = make_log_bytes("paper")
     scenario = open_bytes(data).scenario
