@@ -51,14 +51,14 @@ class Choices:
         return self.randrange(0, 1 << 20) / (1 << 20)
 
 
-def changed(data: bytes) -> None:
+def fuzz_changed_log(data: bytes) -> None:
     """Runs once: a log, changed by the fuzzer's bytes, is read by all readers."""
     choices = Choices(data)
     log = LOGS[choices.randrange(0, len(LOGS))]
-    read(mangle_log(log, choices))
+    fuzz_bytes(mangle_log(log, choices))
 
 
-def read(data: bytes) -> None:
+def fuzz_bytes(data: bytes) -> None:
     """Runs once: the bytes are read by all readers."""
     PATH.write_bytes(data)
     read_by_all(PATH)
@@ -78,7 +78,7 @@ def main() -> None:
         arguments.append(str(FOLDER / "seeds"))
     limits = [f"-rss_limit_mb={MEMORY_MB}", "-timeout=120"]
     long = [] if as_bytes else ["-len_control=0", "-max_len=300"]
-    atheris.Setup([*arguments, *limits, *long], read if as_bytes else changed)
+    atheris.Setup([*arguments, *limits, *long], fuzz_bytes if as_bytes else fuzz_changed_log)
     atheris.Fuzz()
 
 

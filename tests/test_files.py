@@ -42,8 +42,10 @@ def read_folder(folder: Path) -> dict[str, str]:
 
 
 def write_output(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
-    with stage_output(path, force=force, manifest=EXPORT_MANIFEST if folder else None) as made:
-        (made / EXPORT_MANIFEST if folder else made).write_text(text)
+    with stage_output(
+        path, force=force, manifest=EXPORT_MANIFEST if folder else None
+    ) as staged:
+        (staged / EXPORT_MANIFEST if folder else staged).write_text(text)
 
 
 @pytest.mark.parametrize("folder", [False, True])
@@ -63,8 +65,8 @@ def test_only_the_finished_output_remains(folder: bool, tmp_path: Path) -> None:
 
 
 def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
-    with stage_output(path, force=True, manifest=EXPORT_MANIFEST if folder else None) as made:
-        (made / "half" if folder else made).write_text("half")
+    with stage_output(path, force=True, manifest=EXPORT_MANIFEST if folder else None) as staged:
+        (staged / "half" if folder else staged).write_text("half")
         raise error
 
 

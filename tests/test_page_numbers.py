@@ -8,7 +8,7 @@ tenths of its last printed digit.
 import csv
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from trilat_studies.tuning.search_space import (
 )
 
 import trilat_net
-from tests.analysis.ages_in_use import in_order, newest_wins
+from tests.analysis.ages_in_use import compute_ordered_moments, newest_wins
 from tests.analysis.builders import make_run
 from tests.cli.running import trilat
 from tests.execution.builders import run_fused, sample_records
@@ -61,7 +61,7 @@ SHEET = {
     "link.delay_ms": 20,
     "control.d": 0.25,
     "dominance": SHARES,
-    **{f"sites.m2.arm.{key}": one for key, one in (("m1_kg", 0.5), ("m2_kg", 0.5))},
+    **{f"sites.m2.arm.{key}": mass_kg for key, mass_kg in (("m1_kg", 0.5), ("m2_kg", 0.5))},
     **{f"sites.m2.arm.I{n}_kg_m2": 0.0416667 for n in (1, 2)},
     **{f"sites.s.arm.m{n}_kg": 0.667 for n in (1, 2)},
     **{f"sites.s.arm.I{n}_kg_m2": 0.0555833 for n in (1, 2)},
@@ -142,31 +142,34 @@ def analyse_shipped_ports(name: str, **changes: Any) -> PortAnalysis:
 
 def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
     return next(
-        one for one in port_analysis.transparency if (one.operator_site, one.joint) == ("m", 1)
+        transparency
+        for transparency in port_analysis.transparency
+        if (transparency.operator_site, transparency.joint) == ("m", 1)
     )
 
 
-def learning(delay_ms: float) -> Numbers:
+def list_learning_numbers(delay_ms: float) -> Numbers:
     analysed = analyse_shipped_ports("two_sites", link__delay_ms=delay_ms)
     assert analysed.proof is not None
     assert analysed.proof.passive
-    (band,), least = analysed.velocity.minima.below, analysed.velocity.minima
+    minima = analysed.velocity.minima
+    (band,) = minima.below
     return (
         *band[:2],
-        least.least,
-        least.least_hz,
+        minima.least,
+        minima.least_hz,
         *find_felt_impedance(analysed).interpolate_magnitudes(1.0),
         find_felt_impedance(analysed).ratio_db,
     )
 
 
-def known(delay_ms: float) -> float:
+def find_known_ratio_db(delay_ms: float) -> float:
     analysed = analyse_shipped_ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
     assert analysed.velocity.passive
     return float(find_felt_impedance(analysed).ratio_db)
 
 
-def lacking() -> Numbers:
+def list_lacking_numbers() -> Numbers:
     velocity = analyse_shipped_ports("p_d_margin_two", control__d=1.96).velocity
     (band,) = velocity.minima.below
     return (
@@ -177,7 +180,7 @@ def lacking() -> Numbers:
     )
 
 
-def reflecting(delay_ms: float, d: float) -> PortAnalysis:
+def analyse_reflection(delay_ms: float, d: float) -> PortAnalysis:
     open_ends = {"sites__m__hands": [], "sites__s__environment": []}
     return analyse_shipped_ports(
         "contact", **open_ends, link__delay_ms=delay_ms, sites__m__control__d=d
@@ -185,7 +188,7 @@ def reflecting(delay_ms: float, d: float) -> PortAnalysis:
 
 
 def stable_with_any(delay_ms: float, d: float) -> Numbers:
-    network = reflecting(delay_ms, d)
+    network = analyse_reflection(delay_ms, d)
     assert not network.absolute.below
     return [find_felt_impedance(network).ratio_db]
 
@@ -219,20 +222,20 @@ def measure_age(**changes: Any) -> float:
     return float(
         np.mean(
             [
-                one.mean_ms
-                for one in measure_run("jitter", make_overrides(**changes)).ages.values()
+                ages.mean_ms
+                for ages in measure_run("jitter", make_overrides(**changes)).ages.values()
             ]
         )
     )
 
 
-def anchored(delay_s: float, duration_s: float) -> Numbers:
+def list_anchored_angles(delay_s: float, duration_s: float) -> Numbers:
     """Returns the final angle of the first joint in `paper`: predicted, and of a run."""
     predicted = math.asin(-2.0 / (G * (1.0 + delay_s)))
     return predicted, run_shipped("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
 
 
-def pi() -> Any:
+def compute_pi() -> Any:
     alpha = np.array([[SHARES[i].get(j, 0.0) for j in SHARES] for i in SHARES])
     values, vectors = np.linalg.eig(alpha.T)
     vector = vectors[:, values.real.argmax()].real
@@ -245,7 +248,7 @@ def compute_lyapunov_balance(ones: bool = False, **changes: Any) -> EnergyBalanc
     )
 
 
-def rise(V: Any) -> Numbers:
+def list_rises(V: Any) -> Numbers:
     return (V - np.minimum.accumulate(V)).max(), V[0]
 
 
@@ -332,18 +335,21 @@ LINEAR: dict[str, Make] = {
 PORTS: dict[str, Make] = {
     **{
         f"| {T} | {{}}-{{}} Hz | {{}} at {{}} Hz | yes | {{}} / {{}} | {{}} |": lambda T=T: (
-            learning(T)
+            list_learning_numbers(T)
         )
         for T in (0, 50, 200, 800)
     },
-    "it is {} dB at T = 0 and {} dB at 200 ms": lambda: [known(0), known(200)],
+    "it is {} dB at T = 0 and {} dB at 200 ms": lambda: [
+        find_known_ratio_db(0),
+        find_known_ratio_db(200),
+    ],
     "make it unstable, at {}-{} Hz.": lambda: analyse_shipped_ports(
         "training", timeline=[], sites__m1__hands=[], sites__m2__hands=[]
     ).absolute.below[0][:2],
     **{
-        f"| {T} | {d} | some make it unstable, {{}}-{{}} Hz": lambda T=T, d=d: reflecting(
-            T, d
-        ).absolute.below[0][:2]
+        f"| {T} | {d} | some make it unstable, {{}}-{{}} Hz": lambda T=T, d=d: (
+            analyse_reflection(T, d).absolute.below[0][:2]
+        )
         for T, d in ((20, 5), (200, 5), (200, 30))
     },
     **{
@@ -352,7 +358,7 @@ PORTS: dict[str, Make] = {
     },
 }
 ERRATA: dict[str, Make] = {
-    "with ones rises by {} J of {} J while": lambda: rise(
+    "with ones rises by {} J of {} J while": lambda: list_rises(
         compute_lyapunov_balance(ones=True).V
     ),
     "M = {}`$ kg m²": lambda: [3.0 + math.sqrt(8.0)],
@@ -360,8 +366,8 @@ ERRATA: dict[str, Make] = {
 }
 DAMPING: dict[str, Make] = {
     r"$`x = 0`$, and $`{}\, K T`$ for $`a = 1`$, at $`\tan x = x = {}`$. So": lambda: [
-        (asked := common_motion())[0],
-        math.sqrt(asked[2]),
+        common_motion()[0],
+        math.sqrt(common_motion()[2]),
     ],
     r"m = {}\, K T^2 / {}`$, equal": lambda: common_motion()[1:],
     "K T`$, grow by {}/s.": lambda: find_root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
@@ -392,16 +398,20 @@ LAB: dict[str, Make] = {
     "the age in use is {} ms on average": lambda: [measure_age()],
     "the order makes it {} ms": lambda: [measure_age(link__order="in_order")],
     "to choose from: {} ms": lambda: [measure_age(rate_hz=100)],
-    "so {} rad, and the run ends at {}.": lambda: anchored(0.2, 20),
-    "At 400 ms it is {}, and {}.": lambda: anchored(0.4, 40),
+    "so {} rad, and the run ends at {}.": lambda: list_anchored_angles(0.2, 20),
+    "At 400 ms it is {}, and {}.": lambda: list_anchored_angles(0.4, 40),
     "(1 + Lambda T) = {} N m/rad": lambda: [G**2 * 1.2],
     "moves the slave to {} rad for good": lambda: [run_shipped("box").q[-1, 0]],
     "without the box it returns to {}.": lambda: [run_shipped("box", **NO_BOX).q[-1, 0]],
-    "pi = ({}, {}, {}), so": pi,
-    "proportional to ({}, {}, {}).": lambda: pi() / (10.0, 3.0, 0.3),
+    "pi = ({}, {}, {}), so": compute_pi,
+    "proportional to ({}, {}, {}).": lambda: compute_pi() / (10.0, 3.0, 0.3),
     "V falls from {} to {} J": lambda: compute_lyapunov_balance().V[[0, -1]],
-    "With ones it rises by {} of {} J": lambda: rise(compute_lyapunov_balance(ones=True).V),
-    "ones still fail, by {} J": lambda: rise(compute_lyapunov_balance(True, **EQUAL_KD).V)[:1],
+    "With ones it rises by {} of {} J": lambda: list_rises(
+        compute_lyapunov_balance(ones=True).V
+    ),
+    "ones still fail, by {} J": lambda: list_rises(
+        compute_lyapunov_balance(True, **EQUAL_KD).V
+    )[:1],
     "At 20 ms one hit, then {} N.": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), link__delay_ms=20.0
     ),
@@ -419,8 +429,8 @@ LAB: dict[str, Make] = {
     "With gravity known it stays at {} N": lambda: measure_windows(
         "windup", "wall_mean_n", (58.9, 59.1, "s"), control__Gamma=[1.0, 1.0, 1.0, 0.0, 0.0]
     ),
-    "feels 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[0], 5 * p[2] / p[0]],
-    "trainee 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[1], 5 * p[2] / p[1]],
+    "feels 5 * {} / {} = {} N m": lambda: [(p := compute_pi())[2], p[0], 5 * p[2] / p[0]],
+    "trainee 5 * {} / {} = {} N m": lambda: [(p := compute_pi())[2], p[1], 5 * p[2] / p[1]],
     "torques with it: {} rad/s and {} N m, where {} N m": lambda: [
         *measure_windows("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
         *measure_windows("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
@@ -437,7 +447,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/tutorials/lab-answers.md": LAB,
     "docs/theory/port-results.md": PORTS,
     "docs/studies/ports.md": {
-        "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": lacking,
+        "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": list_lacking_numbers,
     },
     "docs/reference/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/theory/linear-method.md": LINEAR_METHOD,
@@ -446,7 +456,7 @@ PAGES: dict[str, dict[str, Make]] = {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
             uniform_age(order, *ends)
             for ends in ((150, 250), (0, 400))
-            for order in (newest_wins, in_order)
+            for order in (newest_wins, compute_ordered_moments)
         ]
     },
     "docs/reference/certificate-premises.md": {
@@ -495,7 +505,7 @@ PAGES: dict[str, dict[str, Make]] = {
         ],
         "makes {} runs of the shipped": lambda: [len(shipped_trials())],
         "random once): {} s simulated": lambda: [
-            sum(one.scenario.duration_s for one in shipped_trials())
+            sum(trial.scenario.duration_s for trial in shipped_trials())
         ],
     },
     "docs/overview.md": {
@@ -530,17 +540,17 @@ PUSHED_PAGES = (
     "docs/studies/ports.md",
     "docs/theory/errata.md",
 )
-"""Of so many numbers of these pages one is made on a push; the long tests make all numbers of all pages."""
-ROWS = [
-    pytest.param(
-        page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ()
-    )
-    for page, entries in PAGES.items()
-    for n, (words, make) in enumerate(entries.items())
-    for slow in [
-        n % PUSHED > 0 or page not in PUSHED_PAGES or any(word in words for word in LONG)
-    ]
-]
+"""One of `PUSHED` numbers of these pages is tested on a push; the long tests have all numbers of all pages."""
+
+
+def list_rows() -> Iterator[Any]:
+    """Yields the page, the phrase and the source of every number, with a mark if the test is long."""
+    for page, entries in PAGES.items():
+        for n, (phrase, make) in enumerate(entries.items()):
+            is_pushed = n % PUSHED == 0 and page in PUSHED_PAGES
+            is_long = not is_pushed or any(word in phrase for word in LONG)
+            marks = pytest.mark.long if is_long else ()
+            yield pytest.param(page, phrase, make, id=f"{page}: {phrase}", marks=marks)
 
 
 def list_numbers(phrase: str, text: str) -> list[str]:
@@ -566,21 +576,21 @@ def check_page(page: str, phrase: str, source: Numbers | str) -> None:
         for m, _, e in (p.partition("e") for p in printed)
     ]
     off = [
-        one is None or abs(one - float(word)) > 0.6 * digit
-        for one, word, digit in zip(wanted, printed, digits, strict=True)
+        number is None or abs(number - float(word)) > 0.6 * digit
+        for number, word, digit in zip(wanted, printed, digits, strict=True)
     ]
     assert not any(off), f"{printed} on the page, made: {wanted}"
 
 
-@pytest.mark.parametrize(("page", "phrase", "make"), ROWS)
+@pytest.mark.parametrize(("page", "phrase", "make"), list(list_rows()))
 def test_page_numbers_equal_their_source(page: str, phrase: str, make: Make) -> None:
     check_page(page, phrase, make())
 
 
 @pytest.mark.long
 def test_the_printed_certificate_is_the_example(tmp_path: Path) -> None:
-    for words in CERTIFIED:
-        check_page("docs/logs/certificate.md", words, certify_paper(tmp_path))
+    for phrase in CERTIFIED:
+        check_page("docs/logs/certificate.md", phrase, certify_paper(tmp_path))
 
 
 TUNED = re.findall(
@@ -604,18 +614,23 @@ def score_candidate(duration_s: float, changes: Changes) -> CandidateScore:
 
 def test_the_table_of_tuned_gains_has_every_range() -> None:
     rows = [
-        [law, one.name, f"{one.low:g}", f"{one.high:g}", one.unit or "-", one.where or "all"]
+        [
+            law,
+            knob.name,
+            f"{knob.low:g}",
+            f"{knob.high:g}",
+            knob.unit or "-",
+            knob.where or "all",
+        ]
         for law, space in SEARCH_SPACES.items()
-        for one in space.knobs
+        for knob in space.knobs
     ]
     assert [row[:6] for row in read_table("tuned-gains.csv")] == rows
 
 
 @pytest.mark.parametrize("row", ENDS)
 def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
-    """For the rows with gains in docs/theory/fair-comparison-results.md: four of the error,
-    then four of settling.
-    """
+    """The rows with gains in docs/theory/fair-comparison-results.md have four gains for the error, then four for settling."""
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
     (space,) = select_search_spaces([law], load_scenario("free"))
@@ -690,7 +705,7 @@ def test_live_cells_have_their_class(row: int) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
 def test_hardly_excited_modes_are_not_ignored(delay_ms: float, d: float) -> None:
-    """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
+    """As docs/maps/README.md says, the mode grows at 0.01 to 0.03 /s, and the cell is not decided."""
     assert (
         0.005 < find_root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
     )

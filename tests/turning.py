@@ -26,7 +26,7 @@ AXES = (
     (-1, 2, 0.5),
 )
 ALLOWED = 1.5
-"""Largest step of a series by that of the true motion."""
+"""The largest permitted step of a series, relative to the largest step of the true motion."""
 
 
 class Motion(NamedTuple):
@@ -75,7 +75,7 @@ def count_wraps(turned: Rotation) -> int:
     return int(np.count_nonzero(steps > np.pi))
 
 
-def find_largest_step(turned: Rotation) -> float:
+def find_largest_turn(turned: Rotation) -> float:
     """Returns the largest angle from one orientation to the next, rad."""
     return float((turned[1:] * turned[:-1].inv()).magnitude().max())
 
@@ -84,7 +84,8 @@ def place_links(scenario: Scenario, site: str, q: Array) -> list[Rotation]:
     """Returns the orientations of the links of an arm in its base."""
     chain = scenario.arms[site].chain
     assert chain is not None
-    links, whole = list[Rotation](), Rotation.identity()
+    links = list[Rotation]()
+    whole = Rotation.identity()
     for joint, angle in zip(chain.joints, q.T, strict=True):
         whole = (
             whole
@@ -118,7 +119,8 @@ def make_turning_log(number: int) -> tuple[Log, dict[str, Motion]]:
     }
 
     def record(fields: Record) -> Record:
-        site, k = fields["site"], min(fields["tick"], RECORDS - 1)
+        site = fields["site"]
+        k = min(fields["tick"], RECORDS - 1)
         for field, vector in zip(("x", "q_des"), vectors[site], strict=True):
             fields[field] = [*fields[field][:3], *vector[k].tolist()]
         return {**fields, "q": motions[site].q[k].tolist()}

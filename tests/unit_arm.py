@@ -29,7 +29,7 @@ CLAMP = {
     "damping_nm_s_rad": 0.0,
     "to_rad": [0.0, 0.0],
 }
-"""What holds a clamped slave; without it the slave is free."""
+"""A spring that clamps the slave, which is free without the spring."""
 
 
 def make_spring_hand(
@@ -116,15 +116,15 @@ def make_four_channel_pair(
     four-channel law.
     """
 
-    def one(at: int) -> dict[str, Any]:
+    def make_control(at: int) -> dict[str, Any]:
         law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}
         return {
             key: value[at] if isinstance(value, tuple) else value for key, value in law.items()
         }
 
     sites = {
-        "m": {"hands": [DRIVE, make_spring_hand(0.0)], "control": one(0)},
-        "s": {"hands": [WALL], "control": one(1)},
+        "m": {"hands": [DRIVE, make_spring_hand(0.0)], "control": make_control(0)},
+        "s": {"hands": [WALL], "control": make_control(1)},
     }
     link = {"model": "constant", "delay_ms": 1e3 * delay_s}
     return make_unit_scenario(sites, {}, link=link, duration_s=duration_s)

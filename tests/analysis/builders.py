@@ -11,6 +11,7 @@ import numpy as np
 
 import trilat_net
 from tests.log.builders import open_bytes, replace_fields, rewrite_log
+from tests.scenario.builders import rough_arm_text
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
     SiteEnergy,
@@ -135,7 +136,7 @@ ORDERED = {
         )
     }
 }
-"""What is ordered while it runs besides: per site and tick."""
+"""Changes that operators order during the run, by site and tick."""
 
 
 class DrivenRun(NamedTuple):
@@ -217,6 +218,12 @@ def make_diverged_log() -> Log:
     )
 
 
+@cache
+def make_rough_log() -> Log:
+    """Returns the log of `rough_arm_text`, simulated once per process."""
+    return trilat_net.simulate(parse_scenario(rough_arm_text()))
+
+
 def make_site_log(modes: Sequence[str]) -> SiteLog:
     """Returns the first records of a site of `paper`, with the given modes."""
     part = make_short_log("paper")["m1"]
@@ -237,7 +244,7 @@ LYAPUNOV = {
     "duration_s": 5.0,
     "rate_hz": 500,
 }
-"""Unequal shares and Kd, upon `free`."""
+"""Overrides of `free` with unequal shares and Kd."""
 
 JITTER = {
     "link.model": "uniform",
@@ -315,7 +322,7 @@ at_s = 3.0
 dominance = "m1"
 to = { m2 = 0.9, s = 0.1 }
 """
-"""Everything at once that can give energy to V."""
+"""A scenario with everything that can add energy to V."""
 
 WALL = """
 name = "wall"

@@ -69,10 +69,8 @@ def test_a_diverged_record_is_left_out() -> None:
 
 def test_the_past_begins_at_rest() -> None:
     track = align_records(make_short_log("four"), common=True)["b"]
-    now, before = (
-        PeerTrajectory(track).evaluate(track.t_s),
-        PeerTrajectory(track).evaluate(np.array([-0.5, -1e-3])),
-    )
+    now = PeerTrajectory(track).evaluate(track.t_s)
+    before = PeerTrajectory(track).evaluate(np.array([-0.5, -1e-3]))
     assert np.array_equal(now.q, track.q)
     assert np.array_equal(now.qd, track.qd)
     expected = cumulative_trapezoid(track.qd**2, track.t_s, axis=0, initial=0.0)

@@ -87,7 +87,8 @@ def test_shares_give_the_recorded_references(ramped):
     alpha = trace_dominance(ramped, "s", part.t_s).alpha
     reference = np.zeros_like(part.q)
     for peer, factor in zip(part.peers, alpha.T, strict=True):
-        used, q = part.used[peer], ramped[peer].q
+        used = part.used[peer]
+        q = ramped[peer].q
         seen = np.where(
             used[:, None] >= 0, q[np.maximum(used, 0)], ramped.scenario.sites[peer].q0_rad
         )

@@ -265,7 +265,8 @@ def test_a_driven_joint_does_not_oscillate(wide: float, motion: EndBehaviour) ->
     assert RunEnd.of_log(rewrite_log(simulate_rest(), change=changed)).behaviour is motion
 
 
-RATE_HZ, SPAN_S = 50, 40.0
+RATE_HZ = 50
+SPAN_S = 40.0
 T_S = np.arange(round(RATE_HZ * SPAN_S)) / RATE_HZ
 
 
@@ -305,7 +306,7 @@ def test_small_speed_is_rest_only_while_falling(speed, behaviour: EndBehaviour) 
     ],
 )
 def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehaviour) -> None:
-    """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
+    """An arm that sinks by 5, 17 or 69 mrad in the second half, with a speed that falls by 10 %, has not converged."""
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
     sinking = make_trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
     assert sinking.classify_end(scenario).behaviour is behaviour

@@ -24,6 +24,7 @@ from tests.log.builders import (
     make_log_bytes,
     replace_fields,
     rewrite_log,
+    write_log,
 )
 from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
 from trilat_net.errors import LogError
@@ -186,12 +187,6 @@ def test_short_logs_have_nulls_and_no_nan(records):
 WHOLE = make_log_bytes("paper")
 STATE = "/trilat/paper/m1/state"
 RATES = {"m1": 1000, "m2": 1000, "s": 1000}
-
-
-def write_log(folder: Path, data: bytes) -> Path:
-    path = folder / "run.mcap"
-    path.write_bytes(data)
-    return path
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])

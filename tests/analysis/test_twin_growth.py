@@ -25,7 +25,8 @@ def make_twins(rate_per_s: float, omega_rad_s: float = 7.0, seconds: float = 20.
     """Returns one mode of a difference, largest at s joint 1, which is rescaled again and again."""
     t_s = np.arange(int(20 * seconds)) / 20.0 + 0.05
     shape = np.array([0.2, 0.1, 1.0, 0.5])
-    last, scale = 1e-6 * np.cos(omega_rad_s * t_s)[:, np.newaxis] * shape, rate_per_s * t_s
+    last = 1e-6 * np.cos(omega_rad_s * t_s)[:, np.newaxis] * shape
+    scale = rate_per_s * t_s
     push = Push("1e-06 rad at m joint 1", "q", np.eye(2) * 1e-6, again=False)
     path = TwinPath(push, t_s, np.log(np.abs(last)) + scale[:, np.newaxis], last, scale, (0,))
     return Twins([path], JOINTS, np.full((len(t_s), 4), 1e-3), True)

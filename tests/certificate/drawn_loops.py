@@ -18,7 +18,6 @@ from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 DRAWN_S = 40.0
 """The length of a drawn run."""
 RODS = {"lc1_m": 0.5, "lc2_m": 0.5, "I1_kg_m2": 1 / 12, "I2_kg_m2": 1 / 12}
-CIRCLE = {"m1": {"m2": 0.5, "s": 0.5}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 0.5, "m2": 0.5}}
 STIFFNESS = "sites.s.environment.0.stiffness_n_m"
 SAMPLED = "sites.s.environment.0.sampled"
 
@@ -118,11 +117,9 @@ def _draw_shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, fl
 
 def _draw_loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
     """Draws a network of P+d or PD+d whose damping is about the edge of stability."""
-    shares, T_ms, K = (
-        _draw_shares(rng, names),
-        float(rng.uniform(80.0, 400.0)),
-        float(rng.uniform(8.0, 40.0)),
-    )
+    shares = _draw_shares(rng, names)
+    T_ms = float(rng.uniform(80.0, 400.0))
+    K = float(rng.uniform(8.0, 40.0))
     alpha = np.array([[shares[i].get(j, 0.0) for j in names] for i in names])
     worst = max(float(np.abs(np.linalg.eigvals(alpha).real.min())), 0.2173)
     bound = worst * K * (T_ms + 10.0) / 1e3
@@ -160,7 +157,8 @@ def _draw_noisy(rng: np.random.Generator) -> Drawn:
 
 def _draw_groups(rng: np.random.Generator) -> Drawn:
     """Draws two closed groups, one of which hides the motion of the other."""
-    keys, T = _draw_loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
+    keys = _draw_loop(rng, "abce")
+    T = 0.001 * float(rng.uniform(50.0, 300.0))
     d = 10.0 * T * rng.uniform([1.2, 0.7], [2.5, 1.3])
     sites = _draw_sites(rng, "abce", 0.5)
     for n, name in enumerate("abce"):
@@ -246,7 +244,7 @@ KINDS: tuple[tuple[float, Callable[[np.random.Generator], Drawn]], ...] = (
 
 
 WIDE_FROM = 2000
-"""From this seed on everything is drawn."""
+"""The first seed that draws every feature of a scenario."""
 _OF_TWO = ("p_f", "smith")
 _LEARN = ("adaptive", "adaptive_box", "adaptive_robust", "sync", "adaptive_kinematics")
 _TYPICAL: Mapping[str, Mapping[str, float]] = {
@@ -309,17 +307,13 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
 
 def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
     """Draws a link's name and its keys: constant, swinging, drifting, or recorded."""
-    T_ms, kind = (
-        round(float(rng.uniform(20.0, 250.0)), 1),
-        str(rng.choice(["constant", "sine", "ar1", "trace"])),
-    )
+    T_ms = round(float(rng.uniform(20.0, 250.0)), 1)
+    kind = str(rng.choice(["constant", "sine", "ar1", "trace"]))
     if kind == "constant":
         return kind, {"delay_ms": T_ms}
     if kind == "sine":
-        swing, period_s = (
-            round(T_ms * float(rng.uniform(0.1, 0.99)), 1),
-            round(float(rng.uniform(0.4, 4.0)), 3),
-        )
+        swing = round(T_ms * float(rng.uniform(0.1, 0.99)), 1)
+        period_s = round(float(rng.uniform(0.4, 4.0)), 3)
         return kind, {
             "model": kind,
             "delay_ms": T_ms,
@@ -343,7 +337,8 @@ def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
 
 def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
     """Draws a hand that holds, lets go or pushes, or an environment that resists, and returns its kind."""
-    names, to = list(sites), [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
+    names = list(sites)
+    to = [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
     spring = {"kind": "spring", "to_rad": to, "stiffness_nm_rad": _draw_about(rng, 30.0, 3.0)}
     spring |= {
         "damping_nm_s_rad": _draw_about(rng, 6.0, 3.0),
@@ -396,7 +391,8 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
     law = str(rng.choice(list(_TYPICAL)))
     names = "ab" if law in _OF_TWO or (law != "six_channel" and rng.random() < 0.4) else "abc"
     rate_hz = int(rng.choice([100, 200]))
-    sites, space = _draw_sites(rng, names, 0.0), "joints"
+    sites = _draw_sites(rng, names, 0.0)
+    space = "joints"
     spread = float(f"{10.0 ** rng.uniform(-10.0, 0.0):.3g}")
     for name, control in zip(names, _draw_law(rng, law, names), strict=True):
         sites[name]["control"] = control
@@ -408,11 +404,13 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
     loop_keys: dict[str, Any] = {"link": keys, "dominance": _draw_shares(rng, names)}
     starts = np.array(sites["a"]["q0_rad"]).round(3)
     if law in ("adaptive", "p_d", "pd_d") and rng.random() < 0.25:
-        loop_keys["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
+        loop_keys["task"] = {"space": "position", "axes": ["x", "y"]}
+        space = "position"
         starts = np.array([0.2, 1.4])
     elif touch == "nobody" and rng.random() < 0.15 and law != "adaptive_kinematics":
         loop_keys["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
-        starts, space = np.array([0.2, -1.0, 1.2]), "chain"
+        starts = np.array([0.2, -1.0, 1.2])
+        space = "chain"
         for name in names:
             del sites[name]["arm"]
             sites[name]["control"].pop("theta_hat0", None)

@@ -52,7 +52,7 @@ def test_only_laws_with_energies_are_recorded(
 
 
 def test_a_long_run_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its records would fill the memory; roots and pushes decide."""
+    """A run whose records would fill the memory is judged by its roots and pushes."""
     monkeypatch.setattr(judge, "MAX_RECORDED_TICKS", 11_999)
     counted, _ = count_recordings(monkeypatch, "free", LOSSY)
     assert counted == 0

@@ -19,7 +19,7 @@ from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.presentation import terminal_output
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
-"""The same as a process of its own."""
+"""The command line of `trilat` in its own process."""
 
 PLAIN = {**os.environ, "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "100"}
 
@@ -28,7 +28,9 @@ class CommandResult:
     """The exit code of a command, and its output."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
+        self.code = code
+        self.out = out
+        self.err = err
 
     def __repr__(self) -> str:
         return f"exit code {self.code}\n--- out\n{self.out}\n--- err\n{self.err}"
@@ -82,7 +84,8 @@ def simulate_by_command(folder: Path, scenario: str, *settings: str, seconds: st
 def trilat(*arguments: str | Path, cwd: Path) -> CommandResult:
     before = dict(allowed_code)
     allowed_code.clear()
-    out, err = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    err = io.StringIO()
     code: object = None
     with (
         contextlib.chdir(cwd),
@@ -104,7 +107,7 @@ def trilat(*arguments: str | Path, cwd: Path) -> CommandResult:
 
 
 def shorten(file: Path) -> None:
-    """Makes the experiment of a protocol short: two participants, two conditions, a trial each."""
+    """Shortens the experiment of a protocol to two participants, two conditions and one trial each."""
     text = file.read_text(encoding="utf-8")
     text = re.sub(r"\[conditions\.(delay_100|jitter_300)\]\n[^\[]*", "", text)
     for key, value in {"participants": 2, "trials": 1, "practice": 0}.items():

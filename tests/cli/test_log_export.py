@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.log.builders import make_log_bytes
+from tests.log.builders import make_log_bytes, write_log
 from tests.log.split_logs import make_bytes_of_messages, make_parts, read_messages
 
 from .running import trilat
@@ -27,7 +27,7 @@ FORMS = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "run.mcap").write_bytes(make_log_bytes("paper"))
+    write_log(tmp_path, make_log_bytes("paper"))
     return tmp_path
 
 

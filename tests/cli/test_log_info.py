@@ -10,16 +10,10 @@ import pytest
 from mcap.writer import Writer
 
 from tests.cli.running import trilat
-from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, write_log
 from trilat_net.presentation.untrusted_text import sanitize
 
 WHOLE = make_log_bytes("paper")
-
-
-def write_log(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
-    path = folder / name
-    path.write_bytes(data)
-    return path
 
 
 def make_foreign_bytes() -> bytes:

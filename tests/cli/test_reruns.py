@@ -26,7 +26,7 @@ def test_changes_are_summarised_in_lines_that_fit(log_file: Path) -> None:
         "rerun", log_file, "--replace", "s", "--set", "control.Kd=5", cwd=log_file.parent
     )
     text = done.succeeds()
-    for words in (
+    for phrase in (
         "control.Kd of s: 3 -> 5",
         "rms e rad",
         "max tau N m",
@@ -34,7 +34,7 @@ def test_changes_are_summarised_in_lines_that_fit(log_file: Path) -> None:
         "s: the first difference is at tick 1 (0.001 s): tau[0] was",
         "note: m1 and m2 are as recorded: nothing is changed there, and they do not react",
     ):
-        assert words in text
+        assert phrase in text
     assert max(map(len, text.splitlines())) <= 100
 
 

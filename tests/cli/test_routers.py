@@ -12,7 +12,7 @@ from .running import trilat
 COMMANDS = [("site", "m", "--scenario", "two_sites"), ("record", "--session", "t"), ("router",)]
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[0])
 def test_a_bad_configuration_is_refused_in_one_line(
     command: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -27,7 +27,7 @@ def test_a_bad_configuration_is_refused_in_one_line(
     assert done.out == ""
 
 
-@pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda words: words[0])
+@pytest.mark.parametrize("command", COMMANDS[:2], ids=lambda command: command[0])
 def test_a_router_runs_alone(command: tuple[str, ...], tmp_path: Path) -> None:
     options = ("--router", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2")
     trilat(*command, *options, cwd=tmp_path).refuses("--router: ", "leave out --connect")

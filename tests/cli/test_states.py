@@ -10,7 +10,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.log.builders import edit_log_bytes, make_log_bytes, write_log
 from tests.log.split_logs import write_late_parts
 from tests.log.surgery import repack_message, take_apart
 from trilat_net.log.log_reader import open_log
@@ -37,7 +37,8 @@ def make_torn_bytes() -> bytes:
 def make_sparse_bytes() -> bytes:
     """Returns a log of an older recorder that missed every tenth record of m1, and says so."""
     taken = take_apart(make_whole_bytes()).without_chain()
-    topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
+    topics = taken.topics()
+    accounts = taken.metadata("trilat.accounts")
     taken.messages = [
         m
         for m in taken.messages
@@ -138,8 +139,7 @@ def test_reports_use_the_requested_coverage(
 ) -> None:
     """Nine tenths of the records of m1 exist: enough if half is requested."""
     monkeypatch.setattr(page, "write_report", lambda *_, verdicts, **__: [*verdicts][:0])
-    file = tmp_path / "run.mcap"
-    file.write_bytes(STATES["sparse"]())
+    file = write_log(tmp_path, STATES["sparse"]())
     conclusion = conclude(open_log(file), tmp_path, min_coverage=0.5)
     assert {line.check: line.passed for line in conclusion.findings}["records"]
     assert not any("less than 99.9 %" in note for note in conclusion.notes)

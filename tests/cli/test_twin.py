@@ -102,7 +102,8 @@ def test_a_forbidden_law_has_no_twin(folder: Path) -> None:
 
 
 def test_unexecutable_logs_have_no_twin() -> None:
-    lost, log = make_log_without({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
+    lost = make_log_without({"m1": [7]})
+    log = tn.simulate("two_sites", duration_s=0.2)
     with pytest.raises(NotRepeatable, match="records of m1 are missing"):
         tn.twin(lost)
     with pytest.raises(

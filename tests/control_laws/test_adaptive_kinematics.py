@@ -67,7 +67,8 @@ def simulate_law(
 
 def compute_tip_places(log: Log, site: str) -> np.ndarray:
     lengths_m = log.scenario.arms[site].lengths_m
-    inner, outer = log[site].q[:, 0], log[site].q.sum(axis=1)
+    inner = log[site].q[:, 0]
+    outer = log[site].q.sum(axis=1)
     return np.stack(
         [
             lengths_m[0] * np.cos(inner) + lengths_m[1] * np.cos(outer),
@@ -80,14 +81,16 @@ def compute_tip_places(log: Log, site: str) -> np.ndarray:
 @pytest.mark.long
 def test_known_lengths_give_the_task_space_law() -> None:
     pushed = {"Gamma": 0.0, "gravity": 0.0, "elbow_rad": 1.5, "hands": PUSH, "duration_s": 3.0}
-    own, chain = simulate_law(UNKNOWN, **pushed), simulate_law(KNOWN, **pushed)
-    for site in own.sites:
-        np.testing.assert_allclose(own[site].q, chain[site].q, rtol=0.0, atol=1e-9)
-    assert np.ptp(own["s"].q[:, 0]) > 0.1
+    unknown = simulate_law(UNKNOWN, **pushed)
+    chain = simulate_law(KNOWN, **pushed)
+    for site in unknown.sites:
+        np.testing.assert_allclose(unknown[site].q, chain[site].q, rtol=0.0, atol=1e-9)
+    assert np.ptp(unknown["s"].q[:, 0]) > 0.1
 
 
-def jacobians(lengths_m: np.ndarray, q: np.ndarray) -> np.ndarray:
-    inner, outer = q[:, 0], q.sum(axis=1)
+def compute_jacobians(lengths_m: np.ndarray, q: np.ndarray) -> np.ndarray:
+    inner = q[:, 0]
+    outer = q.sum(axis=1)
     reach = lengths_m[:, [1]] * np.stack([-np.sin(outer), np.cos(outer)], axis=1)
     elbow = lengths_m[:, [0]] * np.stack([-np.sin(inner), np.cos(inner)], axis=1)
     return np.stack([elbow + reach, reach], axis=2)
@@ -95,7 +98,7 @@ def jacobians(lengths_m: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def compute_tip_speeds(log: Log, site: str) -> np.ndarray:
     lengths_m = np.tile(log.scenario.arms[site].lengths_m, (len(log[site]), 1))
-    return np.einsum("kij,kj->ki", jacobians(lengths_m, log[site].q), log[site].qd)
+    return np.einsum("kij,kj->ki", compute_jacobians(lengths_m, log[site].q), log[site].qd)
 
 
 def integrate(power: np.ndarray) -> np.ndarray:
@@ -112,16 +115,20 @@ def compute_functional(log: Log) -> tuple[np.ndarray, np.ndarray]:
     V = 1/2 sum_i (r'M r + theta~^2 / Gamma + l~^2 / Gamma_l + e'Lambda Kd e + int over T of
     xd_j'Kd xd_j).
     """
-    Lambda, Kp, Kd = 1.5, np.array([6.0, 4.0]), np.array([8.0, 5.0])
-    V, lost = np.zeros(len(log["m"]) - DELAY), np.zeros(len(log["m"]) - DELAY)
+    Lambda = 1.5
+    Kp = np.array([6.0, 4.0])
+    Kd = np.array([8.0, 5.0])
+    V = np.zeros(len(log["m"]) - DELAY)
+    lost = np.zeros(len(log["m"]) - DELAY)
     for site, peer in (("m", "s"), ("s", "m")):
-        records, arm = log[site], log.scenario.arms[site]
+        records = log[site]
+        arm = log.scenario.arms[site]
         lengths_m = np.array([state.mem[-4:-2] for state in records.states])[DELAY:]
         q = records.q[DELAY:]
         e = compute_tip_places(log, site)[DELAY:] - compute_tip_places(log, peer)[:-DELAY]
         r = (
             records.qd[DELAY:]
-            + np.linalg.solve(jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
+            + np.linalg.solve(compute_jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
         )
         speed = compute_tip_speeds(log, peer)
         stored = integrate((Kd * speed**2).sum(axis=1))
@@ -160,13 +167,13 @@ def test_without_learning_lengths_v_changes_otherwise() -> None:
 def estimated_over_true(lengths: tuple[float, float], q: tuple[float, float]) -> np.ndarray:
     """Returns J_hat J^-1 of an arm of two links of 1 m, which relates estimated to true velocities."""
     pose = np.array([q])
-    estimated = jacobians(np.array([lengths]), pose)[0]
-    true = jacobians(np.array([[1.0, 1.0]]), pose)[0]
+    estimated = compute_jacobians(np.array([lengths]), pose)[0]
+    true = compute_jacobians(np.array([[1.0, 1.0]]), pose)[0]
     return np.asarray(estimated @ np.linalg.inv(true))
 
 
 def test_errata_10_weight_may_be_asymmetric_and_singular() -> None:
-    """With Lambda = 1 and one delay for all, the weight is the sum of J_hat J^-1 over the arms plus T I."""
+    """With Lambda = 1 and one common delay, the weight is the sum of J_hat J^-1 over the arms plus T I."""
     ratio = estimated_over_true((0.2, 3.0), (0.0, 0.2))
     assert np.linalg.eigvalsh(0.5 * (ratio + ratio.T)) == pytest.approx(
         [-5.447, 8.647], abs=1e-3
@@ -207,7 +214,8 @@ def test_errors_vanish_despite_indefinite_errata_10_weight() -> None:
         assert np.abs(log[site].qd[-1000:]).max() < 1e-2
         # x_hat(t + s) - x_hat(t) + s Lambda e(t) over s = 0.5 s goes to zero with t.
         lengths_m = np.array([state.mem[-4:-2] for state in log[site].states])
-        inner, outer = log[site].q[:, 0], log[site].q.sum(axis=1)
+        inner = log[site].q[:, 0]
+        outer = log[site].q.sum(axis=1)
         estimate = lengths_m[:, [0]] * np.stack([np.cos(inner), np.sin(inner)], axis=1)
         estimate += lengths_m[:, [1]] * np.stack([np.cos(outer), np.sin(outer)], axis=1)
         peer = "s" if site == "m" else "m"

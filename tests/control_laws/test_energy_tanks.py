@@ -32,7 +32,8 @@ TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40
 @pytest.mark.long
 def test_tanks_keep_a_diverging_layer_finite() -> None:
     run = sample_every_tick(make_energy_pair(TANKS, clamped=False, duration_s=30.0), every=2)
-    m, s = run["m"], run["s"]
+    m = run["m"]
+    s = run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert max(m.to_all.H.max(), s.to_all.H.max()) / 1.25 == pytest.approx(0.230, abs=5e-4)
@@ -40,10 +41,8 @@ def test_tanks_keep_a_diverging_layer_finite() -> None:
 
 
 def test_the_layer_alone_diverges() -> None:
-    none, gains = (
-        [0.0, 0.0],
-        {"level_J": 0.1, "fill_nm_s_rad_J": 50.0, "packet_1_s": 10.0, "by_shares": False},
-    )
+    none = [0.0, 0.0]
+    gains = {"level_J": 0.1, "fill_nm_s_rad_J": 50.0, "packet_1_s": 10.0, "by_shares": False}
     gains["acceleration_rad_s2"] = 100.0
     layer = {"K": [100.0, 100.0], "Kd": [2.0, 2.0], "d": none, "gravity": 1.0, "guarded": False}
     law = {"law": "trilat_net.laws.tanks:Tanks", **gains, **layer}
@@ -128,9 +127,11 @@ def test_compiled_and_stepped_runs_agree_and_verify(law: str) -> None:
     scenario = make_energy_pair(
         LAWS[law], clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0}
     )
-    run, last = make_trajectories(scenario), sample_records(scenario, (1.6,))[:, -1]
+    run = make_trajectories(scenario)
+    last = sample_records(scenario, (1.6,))[:, -1]
     for n, name in enumerate(scenario.names):
-        columns, site = scenario.layout(name).columns(), run.sites[name]
+        columns = scenario.layout(name).columns()
+        site = run.sites[name]
         assert np.abs(site.tau[-1]).max() > 0.0
         for field in ("q", "qd", "tau", "tau_x", "ch"):
             assert last[n, columns[field]].tolist() == getattr(site, field)[-1].tolist()

@@ -94,7 +94,7 @@ def test_lee_and_spong_drag_common_motion() -> None:
 def test_lee_and_spong_bound_holds_at_edge(
     scheme: str, more_ms: float, P_e: float, holds: bool
 ) -> None:
-    """As published, and with K h more for torques that are held."""
+    """The bound is the published one, and K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
     conditions = describe_law_conditions(
@@ -386,7 +386,8 @@ def test_saturated_pull_and_gravity_stay_below_limits() -> None:
     """The largest gravity over all poses of the textbook's arm."""
     changes = {"control.law": "saturated_pd", "control.P": 5.0, "control.d": 4.0}
     scenario = load_scenario("paper", changes)
-    spec, theta = scenario.sites["s"], scenario.arms["s"].theta
+    spec = scenario.sites["s"]
+    theta = scenario.arms["s"].theta
     poses = np.stack(np.meshgrid(*[np.linspace(0.0, 2.0 * np.pi, 201)] * 2)).reshape(2, -1)
     arm = PlacedArm(spec.arm.g_m_s2, scenario.arms["s"].lengths_m, poses)
     gravity = np.abs(arm.gravity_torque(np.repeat(theta[:, None], poses.shape[1], axis=1))).max(

@@ -96,7 +96,8 @@ def test_free_motion_drifts_unless_drift_is_paid_for(
 
 
 def test_contact_stays_bounded() -> None:
-    near, far = sample_pair(50.0, clamped=True), sample_pair(200.0, clamped=True)
+    near = sample_pair(50.0, clamped=True)
+    far = sample_pair(200.0, clamped=True)
     assert find_felt_stiffness(near) == pytest.approx(68.88, rel=1e-3)
     # it chatters: the last digits are the integrator's
     assert find_felt_stiffness(far) == pytest.approx(26.7, rel=0.04)
@@ -156,7 +157,8 @@ def test_later_motion_pays_for_dominance_changes() -> None:
     for ramp_s in (0.0, 0.5):
         change = {"at_s": 6.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": ramp_s}
         scenario = make_unit_scenario(
-            *(sites, {"law": "tdpa"}),
+            sites,
+            {"law": "tdpa"},
             duration_s=9.0,
             dominance=TURNED,
             link={**CONSTANT, "delay_ms": 100.0},
@@ -198,7 +200,8 @@ def test_booked_energy_is_the_arms(clamped: bool) -> None:
     """
     known = {"energy": "step", "reserve_J": 1e-3}
     result = sample_pair(50.0, clamped=clamped, duration_s=6.0, every=1, **known)
-    m, s = result["m"], result["s"]
+    m = result["m"]
+    s = result["s"]
     step = -m.tau[:-1, 0] * np.diff(m.q[:, 0])
     assert m.sent[0].E_led[-1, 0] == pytest.approx(np.maximum(step, 0.0).sum(), rel=1e-9)
     out = np.cumsum(np.minimum(step, 0.0))

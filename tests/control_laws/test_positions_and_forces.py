@@ -14,8 +14,8 @@ from tests.transmission import (
     TABLE,
     VARIANTS,
     approximate_printed,
+    find_transmission,
     rightmost_root,
-    transmitted,
 )
 from tests.unit_arm import (
     DRIVE,
@@ -75,7 +75,7 @@ def test_tables_of_documentation_have_these_numbers() -> None:
         felt = [float(row[f"felt_over_wall_at_{hz}_hz"]) for hz in ("0.1", "1")]
         six.setdefault(float(row["a"]), []).extend(felt)
         assert row["rightmost_root_1_s"] in ("", str(SHARED[float(row["a"])][2]))
-    assert six == {a: [*one, *other] for a, (one, other, *_) in SHARED.items()}
+    assert six == {a: [*first, *other] for a, (first, other, *_) in SHARED.items()}
 
 
 def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> Scenario:
@@ -111,7 +111,7 @@ def measure_transmission(scenario: Scenario, site: str) -> float:
 @pytest.mark.parametrize(("variant", "delay_s"), TABLE)
 def test_two_sites_transmit_as_published(variant: str, delay_s: float) -> None:
     ratios = [
-        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
+        find_transmission(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
     assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
@@ -123,7 +123,7 @@ def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
     *users, root, ratios = SHARED[a]
     for at, values in enumerate(users):
         felt_ratios = [
-            transmitted(hz, alpha, at, acceleration=qdd)
+            find_transmission(hz, alpha, at, acceleration=qdd)
             for qdd in (0.0, 1.0)
             for hz in (0.1, 1.0)
         ]
@@ -171,14 +171,14 @@ def test_six_channel_runs_transmit_like_their_loop(a: float, user: int, felt: fl
 def test_four_channel_runs_transmit_like_their_loop(
     variant: str, delay_s: float, acceleration: float, felt: float
 ) -> None:
-    """With a part of the acceleration, as all of it is unstable; a held torque is modelled as held."""
+    """The law uses a part of the acceleration, as all of it is unstable; the model of a torque holds it over a tick."""
     ratio = measure_transmission(
         make_four_channel_pair(variant, delay_s, acceleration=acceleration), "m"
     )
     law = {**VARIANTS[variant], "acceleration": acceleration, "delay_s": delay_s}
-    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
+    assert ratio == pytest.approx(find_transmission(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
     assert ratio == pytest.approx(felt, abs=6e-5)
-    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, **law), rel=0.02)
+    assert ratio == pytest.approx(find_transmission(1.0, PAIR, 0, **law), rel=0.02)
 
 
 @pytest.mark.long
@@ -237,7 +237,7 @@ def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
         for response in responses
         if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
-    expected = transmitted(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
+    expected = find_transmission(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
         500.0 / (2j * np.pi) + 5.0
     )
     assert felt.ratio.frequency_hz == 1.0

@@ -17,7 +17,8 @@ from trilat_net.laws.wave import Wave
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
 
-b, h = 10.0, 1e-3
+b = 10.0
+h = 1e-3
 c = math.sqrt(2.0 * b)
 T = 0.2 + 0.5 * h
 """Of a line with one end that answers a tick later, by what its arm did: half of its round trip, s."""
@@ -62,9 +63,13 @@ def measure_stored_energy(run: dict[str, Any]) -> tuple[Any, Any]:
 
     Energy on hand at the master's end counts as input; its arm gave -tau times its steps.
     """
-    m, s = run["m"], run["s"]
-    u_m, u_s, force_s = m.sent[0].u[:, 0], s.sent[0].u[:, 0], s.tau[:, 0]
-    v_m, v_s = (m.tau[:, 0] + b * m.qd[:, 0]) / c, u_s + c / b * force_s
+    m = run["m"]
+    s = run["s"]
+    u_m = m.sent[0].u[:, 0]
+    u_s = s.sent[0].u[:, 0]
+    force_s = s.tau[:, 0]
+    v_m = (m.tau[:, 0] + b * m.qd[:, 0]) / c
+    v_s = u_s + c / b * force_s
     waves = np.cumsum(0.5 * h * (u_m**2 - v_s**2 + u_s**2 - v_m**2))
     work = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
     reserve = Wave.reserve_J
@@ -74,7 +79,8 @@ def measure_stored_energy(run: dict[str, Any]) -> tuple[Any, Any]:
 
 def test_a_free_slave_reaches_its_master() -> None:
     run = sample_every_tick(make_energy_pair(WAVE, clamped=False, duration_s=20.0), every=4)
-    m, s = run["m"], run["s"]
+    m = run["m"]
+    s = run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
     assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
     distance = np.abs(m.q - s.q)[:, 0].max()  # of qd h at 1 kHz .0476, of continuous time .0477
@@ -92,9 +98,10 @@ def test_a_line_stores_the_energy_of_its_ports() -> None:
 
 
 def test_a_clamped_line_is_a_spring() -> None:
-    """Of stiffness b / T, in series with the follower's K and the clamp."""
+    """The spring has the stiffness b / T, in series with the follower's K and the clamp."""
     run = sample_every_tick(make_energy_pair(WAVE, clamped=True, duration_s=30.0), every=30000)
-    m, s = run["m"], run["s"]
+    m = run["m"]
+    s = run["s"]
     felt = 1.0 / (T / b + 0.01 + 0.001)
     master = 15.0 / (50.0 + felt)
     assert m.q[-1, 0] == pytest.approx(master, abs=5e-7)
@@ -199,13 +206,13 @@ def test_contact_under_loss_keeps_its_force(link: dict[str, Any], duration_s: fl
     [
         (JITTER, 0.01),
         *(
-            pytest.param(*one, marks=pytest.mark.long)
-            for one in ((JITTER, 0.0), (CONSTANT, 0.01))
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in ((JITTER, 0.0), (CONSTANT, 0.01))
         ),
     ],
 )
 def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
-    """Under varying delays without damping: two ends, two joints, a reserve in H and one in W."""
+    """Under varying delays without damping, the energy grows by the reserves of two ends and two joints only."""
     control = {"law": "wave", "K": 0.0, "B": 0.0, "reserve_J": reserve_J}
     sites = {"m": {"qd0_rad_s": [1e-6, 5e-7]}, "s": {}}
     run = sample_every_tick(make_unit_scenario(sites, control, duration_s=20.0, link=link))

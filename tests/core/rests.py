@@ -1,4 +1,4 @@
-"""The equations of `resting` over the rows of a log, written again."""
+"""An independent version of the equations of `resting`, over the rows of a log."""
 
 import numpy as np
 
@@ -23,7 +23,8 @@ def compute_reference(
     Eq. (1) of docs/theory/coming-to-rest.md, joint by joint; q_ref is the integral of qd_ref.
     """
     h_s = 1.0 / part.rate_hz
-    q_ref, qd_ref = [part.q[first].copy()], [part.qd[first].copy()]
+    q_ref = [part.q[first].copy()]
+    qd_ref = [part.qd[first].copy()]
     for n in range(1, rows):
         left_s = max(
             LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max())
@@ -47,11 +48,13 @@ def compute_rest_torque(
     """
     rows = slice(first, first + len(law))
     q_ref, qd_ref = compute_reference(gains, part, first, len(law))
-    B, qd = np.array(gains.damping), part.qd[rows]
+    B = np.array(gains.damping)
+    qd = part.qd[rows]
     slip = qd - qd_ref + REST_RATE_1_S * (part.q[rows] - q_ref)
     haste = float((B * np.abs(qd[0]) / limit).max())
     w = (1.0 - haste) * (part.tau[first - 1] - law[0])
-    begun, taken = [], []
+    begun = []
+    taken = []
     for n in range(len(law)):
         begun.append(w)
         if n < LEAST_STOP_S * part.rate_hz or qd_ref[n].any():

@@ -57,9 +57,9 @@ arrivals = st.lists(st.lists(st.integers(0, 250), max_size=8), min_size=1, max_s
 
 @every_kind
 @quick
-@given(came=arrivals, rates=st.sampled_from([(1000, 1000), (1000, 333), (700, 1000)]))
+@given(arriving=arrivals, rates=st.sampled_from([(1000, 1000), (1000, 333), (700, 1000)]))
 def test_the_newest_due_arrived_sample_is_used(
-    name: str, came: list[list[int]], rates: tuple[int, int]
+    name: str, arriving: list[list[int]], rates: tuple[int, int]
 ) -> None:
     """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
     release = list_releases(name, 251, *rates)
@@ -67,7 +67,7 @@ def test_the_newest_due_arrived_sample_is_used(
     arrived: set[int] = set()
     before = -1
     for k in range(TICKS):
-        now = came[k] if k < len(came) else []
+        now = arriving[k] if k < len(arriving) else []
         arrived.update(now)
         output = site.step(TickInput(k, [make_arrival(m) for m in now]))
         assert output.used == [max((m for m in arrived if LOST < release[m] <= k), default=-1)]
@@ -82,27 +82,27 @@ def test_the_newest_due_arrived_sample_is_used(
 
 @every_kind
 @quick
-@given(came=arrivals)
-def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> None:
+@given(arriving=arrivals)
+def test_every_arrival_is_accounted_for(name: str, arriving: list[list[int]]) -> None:
     """Accepted = refused + duplicate + lost + superseded + used, once no sample waits any more."""
     site = make_site_behind_link(name)
     release = list_releases(name, 251, 1000, 1000)
     used: set[int] = set()
-    for k in range(max(release) + len(came) + 1):
-        now = came[k] if k < len(came) else []
+    for k in range(max(release) + len(arriving) + 1):
+        now = arriving[k] if k < len(arriving) else []
         used.add(site.step(TickInput(k, [make_arrival(m) for m in now])).used[0])
     counts = site.counts()[0]
     gone = counts.refused + counts.duplicate + counts.lost + counts.superseded
-    assert counts.accepted == sum(map(len, came)) == gone + len(used - {-1})
-    assert counts.lost == sum(release[m] == LOST for now in came for m in now)
-    late = sum(LOST < release[m] < k for k, m in first_arrivals(came) if name != "measured")
+    assert counts.accepted == sum(map(len, arriving)) == gone + len(used - {-1})
+    assert counts.lost == sum(release[m] == LOST for now in arriving for m in now)
+    late = sum(LOST < release[m] < k for k, m in first_arrivals(arriving) if name != "measured")
     assert counts.late == late
 
 
-def first_arrivals(came: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+def first_arrivals(arriving: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
     """Returns (tick of the receiver, sample) without repetitions."""
     seen: dict[int, int] = {}
-    for k, now in enumerate(came):
+    for k, now in enumerate(arriving):
         for m in now:
             seen.setdefault(m, k)
     return [(k, m) for m, k in seen.items()]
@@ -144,7 +144,8 @@ def test_reused_sites_have_the_same_future(name: str, k: int) -> None:
     """
     ticks = [TickInput(n, [make_arrival(n - 1)] if n else []) for n in range(TICKS)]
     whole = step_site(make_site_behind_link(name), ticks)
-    before, last = whole[max(0, k - 2)], whole[k - 1]
+    before = whole[max(0, k - 2)]
+    last = whole[k - 1]
     in_use = [make_arrival(last.used[0]) if last.used[0] >= 0 else None]
     waiting = [make_arrival(m) for m in range(last.used[0] + 1, k - 1)]
     worn = make_site_behind_link(name)
@@ -181,18 +182,18 @@ hostile = st.one_of(
 
 @every_kind
 @quick
-@given(came=st.lists(st.lists(hostile, max_size=5), max_size=6))
-def test_work_is_bounded_for_any_sample_number(name: str, came: list[list[int]]) -> None:
+@given(arriving=st.lists(st.lists(hostile, max_size=5), max_size=6))
+def test_work_is_bounded_for_any_sample_number(name: str, arriving: list[list[int]]) -> None:
     """A channel looks no further ahead than ten seconds, and no other peer's samples suffer."""
     site = make_site_behind_link(name)
-    for k, now in enumerate(came):
+    for k, now in enumerate(arriving):
         output = site.step(TickInput(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
         assert site._links["scheduled"][0] <= k + 10_000
         assert output.used[0] < k
-    k = len(came)
+    k = len(arriving)
     counts = site.counts()[0]
     assert counts.refused == sum(
-        not 0 <= m <= k + 10_000 for k, now in enumerate(came) for m in now
+        not 0 <= m <= k + 10_000 for k, now in enumerate(arriving) for m in now
     )
     assert site.release_tick(0, 200) == make_site_behind_link(name).release_tick(0, 200)
 
@@ -234,19 +235,19 @@ def test_newest_first_shortens_ages_unlike_order() -> None:
 
 
 @given(
-    came=st.lists(st.integers(0, 30), min_size=30, max_size=30),
+    arrival_ticks=st.lists(st.integers(0, 30), min_size=30, max_size=30),
     rates=st.sampled_from([(1000, 1000), (400, 900)]),
 )
 def test_measured_samples_are_used_from_arrival(
-    came: list[int], rates: tuple[int, int]
+    arrival_ticks: list[int], rates: tuple[int, int]
 ) -> None:
-    """But not at their own stamp: a sample from a clock that is ahead waits for the first later tick."""
+    """A sample from a clock that is ahead is used from the first tick after its own stamp."""
     site = make_site_with_link(*rates, [LinkModel(kind=DelayKind.MEASURED)])
     for k in range(80):
-        now = [m for m, at in enumerate(came) if at == k]
+        now = [m for m, at in enumerate(arrival_ticks) if at == k]
         usable = [
             m
-            for m, at in enumerate(came)
+            for m, at in enumerate(arrival_ticks)
             if at <= k and tick_ns(m, rates[1]) < tick_ns(k, rates[0])
         ]
         assert site.step(TickInput(k, [make_arrival(m) for m in now])).used == [

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from tests.core.chain_references import Arm, chain_references, full_matrix, moving, torque_for
+from tests.core.chain_references import (
+    Arm,
+    chain_references,
+    find_largest_difference,
+    full_matrix,
+    propagate_state,
+    torque_for,
+)
 from trilat_net.core.arms.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
@@ -34,17 +41,13 @@ def build_arm(name: str, **drive: float) -> Arm:
     )
 
 
-def find_largest_difference(got: Array, wanted: Array) -> float:
-    return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
-
-
 @each
 def test_inverse_dynamics_and_gradient_are_those_of_pinocchio(name: str) -> None:
     """M a + C v + G with C by Christoffel symbols, Eq. (12), and Y' r, Eq. (15)."""
     arm = build_arm(name)
     gradient = np.zeros(LINK_PARAMETERS * len(arm.rows))
     for state in REFERENCES[name].states:
-        moving(arm, state, state.v)
+        propagate_state(arm, state, state.v)
         assert (
             find_largest_difference(torque_for(arm, state.v, state.a), state.inverse_dynamics)
             <= 1e-12
@@ -71,7 +74,8 @@ def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
 
 @each
 def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
-    arm, chain = build_arm(name), REFERENCES[name].chain
+    arm = build_arm(name)
+    chain = REFERENCES[name].chain
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         assert (
@@ -93,8 +97,9 @@ def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
 def test_friction_and_drives_enter_both_dynamics_alike() -> None:
     """The torque of inverse dynamics for a motion makes that motion, with armature and friction too."""
     arm = build_arm("arm7", armature_kg_m2=0.1, viscous=0.5, coulomb=1.5)
-    state, qdd = REFERENCES["arm7"].states[0], np.zeros(7)
-    moving(arm, state, state.qd)
+    state = REFERENCES["arm7"].states[0]
+    qdd = np.zeros(7)
+    propagate_state(arm, state, state.qd)
     torque = torque_for(arm, state.qd, state.a)
     find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, torque, qdd)
     assert find_largest_difference(qdd, state.a) <= 1e-11

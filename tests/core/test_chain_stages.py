@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from tests.core.chain_references import Arm, ChainState, chain_references, moving, torque_for
+from tests.core.chain_references import (
+    Arm,
+    ChainState,
+    chain_references,
+    propagate_state,
+    torque_for,
+)
 from trilat_net.core.arms.chain import ChainJoint
 from trilat_net.core.arms.chain_stages import place_chain, update_errors, update_torque
 from trilat_net.core.step.site_arrays import SiteArrays
@@ -45,16 +51,15 @@ def build_arrays(name: str, state: ChainState, **gains: object) -> SiteArrays:
         pages=8,
     )
     site = arrays.site[0]
-    site["q_des"][:n], site["qd_des"][:n] = (
-        state.q + state.v / LAMBDA,
-        state.qd + state.a / LAMBDA,
-    )
+    site["q_des"][:n] = state.q + state.v / LAMBDA
+    site["qd_des"][:n] = state.qd + state.a / LAMBDA
     return arrays
 
 
 def find_torque(arrays: SiteArrays) -> Array:
     """Returns the torque of the site's law in its tick, N m."""
-    site, chain = arrays.site[0], arrays.chain
+    site = arrays.site[0]
+    chain = arrays.chain
     place_chain(site, chain)
     update_errors(site, chain)
     update_torque(site, chain)
@@ -85,7 +90,7 @@ def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
             arrays.chain,
             np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints]),
         )
-        moving(arm, state._replace(qd=still, a=still), still)
+        propagate_state(arm, state._replace(qd=still, a=still), still)
         wanted = torque_for(arm, still, still)
         assert np.abs(wanted).max() > 1e-3
         wanted += 7.0 * state.v / LAMBDA - 2.0 * state.qd + 5.0 * state.a / LAMBDA

@@ -17,7 +17,7 @@ from tests.core.builders import (
     compute_stamps_ns,
     make_channel,
 )
-from tests.core.compiled import run_python
+from tests.programs import run_python
 from trilat_net.core.links.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
@@ -44,10 +44,11 @@ LOSSES: list[LinkBase] = [
 ]
 
 
-def bursts(lost: np.ndarray) -> Ints:
+def list_burst_lengths(lost: np.ndarray) -> Ints:
     """Returns the lengths of runs of losses, without a run that the end truncates."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], lost]).astype(np.int8)))
-    begin, end = edges[::2], edges[1::2]
+    begin = edges[::2]
+    end = edges[1::2]
     return end - begin[: len(end)]
 
 
@@ -64,7 +65,8 @@ def test_loss_and_burst_follow_their_model(link: LinkBase, seed: int) -> None:
     """
     model = link.to_core_model()
     lost = compute_due_ns(make_channel([model], seed), COUNT) == LOST
-    p, h = link.loss, link.loss_bad
+    p = link.loss
+    h = link.loss_bad
     variance = p * (1 - p)
     if link.loss_burst:
         memory = 1 - model.enter - model.leave
@@ -72,7 +74,7 @@ def test_loss_and_burst_follow_their_model(link: LinkBase, seed: int) -> None:
         assert share * h == pytest.approx(p, rel=1e-12)
         variance += 2 * h * h * share * (1 - share) * memory / (1 - memory)
     assert abs(lost.mean() - p) <= SIGMAS * math.sqrt(variance / COUNT)
-    lengths = bursts(lost)
+    lengths = list_burst_lengths(lost)
     mean = link.loss_burst or 1 / (1 - p)
     allowed = SIGMAS / math.sqrt(len(lengths))
     assert abs(lengths.mean() - mean) <= allowed * math.sqrt(mean * (mean - 1))
@@ -105,7 +107,7 @@ def test_directions_and_seeds_lose_independently() -> None:
 
 
 def test_losses_are_independent_of_delays() -> None:
-    """So the delays of the samples that arrive are those of the link without loss."""
+    """The delays of the samples that arrive are those of the link without loss."""
     link = UniformDelay(delay_ms=100, half_width_ms=50)
     whole = compute_due_ns(make_channel([link.to_core_model()]), 10_000)
     holed = compute_due_ns(
@@ -136,7 +138,7 @@ def test_copies_have_their_share(seed: int) -> None:
 
 
 def test_the_earlier_of_sample_and_copy_counts() -> None:
-    """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
+    """A sample and its copy have separate delays, and the smaller of two uniform numbers has its mean at a third."""
     link = UniformDelay(delay_ms=100, half_width_ms=60)
     single = compute_due_ns(make_channel([link.to_core_model()]), 100_000)
     link_channel = make_channel(
@@ -178,7 +180,8 @@ def test_in_order_no_sample_overtakes_an_older_one() -> None:
 
 
 def test_newly_ordered_links_hold_samples_back() -> None:
-    first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
+    first = ConstantDelay(delay_ms=50.0)
+    then = ConstantDelay(delay_ms=1.0, order="in_order")
     due_ns = compute_due_ns(
         make_channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80
     )

@@ -44,7 +44,7 @@ COUNT = 1_000_000
 SIGMAS = 4.0
 
 
-def truncated(link: NormalDelay) -> Any:
+def truncate_normal(link: NormalDelay) -> Any:
     return stats.truncnorm(
         -link.delay_ms / link.deviation_ms, np.inf, link.delay_ms, link.deviation_ms
     )
@@ -94,7 +94,7 @@ INDEPENDENT: list[tuple[LinkBase, Any]] = [
             ],
         ),
         (
-            truncated,
+            truncate_normal,
             [
                 NormalDelay(delay_ms=200, deviation_ms=30),
                 NormalDelay(delay_ms=10, deviation_ms=20),
@@ -134,11 +134,11 @@ CORRELATED = [
 ]
 
 
-def named(value: object) -> str | None:
+def name_case(value: object) -> str | None:
     return value.describe() if isinstance(value, LinkBase) else None
 
 
-def likely(delays_us: Ints, law: Any) -> bool:
+def is_likely(delays_us: Ints, law: Any) -> bool:
     """Applies Kolmogorov and Smirnov's test at the bounds between whole microseconds, where
     rounding has no effect.
     """
@@ -159,7 +159,8 @@ def holds_its_moments(
     mean_ms, deviation_ms = link.moments()
     variance = (1e3 * deviation_ms) ** 2 + 1 / 12
     centred = delays - 1e3 * mean_ms
-    second, fourth = np.mean(centred**2), np.mean(centred**4)
+    second = np.mean(centred**2)
+    fourth = np.mean(centred**4)
     count = len(delays)
     assert abs(centred.mean()) <= SIGMAS * math.sqrt(mean_factor * variance / count)
     error = math.sqrt(factor * (fourth - second**2) / (4 * second * count))
@@ -167,13 +168,13 @@ def holds_its_moments(
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
+@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=name_case)
 def test_mean_and_deviation_over_a_million_draws(link: LinkBase, law: Any, seed: int) -> None:  # noqa: ARG001
     holds_its_moments(link, draw_delays_us(link, seed, COUNT))
 
 
 def test_a_uniform_delay_worked_out_by_hand() -> None:
-    """From the published generator to microseconds, in Python's integers: purpose 2, attempt 0."""
+    """Python's integers lead from the published generator to microseconds, with purpose 2 and attempt 0."""
     key = link_key(1, LINK_NAME)
     draws = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
     units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in draws]
@@ -184,20 +185,20 @@ def test_a_uniform_delay_worked_out_by_hand() -> None:
     )
 
 
-@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
+@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=name_case)
 def test_the_closed_forms_are_scipys(link: LinkBase, law: Any) -> None:
     assert link.moments() == pytest.approx((law.mean(), law.std()), rel=1e-9)
 
 
-@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
+@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=name_case)
 def test_the_distribution_is_the_stated_one(link: LinkBase, law: Any) -> None:
     delays = draw_delays_us(link, 5, 200_000)
-    assert likely(delays, law)
+    assert is_likely(delays, law)
     assert abs(np.corrcoef(delays[:-1], delays[1:])[0, 1]) < SIGMAS / math.sqrt(len(delays))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("link", CORRELATED, ids=named)
+@pytest.mark.parametrize("link", CORRELATED, ids=name_case)
 def test_correlated_delays_have_their_moments_and_correlations(
     link: CorrelatedDelay, seed: int
 ) -> None:
@@ -209,7 +210,7 @@ def test_correlated_delays_have_their_moments_and_correlations(
     for lag in range(1, 6):
         variance = (1 + c**2) * (1 - c ** (2 * lag)) / (1 - c**2) - 2 * lag * c ** (2 * lag)
         assert abs(np.mean(x[:-lag] * x[lag:]) - c**lag) <= SIGMAS * math.sqrt(variance / COUNT)
-    assert likely(delays[:: 200 if c else 1], stats.norm(link.delay_ms, link.deviation_ms))
+    assert is_likely(delays[:: 200 if c else 1], stats.norm(link.delay_ms, link.deviation_ms))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -236,7 +237,7 @@ def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms:
 
 
 def test_a_sine_over_whole_periods() -> None:
-    """Its mean, its deviation and its values, without any randomness."""
+    """The mean, the deviation and the values of a sine are exact, since it has no randomness."""
     link = SineDelay(delay_ms=120, amplitude_ms=80, period_s=2.5, phase_rad=0.4)
     delays = draw_delays_us(link, 1, COUNT)
     assert (delays == draw_delays_us(link, 2, COUNT)).all()

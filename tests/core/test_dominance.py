@@ -14,7 +14,7 @@ SMALLEST = 1e-6
 
 
 @st.composite
-def matrices(draw: st.DrawFn, zeros: bool = True) -> Array:
+def draw_matrix(draw: st.DrawFn, zeros: bool = True) -> Array:
     """Rows that sum to one, zero diagonal, other entries zero or at least 1e-6."""
     size = draw(st.integers(2, 6))
     share = st.one_of(st.floats(-6, 0).map(lambda x: 10**x), *([st.just(0.0)] if zeros else []))
@@ -36,7 +36,8 @@ def strongly_connected(a: Array) -> bool:
     """Walks from the first site along the edges and against them."""
 
     def reached(edges: Array) -> set[int]:
-        visited, new = {0}, [0]
+        visited = {0}
+        new = [0]
         while new:
             new = [
                 j
@@ -49,7 +50,7 @@ def strongly_connected(a: Array) -> bool:
     return len(reached(a)) == len(reached(a.T)) == len(a)
 
 
-@given(a=matrices())
+@given(a=draw_matrix())
 def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
     """beta'Upsilon = 0 after Eq. (20), to 1e-12, entry by entry positive."""
     assume(strongly_connected(a))
@@ -59,18 +60,18 @@ def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
     assert np.abs(beta @ (a - np.eye(len(a)))).max() <= 1e-12
 
 
-@given(a=matrices(zeros=False))
+@given(a=draw_matrix(zeros=False))
 def test_beta_is_numpys_null_vector(a: Array) -> None:
     left = np.linalg.svd((a - np.eye(len(a))).T)[2][-1]
     assert perron_vector(a) == pytest.approx(left / left.sum(), abs=1e-9)
 
 
-@given(a=matrices())
+@given(a=draw_matrix())
 def test_irreducible_matrices_have_strongly_connected_graphs(a: Array) -> None:
     assert is_irreducible(a) == strongly_connected(a)
 
 
-@given(a=matrices(zeros=False), closed=st.integers(2, 5))
+@given(a=draw_matrix(zeros=False), closed=st.integers(2, 5))
 def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
     """The first sites follow each other alone: all other sites have no weight."""
     assume(closed < len(a))
@@ -85,7 +86,9 @@ def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
 def test_beta_of_three_sites_in_closed_form(shares: tuple[float, float, float]) -> None:
     """beta ~ (1 - a23 a32, 1 - a13 a31, 1 - a12 a21)."""
     a12, a21, a31 = shares
-    a13, a23, a32 = 1 - a12, 1 - a21, 1 - a31
+    a13 = 1 - a12
+    a23 = 1 - a21
+    a32 = 1 - a31
     closed = np.array([1 - a23 * a32, 1 - a13 * a31, 1 - a12 * a21])
     beta = perron_vector(np.array([[0, a12, a13], [a21, 0, a23], [a31, a32, 0]]))
     assert beta == pytest.approx(closed / closed.sum(), rel=1e-12)
@@ -101,20 +104,20 @@ def test_only_circulant_shares_have_ones_as_vector(share: float) -> None:
     assert np.abs(np.ones(3) @ (skewed - np.eye(3))).max() > 1e-3
 
 
-@given(a=matrices(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))
-def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
+@given(a=draw_matrix(), off=st.floats(-0.5, 0.5), index=st.integers(0, 1))
+def test_rows_sum_to_one_within_1e_9(a: Array, off: float, index: int) -> None:
     """Eq. (7)."""
-    row = a[own].copy()
+    row = a[index].copy()
     entry = int(np.argmax(row))
     row[entry] += off
     assume(0 <= row[entry] <= 1)
-    fault = find_row_problem(row, own)
+    fault = find_row_problem(row, index)
     assume(abs(abs(row.sum() - 1) - 1e-9) > 1e-15)
     assert (fault is not None) == (abs(row.sum() - 1.0) > 1e-9)
 
 
 @pytest.mark.parametrize(
-    ("row", "own", "phrase"),
+    ("row", "index", "phrase"),
     [
         ([0.2, 0.8, 0.0], 0, "does not follow itself"),
         ([0.0, 1.5, -0.5], 0, "between 0 and 1"),
@@ -123,7 +126,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
         ([0.0, np.inf, 0.5], 0, "finite"),
     ],
 )
-def test_an_invalid_row_gives_the_reason(row: list[float], own: int, phrase: str) -> None:
-    fault = find_row_problem(np.array(row), own)
+def test_an_invalid_row_gives_the_reason(row: list[float], index: int, phrase: str) -> None:
+    fault = find_row_problem(np.array(row), index)
     assert fault is not None
     assert phrase in fault

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.core.compiled import run_python
+from tests.programs import run_python
 from trilat_net.core.step.fingerprint import compute_fingerprint
 
 PROGRAM = "from trilat_net.core.step.fingerprint import compute_fingerprint; print(compute_fingerprint())"

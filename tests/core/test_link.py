@@ -24,12 +24,15 @@ class SampleList:
     """L2 by brute force: of all due samples, the newest that has arrived."""
 
     def __init__(self, rate_hz: int, peer_rate_hz: int, delay_ns: int) -> None:
-        self.rate_hz, self.peer_rate_hz, self.delay_ns = rate_hz, peer_rate_hz, delay_ns
+        self.rate_hz = rate_hz
+        self.peer_rate_hz = peer_rate_hz
+        self.delay_ns = delay_ns
         self.come: dict[int, int] = {}
         self.accepted = self.late = self.duplicate = self.refused = 0
 
     def due(self, tick: int, k: int) -> bool:
-        now, stamp = stamp_ns(k, self.rate_hz), stamp_ns(tick, self.peer_rate_hz)
+        now = stamp_ns(k, self.rate_hz)
+        stamp = stamp_ns(tick, self.peer_rate_hz)
         return now >= stamp + self.delay_ns and now > stamp
 
     def take(self, k: int, tick: int) -> None:
@@ -87,7 +90,8 @@ def test_the_newest_due_sample_is_in_use(
 ) -> None:
     """Any order, late samples, duplicates, and stamps of the future, all against the list."""
     rates_and_delay = (rate_hz, peer_rate_hz, delay_us * 1000)
-    site, model = make_site_with_delay(*rates_and_delay), SampleList(*rates_and_delay)
+    site = make_site_with_delay(*rates_and_delay)
+    model = SampleList(*rates_and_delay)
     arrivals = st.lists(st.integers(-1, 40), max_size=6)
     for k in range(25):
         arrival_list = data.draw(arrivals)

@@ -52,7 +52,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @pytest.mark.parametrize("kind", SCENARIOS)
 def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
-    """At 1 kHz and at 4 kHz, whatever the arms, the laws and the distribution."""
+    """The limit holds at 1 kHz and 4 kHz for any arms, laws and distributions."""
     source, changes = SCENARIOS[kind]
     for rate_hz in (1000, 4000):
         scenario = load_scenario(
@@ -87,10 +87,8 @@ ORDERS = st.one_of(
 @given(data=st.data())
 def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataObject) -> None:
     """Senders up to ten seconds ahead and late by as much, out of order and twice, delays that change."""
-    grown, widest = (
-        make_site_with_link(*rates, [LinkModel(location=1_000.0)]),
-        make_site_with_link(*rates, [LinkModel(location=1_000.0)]),
-    )
+    grown = make_site_with_link(*rates, [LinkModel(location=1_000.0)])
+    widest = make_site_with_link(*rates, [LinkModel(location=1_000.0)])
     widest = make_wide_site(widest, calendar_pages(rates[0]))
     first = grown._arrays.calendars.shape[1]
     now = 0
@@ -117,7 +115,7 @@ def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataOb
 
 
 def test_growing_delays_lose_no_sample() -> None:
-    """From 1 ms to ten seconds: every sent sample comes into use when it is due."""
+    """While the delay grows from 1 ms to ten seconds, every sent sample comes into use when it is due."""
     site = make_site_with_delay(1000, 1000, 1_000_000)
     order = CoreChange("longer", 0, LinkModel(from_ns=1_000_000_000, location=9_999_000.0))
     ticks = (
@@ -136,7 +134,8 @@ def test_samples_on_their_way_survive_the_widening() -> None:
         "paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"}
     )
     setups = [scenario.setup("m1")] * 2
-    small, large = Site(setups[0]), make_wide_site(Site(setups[1]), 1 << 15)
+    small = Site(setups[0])
+    large = make_wide_site(Site(setups[1]), 1 << 15)
     for k in range(400):
         arrivals = [
             make_arrival(k - 1, peer)._replace(
@@ -154,7 +153,7 @@ def test_samples_on_their_way_survive_the_widening() -> None:
 # One limit.
 
 
-def many(count: int, rate_hz: int, delay_ms: float) -> str:
+def many_sites_text(count: int, rate_hz: int, delay_ms: float) -> str:
     """Returns the text of so many sites, each of which follows the site before it."""
     names = [f"a{n}" for n in range(count)]
     sites = "".join(f"[sites.{name}]\n" for name in names)
@@ -168,13 +167,13 @@ def many(count: int, rate_hz: int, delay_ms: float) -> str:
     ("count", "rate_hz"), [(3, 4000), (8, 1000), (12, 1000), (12, 4000), (32, 1000)]
 )
 def test_the_recorder_takes_virtual_runs(count: int, rate_hz: int) -> None:
-    scenario = parse_scenario(many(count, rate_hz, 100.0))
+    scenario = parse_scenario(many_sites_text(count, rate_hz, 100.0))
     assert parse_embedded(scenario.text).names == scenario.names
     assert count_link_bytes(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
 
 
 def test_limit_has_equal_words_in_all_scenarios() -> None:
-    text = many(12, 20_000, 9000.0)
+    text = many_sites_text(12, 20_000, 9000.0)
     problems = []
     for read in (parse_scenario, parse_embedded):
         with pytest.raises(
@@ -188,7 +187,7 @@ def test_limit_has_equal_words_in_all_scenarios() -> None:
 
 
 def test_changes_beyond_the_limit_are_refused() -> None:
-    scenario = parse_scenario(many(12, 20_000, 1.0))
+    scenario = parse_scenario(many_sites_text(12, 20_000, 1.0))
     present = LinkTables(scenario.links, ())
     change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
     assert resolve_change(scenario, present, change, 10**9).link == "a1->a0"
@@ -200,10 +199,8 @@ def test_limited_links_count_what_they_refuse() -> None:
     """A site with less memory refuses stamps from further ahead; all others come into use."""
     setup = load_scenario("paper").setup("m1")
     assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
-    free, tight = (
-        make_site_with_delay(1000, 1000, 1_000_000),
-        make_site_with_delay(1000, 1000, 1_000_000),
-    )
+    free = make_site_with_delay(1000, 1000, 1_000_000)
+    tight = make_site_with_delay(1000, 1000, 1_000_000)
     tight._sizer.most_pages = 1024
     ahead = TickInput(0, [make_arrival(m) for m in (0, 500, 900, 1100, 5000)])
     for site in (free, tight):
@@ -218,8 +215,8 @@ def test_limited_links_count_what_they_refuse() -> None:
 
 
 def test_the_most_pages_are_within_the_limit() -> None:
-    """For a limit below twenty seconds."""
-    setup = parse_scenario(many(12, 4000, 100.0)).setup("a0")
+    """The number of pages is bounded for every limit below twenty seconds."""
+    setup = parse_scenario(many_sites_text(12, 4000, 100.0)).setup("a0")
     pages = CalendarSizer(setup).most_pages
     assert needed_pages(setup) < pages < calendar_pages(4000)
     assert links_bytes(setup, pages) <= MAX_LINKS_BYTES < links_bytes(setup, 2 * pages)

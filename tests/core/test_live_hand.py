@@ -37,7 +37,8 @@ def advance_ticks(
     messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES
 ) -> list[HandStep]:
     """Returns the hand's state in each tick, with the given messages before some ticks."""
-    memory, steps = HandMemory(), []
+    memory = HandMemory()
+    steps = []
     for k in range(ticks):
         step = advance_hand(
             rules, memory, k * 10**9 // rules.rate_hz, messages.get(k, ()), lambda: ARM
@@ -229,7 +230,7 @@ def test_stopping_distance_matches_stopping_speed(
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
 def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
-    """Also for messages that let go, fall silent, or take over a fading grip."""
+    """The limits hold also for messages that let go, fall silent, or take over a fading grip."""
     steps = list_hands(advance_ticks(messages, 600, LIMITED))
     assert all(math.hypot(*now.rate) <= 1.5 + 1e-9 for now in steps)
     for before, now in pairwise(steps):
@@ -276,7 +277,8 @@ def test_targets_overshoot_returning_goals_by_stopping_distance() -> None:
 @pytest.mark.parametrize("gap", [10, 25, 60, 150])
 def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
     """A hand at 0.3 m/s whose states come in bursts: its spring and damper change by 0.85 N in a tick."""
-    stiffness_n_m, damping_n_s_m = 300.0, 20.0
+    stiffness_n_m = 300.0
+    damping_n_s_m = 20.0
     messages: dict[int, Any] = {}
     for k in range(0, 3000, 10):
         tip_m = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)

@@ -48,7 +48,8 @@ def make_master_lost_log() -> Log:
 def test_lost_masters_shares_go_over_and_return() -> None:
     """The last sample before the cut comes into use at 3.099 s, the first after it at 4.1 s."""
     log = make_master_lost_log()
-    part, other = log["s"], log["m2"]
+    part = log["s"]
+    other = log["m2"]
     modes = list_reasons(log, "s")[-4:]
     assert modes == [
         ("return", LifeReason.DROPPED),
@@ -68,7 +69,8 @@ def test_lost_masters_shares_go_over_and_return() -> None:
 
 
 def test_losing_a_master_never_jumps_the_reference() -> None:
-    part, h_s = make_master_lost_log()["s"], 1e-3
+    part = make_master_lost_log()["s"]
+    h_s = 1e-3
     stale = slice(3099, 3120)  # what is in use stays meanwhile, and so does its rate
     steps = np.diff(part.q_des, axis=0) - 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
     steps[stale] = 0.0
@@ -82,7 +84,8 @@ def test_degraded_runs_verify_and_close_their_energies() -> None:
     assert verify(log).identical == 18_000
     assert compare_with_virtual(log).fed.identical == 18_000
     plan = make_cut_scenario("m1->s", "m1->m2")
-    ticks, fused = make_trajectories(plan), sample_records(plan, (6.0,))[:, 0]
+    ticks = make_trajectories(plan)
+    fused = sample_records(plan, (6.0,))[:, 0]
     columns = plan.layout("s").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(

@@ -14,7 +14,9 @@ from trilat_net.core.life.live_hand import HandInForce, HandRules
 from trilat_net.core.life.own_hand import PROGRAM, OwnHand
 
 PLACE = (0.5, -0.25)
-EVERY, DELAY, TICKS = 20, 30, 400
+EVERY = 20
+DELAY = 30
+TICKS = 400
 
 
 def make_hand(delay: int = DELAY, *, starts_at_arm: bool = True) -> OwnHand:
@@ -33,8 +35,8 @@ def advance_ticks(
     hand = make_hand(delay)
     hand_states = []
     for k in range(TICKS):
-        for asked, goal in (one for at, one in decisions.items() if at == k):
-            hand.accept_decision(asked, goal)
+        for sent_tick, goal in (decision for at, decision in decisions.items() if at == k):
+            hand.accept_decision(sent_tick, goal)
         hand_states.append(advance_tick(hand, k))
     return hand_states
 
@@ -43,13 +45,15 @@ def advance_ticks(
 def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
     """Each decision takes another computing time, no longer than the hand's delay."""
     goals = {EVERY * n: (0.5 + 0.01 * n, -0.25) for n in range(5)}
-    prompt = advance_ticks({asked: (asked, goal) for asked, goal in goals.items()})
+    prompt = advance_ticks({sent_tick: (sent_tick, goal) for sent_tick, goal in goals.items()})
     pairs = zip(goals.items(), thinks, strict=True)
-    arrivals = sorted((asked + took, asked, goal) for (asked, goal), took in pairs)
+    arrivals = sorted((sent_tick + took, sent_tick, goal) for (sent_tick, goal), took in pairs)
     in_order: dict[int, tuple[int, Sequence[float] | None]] = {}
-    for came, asked, goal in arrivals:
-        if came not in in_order and all(asked > other for other, _ in in_order.values()):
-            in_order[came] = asked, goal
+    for arrival_tick, sent_tick, goal in arrivals:
+        if arrival_tick not in in_order and all(
+            sent_tick > other for other, _ in in_order.values()
+        ):
+            in_order[arrival_tick] = sent_tick, goal
     later = advance_ticks(in_order)
     first = min(in_order)
     assert [state.number for state in later[:first]] == [-1] * first
@@ -138,7 +142,8 @@ def test_compiled_spans_equal_ticks_bit_for_bit(
         if k % EVERY == 0 and k // EVERY < len(goals):
             by_tick.accept_decision(k, goals[k // EVERY])
         singles.append(by_tick.advance_to(k, lambda: PLACE).vector)
-    k, spans = 0, []
+    k = 0
+    spans = []
     while k < len(singles):
         if k % EVERY == 0 and k // EVERY < len(goals):
             by_span.accept_decision(k, goals[k // EVERY])

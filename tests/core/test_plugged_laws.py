@@ -79,7 +79,8 @@ def test_laws_see_peers_external_torque_and_past() -> None:
     setup = scenario.setup("m1")._replace(
         law_factory=lambda facts: laws.append(Watching(facts)) or laws[-1]
     )
-    site, records = Site(setup), []
+    site = Site(setup)
+    records = []
     for k in range(20):
         arrived = (
             [Arrival(1, k - 1, (0.1 * k, 0.2), (0.3, 0.4), 0, (0.5, -0.6))]
@@ -102,10 +103,12 @@ def test_laws_see_peers_external_torque_and_past() -> None:
     assert any(now.tau_x != [0.0, 0.0] for now in laws[0].seen)
     now = laws[0].seen[7]
     th1, th2, th3, th4, th5 = setup.theta
-    c2, s2 = math.cos(now.q[1]), math.sin(now.q[1])
+    c2 = math.cos(now.q[1])
+    s2 = math.sin(now.q[1])
     outer = setup.g_m_s2 * th5 * math.cos(now.q[0] + now.q[1])
     gravity = [setup.g_m_s2 * th4 * math.cos(now.q[0]) + outer, outer]
-    h, (v, w) = th2 * s2, now.qd
+    h = th2 * s2
+    v, w = now.qd
     np.testing.assert_allclose(now.gravity, gravity, rtol=1e-12)
     np.testing.assert_allclose(
         now.inertia, [[th1 + 2 * th2 * c2, th3 + th2 * c2], [th3 + th2 * c2, th3]]
@@ -236,18 +239,18 @@ def test_arithmetic_of_vectors_is_that_of_arrays(
 ) -> None:
     for operate in (operator.add, operator.sub, operator.mul):
         expected = operate(np.array(a), np.array(b))
-        for one, other in ((LawVector(a), LawVector(b)), (LawVector(a), b), (a, LawVector(b))):
-            if LawVector in (type(one), type(other)) and (type(one), operate) != (
+        for left, other in ((LawVector(a), LawVector(b)), (LawVector(a), b), (a, LawVector(b))):
+            if LawVector in (type(left), type(other)) and (type(left), operate) != (
                 list,
                 operator.mul,
             ):
-                assert operate(one, other) == expected.tolist()
+                assert operate(left, other) == expected.tolist()
         assert np.array_equal(operate(LawVector(a), np.array(b)), expected)
         assert np.array_equal(operate(np.array(a), LawVector(b)), expected)
         assert operate(LawVector(a), x) == operate(np.array(a), x).tolist()
         assert operate(x, LawVector(a)) == operate(x, np.array(a)).tolist()
     assert LawVector(a) / x == (np.array(a) / x).tolist()
-    assert -LawVector(a) == [-one for one in a]
+    assert -LawVector(a) == [-number for number in a]
     total = LawVector(a)
     total += b
     total *= 2
@@ -273,10 +276,8 @@ FAILING = {
 
 @pytest.mark.parametrize("law", FAILING)
 def test_failing_compiled_laws_name_their_tick(law: str) -> None:
-    site, (tick, problem) = (
-        Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s")),
-        FAILING[law],
-    )
+    site = Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+    tick, problem = FAILING[law]
     for k in range(tick):
         site.step(TickInput(k))
     with pytest.raises(LawFailed, match=f"{law} of s failed at tick {tick}: {problem}"):

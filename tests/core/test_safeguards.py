@@ -212,7 +212,8 @@ class Pull:
     remembers = ()
 
     def __init__(self, _facts: LawContext, K: float = 60.0, d: float = 12.0) -> None:
-        self.K, self.d = K, d
+        self.K = K
+        self.d = d
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -238,7 +239,9 @@ def test_own_laws_yield_to_gravity_while_holding() -> None:
     """The slave holds from 2.12 to 2.7 s."""
     log = simulate_own_law("Pull")
     part = log["s"]
-    q, qd, held = part.q, part.qd, slice(2120, 2700)
+    q = part.q
+    qd = part.qd
+    held = slice(2120, 2700)
     assert set(part.mode[held]) == {"hold"}
     gravity = gravity_of(log.scenario.arms["s"].theta, q)
     setup = log.scenario.setup("s")
@@ -257,7 +260,8 @@ def test_own_laws_yield_to_gravity_while_holding() -> None:
 
 def test_a_holding_law_is_still_called() -> None:
     log = simulate_own_law("PullHeld")
-    part, q = log["s"], log["s"].q[2120:2700]
+    part = log["s"]
+    q = log["s"].q[2120:2700]
     gravity = gravity_of(log.scenario.arms["s"].theta, q)
     law = gravity - 12.0 * part.qd[2120:2700] - 60.0 * (q - log["m"].q[1999])
     setup = log.scenario.setup("s")

@@ -77,7 +77,8 @@ def test_the_reference_never_jumps(site: str, log: Log) -> None:
 
     Where the arm begins to rest, the reference changes from the peers' to its own pose.
     """
-    part, h_s = log[site], 1e-3
+    part = log[site]
+    h_s = 1e-3
     steps = np.diff(part.q_des, axis=0)
     means = 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
     # at the first tick without a new sample, what is in use stays, and so does qd_des
@@ -91,7 +92,8 @@ def test_the_reference_never_jumps(site: str, log: Log) -> None:
 @pytest.mark.parametrize("speed", [0.2, 1.0])
 def test_approaches_to_peers_keep_their_speed_limit(speed: float) -> None:
     log = trilat_net.simulate(make_glide_scenario(12.0, outages_s="[]", speed=speed))
-    part, other = log["s"], log["m"]
+    part = log["s"]
+    other = log["m"]
     aligning = np.flatnonzero(part.mode == "return")
     way_rate = part.qd_des[aligning] - other.qd[aligning - 100]
     start = np.abs(way_rate[0]).max()
@@ -108,7 +110,8 @@ def test_sites_beyond_their_limit_wait_and_say_so() -> None:
 
 def test_every_driver_gives_the_same_bits() -> None:
     scenario = make_glide_scenario(3.0)
-    ticks, fused = make_trajectories(scenario), sample_records(scenario, (3.0,))[:, 0]
+    ticks = make_trajectories(scenario)
+    fused = sample_records(scenario, (3.0,))[:, 0]
     columns = scenario.layout("m").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(

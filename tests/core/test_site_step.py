@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.builders import VECTORS, describe_bits, make_arrival, make_site_setup, step_site
-from tests.core.compiled import run_python
+from tests.programs import run_python
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
@@ -17,7 +17,7 @@ from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
 
 
-def finite(output: TickRecord) -> bool:
+def is_finite(output: TickRecord) -> bool:
     return all(math.isfinite(v) for field in VECTORS for v in getattr(output, field))
 
 
@@ -35,15 +35,17 @@ arrivals = st.lists(
 
 @settings(max_examples=40)
 @given(
-    came=st.lists(arrivals, min_size=1, max_size=40),
+    arrivals_by_tick=st.lists(arrivals, min_size=1, max_size=40),
     scheme=st.sampled_from(["second_order", "digital"]),
 )
-def test_equal_ticks_give_equal_bits(came: list[list[Arrival]], scheme: str) -> None:
-    ticks = [TickInput(k, c) for k, c in enumerate(came)]
-    one, other = (
+def test_equal_ticks_give_equal_bits(
+    arrivals_by_tick: list[list[Arrival]], scheme: str
+) -> None:
+    ticks = [TickInput(k, c) for k, c in enumerate(arrivals_by_tick)]
+    first, other = (
         Site(make_site_setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2)
     )
-    assert [describe_bits(o) for o in step_site(one, ticks)] == [
+    assert [describe_bits(o) for o in step_site(first, ticks)] == [
         describe_bits(o) for o in step_site(other, ticks)
     ]
 
@@ -94,7 +96,8 @@ def test_two_records_resume_the_same_bits(scheme: str, k: int) -> None:
     ]
     whole = step_site(Site(built), ticks)
     site = Site(built)
-    before, last = whole[max(0, k - 2)], whole[k - 1]
+    before = whole[max(0, k - 2)]
+    last = whole[k - 1]
     in_use = [make_arrival(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
     waiting = [
         make_arrival(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)
@@ -180,22 +183,22 @@ extreme = st.sampled_from([1.7e308, -1.7e308, 1e200, -1e160, 5e-324, 0.0, 1.0])
 
 @settings(max_examples=60)
 @given(
-    came=st.lists(st.tuples(extreme, extreme, extreme, extreme), min_size=1, max_size=20),
+    arriving=st.lists(st.tuples(extreme, extreme, extreme, extreme), min_size=1, max_size=20),
     Lambda=st.sampled_from([1.0, 5.0, 1e9]),
     scheme=st.sampled_from(["second_order", "digital"]),
 )
 def test_no_record_is_ever_infinite(
-    came: list[tuple[float, float, float, float]], Lambda: float, scheme: str
+    arriving: list[tuple[float, float, float, float]], Lambda: float, scheme: str
 ) -> None:
-    """For any finite numbers of a peer, and any gains."""
+    """Records are finite for any finite numbers of a peer and any gains."""
     site = Site(
         make_site_setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0)
     )
-    for k, numbers in enumerate([None, *came, None, None]):
+    for k, numbers in enumerate([None, *arriving, None, None]):
         numbers_of_tick = (
             [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
         )
-        assert finite(site.step(TickInput(k, numbers_of_tick)))
+        assert is_finite(site.step(TickInput(k, numbers_of_tick)))
 
 
 LARGEST = 1e9
@@ -216,7 +219,7 @@ def test_absurd_scenarios_are_refused_or_stop_finite(key: str, scheme: str) -> N
             load_scenario("paper", {key: LARGEST, "scheme": scheme, "duration_s": 0.3})
         )
     )
-    assert all(finite(r.output) for r in ran)
+    assert all(is_finite(r.output) for r in ran)
 
 
 def test_too_many_arrivals_in_a_tick_are_refused() -> None:

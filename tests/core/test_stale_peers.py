@@ -38,19 +38,26 @@ def peer_state(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, 
     return (0.4 * peer + speed[0] * tick / 1000, -0.3 + speed[1] * tick / 1000), speed
 
 
-def moving(peer: int, tick: int) -> Arrival:
+def make_moving_arrival(peer: int, tick: int) -> Arrival:
     return Arrival(peer, tick, *peer_state(peer, tick))
 
 
 def cut_ticks(count: int = 200) -> list[TickInput]:
     """Yields both peers at every tick, except peer 1 in samples from 50 to 90."""
     return [
-        TickInput(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and 50 <= k - 1 < 90)])
+        TickInput(
+            k,
+            [
+                make_moving_arrival(j, k - 1)
+                for j in (0, 1)
+                if k and not (j and 50 <= k - 1 < 90)
+            ],
+        )
         for k in range(count)
     ]
 
 
-def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
+def run_cut_site(rule: StaleRule, count: int = 200) -> list[TickRecord]:
     """Returns the records of a site during that cut."""
     return step_site(make_stale_site(rule), cut_ticks(count))
 
@@ -64,7 +71,7 @@ def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
     return [(outputs[k].mode, k) for k in edges]
 
 
-def followed(
+def compute_followed(
     output: TickRecord, shares: Sequence[float] = (0.5, 0.5)
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the reference of the peers, from the samples in use."""
@@ -84,19 +91,22 @@ def followed(
 )
 def test_cuts_lead_to_hold_and_return(action: StaleAction, mode: Mode) -> None:
     """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
-    outputs = cut(RULE._replace(action=action))
+    outputs = run_cut_site(RULE._replace(action=action))
     assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
 
 
 def test_the_rule_use_continues() -> None:
-    assert runs_of(cut(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
+    assert runs_of(run_cut_site(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
 
 
 def test_staleness_during_a_return_is_held() -> None:
     ticks = [
         TickInput(
             k,
-            [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])]
+            [
+                make_moving_arrival(0, k - 1),
+                *([make_moving_arrival(1, k - 1)] if k <= 50 or 90 < k <= 91 else []),
+            ]
             if k
             else [],
         )
@@ -119,7 +129,7 @@ def test_an_unheard_peer_has_the_runs_age() -> None:
 
 
 def test_peers_without_share_may_be_stale() -> None:
-    ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
+    ticks = [TickInput(k, [make_moving_arrival(0, k - 1)] if k else []) for k in range(100)]
     assert runs_of(step_site(make_stale_site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
     assert runs_of(step_site(make_stale_site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
 
@@ -131,13 +141,13 @@ def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     outputs = step_site(
         stale_site,
         [
-            TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else [])
+            TickInput(k, [make_moving_arrival(j, k - 1) for j in (0, 1)] if k > 60 else [])
             for k in range(120)
         ],
     )
     diverged = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert all(o.mode is Mode.DIVERGED and o.mem == [] for o in outputs[diverged:])
-    q, _ = followed(outputs[-1])
+    q, _ = compute_followed(outputs[-1])
     assert outputs[-1].q_des == pytest.approx(q, abs=1e-12)
 
 
@@ -163,12 +173,15 @@ def test_modes_and_references_follow_the_law(
     return_ms: int,
     shares: tuple[float, float],
 ) -> None:
-    """For any pattern of arrivals: the edges of `Mode`, and the reference of each mode."""
+    """The edges of `Mode` and the reference of each mode hold for any pattern of arrivals."""
     stale_site = make_stale_site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
-    mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
+    mode = Mode.RUN
+    since = 0
+    held = np.zeros(2)
+    before = np.zeros(2)
     for k, flags in enumerate(heard):
         output = stale_site.step(
-            TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k])
+            TickInput(k, [make_moving_arrival(j, k - 1) for j in (0, 1) if flags[j] and k])
         )
         ages = [k - max(used, 0) for used in output.used]
         stale = any(share > 0 and age > age_ms for share, age in zip(shares, ages, strict=True))
@@ -177,19 +190,20 @@ def test_modes_and_references_follow_the_law(
                 mode = Mode.HOLD if action is StaleAction.HOLD else Mode.BRAKE
                 held = before if action is StaleAction.HOLD else np.array(output.q)
             elif not stale and mode in (Mode.HOLD, Mode.BRAKE):
-                mode, since = Mode.RETURN, k
+                mode = Mode.RETURN
+                since = k
             if mode is Mode.RETURN and k - since >= return_ms:
                 mode = Mode.RUN
-        q, qd = followed(output, shares)
+        q, qd = compute_followed(output, shares)
         if mode is Mode.RETURN:
             x = (k - since) / return_ms
-            q, qd = (
-                held + (3 * x**2 - 2 * x**3) * (q - held),
-                (3 * x**2 - 2 * x**3) * qd
-                + (6 * x * (1 - x) / (return_ms / 1000)) * (q - held),
-            )
+            share = 3 * x**2 - 2 * x**3
+            share_rate_per_s = 6 * x * (1 - x) / (return_ms / 1000)
+            qd = share * qd + share_rate_per_s * (q - held)
+            q = held + share * (q - held)
         elif mode is not Mode.RUN:
-            q, qd = held, np.zeros(2)
+            q = held
+            qd = np.zeros(2)
         assert output.mode is mode
         assert output.q_des == pytest.approx(q, abs=1e-12)
         assert output.qd_des == pytest.approx(qd, abs=1e-9)
@@ -206,7 +220,7 @@ def test_modes_and_references_follow_the_law(
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_returning_references_have_no_step(action: StaleAction) -> None:
     """Central differences of the reference from the last tick of holding to well within RUN."""
-    outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 700)
+    outputs = run_cut_site(StaleRule(action, 20 * MS, 400 * MS), 700)
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     assert runs_of(outputs)[2:] == [(Mode.RETURN, 95), (Mode.RUN, 495)]
     assert (q[95] == q[94]).all()
@@ -219,19 +233,19 @@ def test_returning_references_have_no_step(action: StaleAction) -> None:
 @pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
-    """In any mode, because the records hold the site's memory."""
+    """A site resumes in any mode, because the records hold its memory."""
     rule = RULE._replace(action=action)
-    whole = cut(rule)
+    whole = run_cut_site(rule)
     stale_site = make_stale_site(rule)
     last = whole[k - 1]
-    in_use = [moving(j, m) for j, m in enumerate(last.used)]
+    in_use = [make_moving_arrival(j, m) for j, m in enumerate(last.used)]
     heard = [
         (j, m)
         for j in (0, 1)
         for m in range(last.used[j] + 1, k - 1)
         if not (j and 50 <= m < 90)
     ]
-    stale_site.restore_links(k, in_use, [moving(j, m) for j, m in heard])
+    stale_site.restore_links(k, in_use, [make_moving_arrival(j, m) for j, m in heard])
     stale_site.restore_state(whole[k - 2], last)
     assert step_site(stale_site, cut_ticks()[k:]) == whole[k:]
 

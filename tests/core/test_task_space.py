@@ -31,7 +31,8 @@ tasks = pytest.mark.parametrize("task", [PLACE, POSE], ids=["place", "pose"])
 def place_row(arrays: SiteArrays, q: Array, qd: Array) -> Row:
     """Returns the site's row with its end effector placed in a state."""
     s: Row = arrays.site[0]
-    s.q, s.qd = q, qd
+    s.q = q
+    s.qd = qd
     place_joints(arrays.chain, s.q)
     update_pose(s, arrays.chain)
     return s
@@ -81,7 +82,8 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 @given(seed=seeds)
 def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
     arrays, q, qd = draw_state(seed)
-    h, m = 1e-6, arrays.site[0].shared
+    h = 1e-6
+    m = arrays.site[0].shared
     before, after = (
         np.array(place_row(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0)
     )
@@ -112,14 +114,16 @@ def test_reference_acceleration_differentiates_reference_velocity(
 ) -> None:
     """Along a motion whose reference stands still: v shortly before and after, and a between them."""
     arrays = make_task_arrays(task)
-    q, h = np.array(arrays.site[0].q), 1e-6
+    q = np.array(arrays.site[0].q)
+    h = 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
     x = np.array(place_row(arrays, q, qd).x)
     x[:3] += 0.05
     errors = []
     for sign in (-1.0, 0.0, 1.0):
         s = place_row(arrays, q + sign * h * qd, qd)
-        s.q_des, s.qd_des = x, 0.0
+        s.q_des = x
+        s.qd_des = 0.0
         update_task_errors(s)
         errors.append((np.array(s.v), np.array(s.a)))
     rate = (errors[2][0] - errors[0][0]) / (2 * h)
@@ -132,9 +136,10 @@ def test_reference_acceleration_differentiates_reference_velocity(
 def test_damping_begins_below_its_singular_value() -> None:
     arrays = make_task_arrays(PLACE._replace(singular_value=1e-6))
     straight = make_task_arrays(PLACE._replace(singular_value=0.5))
-    q, qd = np.array(arrays.site[0].q), np.zeros(7)
-    for one, damped in ((arrays, False), (straight, True)):
-        s = place_row(one, q, qd)
+    q = np.array(arrays.site[0].q)
+    qd = np.zeros(7)
+    for posed, damped in ((arrays, False), (straight, True)):
+        s = place_row(posed, q, qd)
         s.q_des = np.array(s.x) - 0.1
         update_task_errors(s)
         left = np.abs(s.J @ s.v + s.Lambda * s.e).max()

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One site's records, rows are ticks."""
+    """The records of one site as arrays, with one row for each tick."""
 
     t_s: Array
     q: Array

@@ -34,7 +34,7 @@ def draw_gaps(
 
 
 def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
-    """Holds each sample back until the earlier samples of the same link have come."""
+    """Returns delays, in ticks, with which each sample waits for the earlier samples of its link."""
     held: dict[Sample, int] = {}
     for receiver in SCENARIO.names:
         for peer in (0, 1):

@@ -17,6 +17,7 @@ from tests.log.builders import (
     make_log,
     make_log_bytes,
     open_bytes,
+    write_log,
 )
 from tests.log.surgery import Pieces, Stored, repack_message, take_apart
 from trilat_net.app.cli import options
@@ -39,7 +40,7 @@ def make_run_bytes(*, other: bool = False) -> bytes:
     return make_delivered_bytes(LATE if other else {})
 
 
-def pieces(*, chained: bool, other: bool = False) -> Pieces:
+def make_pieces(*, chained: bool, other: bool = False) -> Pieces:
     taken = take_apart(make_run_bytes(other=other))
     return taken if chained else taken.without_chain()
 
@@ -60,7 +61,7 @@ def test_rewriting_without_changes_keeps_the_file() -> None:
     log = open_bytes(make_run_bytes())
     assert judge_integrity(log).state is DigestState.INTACT
     assert LogCheckReport.of_log(log, virtual=True).passed
-    old = open_bytes(pieces(chained=False).bytes())
+    old = open_bytes(make_pieces(chained=False).bytes())
     assert judge_integrity(old).state is DigestState.ABSENT
     assert LogCheckReport.of_log(old, virtual=True).passed
 
@@ -71,7 +72,7 @@ stretches = st.tuples(st.integers(1, TICKS - 2), st.integers(1, 30)).map(
 )
 
 
-def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
+def list_places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
     """Returns the places in a file of the records of some sites and ticks."""
     topics = taken.topics()
     wanted = {f"/trilat/free/{site}/state" for site in of}
@@ -82,14 +83,15 @@ def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
     ]
 
 
-def remove(draw: Callable, taken: Pieces) -> None:
-    gone = set(places(taken, draw(sites), draw(stretches)))
+def remove_records(draw: Callable, taken: Pieces) -> None:
+    gone = set(list_places(taken, draw(sites), draw(stretches)))
     taken.messages = [m for n, m in enumerate(taken.messages) if n not in gone]
 
 
-def splice(draw: Callable, taken: Pieces) -> None:
+def splice_run(draw: Callable, taken: Pieces) -> None:
     """Returns a log that continues with another run from some tick on, over a gap or none."""
-    k, gap = draw(st.integers(TICKS // 2, TICKS - 5)), draw(st.integers(0, 3))
+    k = draw(st.integers(TICKS // 2, TICKS - 5))
+    gap = draw(st.integers(0, 3))
     other = take_apart(make_run_bytes(other=True)).messages
     topics = taken.topics()
 
@@ -100,17 +102,18 @@ def splice(draw: Callable, taken: Pieces) -> None:
     taken.messages = kept + [m for m in other if is_record(m) and m.sequence >= k + gap]
 
 
-def replay(draw: Callable, taken: Pieces) -> None:
+def replay_records(draw: Callable, taken: Pieces) -> None:
     """Returns a log with a repeated stretch: unchanged, or with the following tick numbers, in
     place of the original.
     """
-    of, ticks = draw(sites), draw(stretches)
-    again = [taken.messages[n] for n in places(taken, of, ticks)]
+    of = draw(sites)
+    ticks = draw(stretches)
+    again = [taken.messages[n] for n in list_places(taken, of, ticks)]
     if draw(st.booleans()):
         taken.messages += again
         return
     assume(ticks.stop + len(ticks) < TICKS)
-    later = set(places(taken, of, range(ticks.stop, ticks.stop + len(ticks))))
+    later = set(list_places(taken, of, range(ticks.stop, ticks.stop + len(ticks))))
     taken.messages = [m for n, m in enumerate(taken.messages) if n not in later]
     for message in again:
         tick = message.sequence + len(ticks)
@@ -119,9 +122,9 @@ def replay(draw: Callable, taken: Pieces) -> None:
         )
 
 
-def renumber(draw: Callable, taken: Pieces) -> None:
+def renumber_records(draw: Callable, taken: Pieces) -> None:
     by = draw(st.integers(-40, 40).filter(bool))
-    for n in places(taken, draw(sites), draw(stretches)):
+    for n in list_places(taken, draw(sites), draw(stretches)):
         tick = taken.messages[n].sequence + by
         taken.messages[n] = repack_message(taken.messages[n], tick=tick)
 
@@ -160,7 +163,7 @@ def change_description(draw: Callable, taken: Pieces) -> None:
     entry.data = entry.data[:index] + bytes([entry.data[index] ^ 1]) + entry.data[index + 1 :]
 
 
-def change_message(draw: Callable, taken: Pieces) -> None:
+def change_one_message(draw: Callable, taken: Pieces) -> None:
     """Changes a time, or the telemetry of a record, which no execution computes; or removes any message."""
     n = draw(st.integers(0, len(taken.messages) - 1))
     message = taken.messages[n]
@@ -175,15 +178,15 @@ def change_message(draw: Callable, taken: Pieces) -> None:
             taken.messages[n] = message._replace(log_ns=message.log_ns + 1)
 
 
-OF_RECORDS = [remove, splice, replay, renumber]
-ANY = [*OF_RECORDS, change_metadata, change_description, change_message]
+OF_RECORDS = [remove_records, splice_run, replay_records, renumber_records]
+ANY = [*OF_RECORDS, change_metadata, change_description, change_one_message]
 
 
 def refuses_all(changes: list[Callable], *, chained: bool, examples: int) -> None:
     @settings(max_examples=examples)
     @given(st.data(), st.sampled_from(changes))
     def check(data: st.DataObject, change: Callable) -> None:
-        taken = pieces(chained=chained)
+        taken = make_pieces(chained=chained)
         change(data.draw, taken)
         assert is_refused(taken.bytes(), chained=chained), change.__name__
 
@@ -207,7 +210,7 @@ def test_of_500_changed_logs_none_passes(chained: bool, changes: list[Callable])
 
 def test_two_runs_over_a_gap_are_refused() -> None:
     """The same experiment and the same starts of its sites: another run follows the gap."""
-    taken = pieces(chained=False)
+    taken = make_pieces(chained=False)
     other = take_apart(make_run_bytes(other=True)).messages
     topics = taken.topics()
     taken.messages = [
@@ -272,7 +275,7 @@ def test_a_claimed_rerun_is_executed_whole() -> None:
 
 
 def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(make_log_bytes("free"))
+    write_log(tmp_path, make_log_bytes("free"))
     log_path = tmp_path / "again.mcap"
     rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(log_path)
     verdict = verify(open_log(log_path))
@@ -285,7 +288,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
     log_path.write_bytes(forged)
     assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
-    (tmp_path / "run.mcap").write_bytes(make_log_bytes("free") + b"x")
+    write_log(tmp_path, make_log_bytes("free") + b"x")
     alone = LogCheckReport.of_log(open_log(log_path), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)

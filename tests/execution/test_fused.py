@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.core.compiled import run_python
 from tests.execution.builders import execute_ticks, run_fused
 from tests.execution.varying_links import VARYING_LINKS
+from tests.programs import run_python
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.core.step.ticks import BUCKETS_PER_S, Mode, TickRecord
@@ -126,7 +126,8 @@ def test_diverging_runs_end_with_that_tick() -> None:
 @given(stops=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=5))
 def test_a_split_run_equals_the_whole_run(stops: list[float]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})
-    whole, parts = FusedRun(scenario), FusedRun(scenario)
+    whole = FusedRun(scenario)
+    parts = FusedRun(scenario)
     whole.advance_to(1.0)
     for until_s in sorted(stops):
         parts.advance_to(until_s)
@@ -170,7 +171,9 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
         ), key
     squares = []
     for site in scenario.names:
-        q, tau, theta = log[site].q, log[site].tau, scenario.arms[site].theta
+        q = log[site].q
+        tau = log[site].tau
+        theta = scenario.arms[site].theta
         outer = 9.81 * theta[4] * np.cos(q[:, 0] + q[:, 1])
         gravity = np.stack((9.81 * theta[3] * np.cos(q[:, 0]) + outer, outer), axis=1)
         squares.append(np.mean((tau - gravity) ** 2))
@@ -226,7 +229,7 @@ def test_unsupported_runs_are_refused() -> None:
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
 def test_plugged_laws_have_per_tick_bits(law: str) -> None:
-    """One law among those of the kernel, which send nothing; and all sites, at two rates."""
+    """The law runs at one site among laws of the kernel, and at all sites at two rates."""
     plugged = {"link.delay_ms": 5.0, "duration_s": 0.2}
     line = f"tests.plugged_laws:{law}"
     for changes in (

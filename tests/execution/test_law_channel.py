@@ -67,7 +67,7 @@ def test_messages_are_executed_again_like_virtual_time() -> None:
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_behind_gaps_messages_continue_from_records(session: dict[str, str] | None) -> None:
-    """As much can be judged as without messages between laws, and all of it agrees."""
+    """As many records are judged as without messages between laws, and all of them agree."""
     verdict = verify(make_log_without({"s": range(50, 61)}, make_talking_bytes(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed

@@ -59,7 +59,8 @@ def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
 
 
 def test_record_tables_name_the_hands_values(held_log: Log) -> None:
-    table, mode = held_log.table("m1"), held_log.scenario.sites["m1"].hands[0].mode
+    table = held_log.table("m1")
+    mode = held_log.scenario.sites["m1"].hands[0].mode
     first = {
         "tip": "hand_target_x_m",
         "joint": "hand_target_q1_rad",

@@ -44,7 +44,8 @@ def test_any_record_resumes_the_whole_run(law: str) -> None:
     samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
     ends = dict.fromkeys(log.sites, TICKS - 1)
     for name in log.sites:
-        part, setup = log[name], log.scenario.setup(name)
+        part = log[name]
+        setup = log.scenario.setup(name)
         for first in range(2, TICKS, 9):
             inputs: RecordedInputs[Any] = RecordedInputs(part, samples, ends, {}, setup.links)
             site = Site(setup)

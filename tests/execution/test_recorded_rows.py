@@ -142,10 +142,10 @@ def test_calendars_that_are_too_short_are_replaced() -> None:
 
 
 @given(st.lists(st.integers(0, 2**64 - 1), max_size=9))
-def test_the_checksum_is_that_of_zlib(words: list[int]) -> None:
-    signed = np.array(words, np.uint64).view(np.int64).tolist()
+def test_the_checksum_is_that_of_zlib(numbers: list[int]) -> None:
+    signed = np.array(numbers, np.uint64).view(np.int64).tolist()
     crc = 0xFFFFFFFF
     for word in signed:
         crc = recorded_ticks._update_checksum(crc, word)
-    data = b"".join(word.to_bytes(8, "little") for word in words)
+    data = b"".join(word.to_bytes(8, "little") for word in numbers)
     assert crc ^ 0xFFFFFFFF == zlib.crc32(data)

@@ -64,7 +64,8 @@ def test_reruns_of_every_log_version_are_equal(path: Path, replace: list[str]) -
     )
     for site in replace:
         for field in ("q", "qd", "tau", "theta_hat"):
-            ours, theirs = getattr(again.after[site], field), getattr(again.before[site], field)
+            ours = getattr(again.after[site], field)
+            theirs = getattr(again.before[site], field)
             assert abs(ours - theirs).max() <= 1e3 * TOLERANCE * (1 + abs(theirs).max())
 
 
@@ -77,7 +78,7 @@ def test_recorded_delivery_is_repeated_exactly(
 
 
 def test_a_changed_site_sees_recorded_samples() -> None:
-    """By hand: the site of the changed scenario receives the samples that its records list."""
+    """A site of the changed scenario, stepped by hand, receives the samples that its records list."""
     log = open_bytes(
         make_delivered_bytes(
             {("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)}
@@ -91,11 +92,11 @@ def test_a_changed_site_sees_recorded_samples() -> None:
     again = rerun(log, ["s"], changes)
     site = Site(load_scenario(log.scenario, changes).setup("s"))
     samples = [{state.tick: state for state in log[peer].states} for peer in site.peers]
-    for state, made in zip(log["s"].states, again.after["s"].states, strict=True):
+    for state, record in zip(log["s"].states, again.after["s"].states, strict=True):
         arrivals = [
             Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx
         ]
-        assert equal_record(made, site.step(TickInput(state.tick, arrivals)), site.peers)
+        assert equal_record(record, site.step(TickInput(state.tick, arrivals)), site.peers)
     assert again.sites["s"].first is not None
     assert not again.identical
     assert not again.broken
@@ -131,7 +132,8 @@ def test_closed_loop_changes_equal_the_changed_experiment(
     again = rerun(make_log("free"), [], changes, closed_loop=True)
     twin = make_log("free", {**SHORT, **changes})
     for site in SITES:
-        ours, theirs = list_tick_results(again.after, site), list_tick_results(twin, site)
+        ours = list_tick_results(again.after, site)
+        theirs = list_tick_results(twin, site)
         assert ours == theirs[: len(ours)]
         # rates that do not divide: up to the last record of the log
         assert len(ours) >= len(theirs) - 2
@@ -161,7 +163,8 @@ def test_only_executed_sites_react() -> None:
     """If m1 moves otherwise, an executed s sees the change 20 ms later, and no other site does."""
     log = make_log("free")
     stiff = {"sites.m1.control.Kd": 9.0}
-    alone, both = rerun(log, ["m1"], stiff), rerun(log, ["m1", "s"], stiff)
+    alone = rerun(log, ["m1"], stiff)
+    both = rerun(log, ["m1", "s"], stiff)
     assert list_tick_results(alone.after, "s") == list_tick_results(log, "s")
     assert alone.after["s"].payloads[50] == log["s"].payloads[50]
     assert list_tick_results(both.after, "s")[:20] == list_tick_results(log, "s")[:20]

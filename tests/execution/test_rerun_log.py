@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.execution.builders import make_log_without
-from tests.log.builders import make_log, make_log_bytes
+from tests.log.builders import make_log, make_log_bytes, write_log
 from trilat_net.errors import UsageError
 from trilat_net.execution.log_checks import LogCheckReport
 from trilat_net.execution.verification import verify
@@ -23,9 +23,7 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "v2.mcap"
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    path = tmp_path / "field.mcap"
-    path.write_bytes(make_log_bytes("free"))
-    return path
+    return write_log(tmp_path, make_log_bytes("free"), "field.mcap")
 
 
 def test_rerun_logs_name_source_and_differences(file: Path) -> None:

@@ -42,12 +42,13 @@ def test_task_errors_are_those_of_place(log: Log) -> None:
 def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
     metrics = compute_log_metrics(log)
     for site in log.sites:
-        own, part = metrics.sites[site], log[site]
-        assert own["rms_error_m"].value == pytest.approx(
+        site_metrics = metrics.sites[site]
+        part = log[site]
+        assert site_metrics["rms_error_m"].value == pytest.approx(
             np.sqrt((part.e**2).mean(axis=0)).max()
         )
-        assert not own["rms_error_rad"].applies
-        assert own["unaccounted_j"].value < 1e-6
+        assert not site_metrics["rms_error_rad"].applies
+        assert site_metrics["unaccounted_j"].value < 1e-6
     distance = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
     assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= distance
     assert {"tracking_errors", "settling", "phase"} <= set(list_drawable_figures(log))

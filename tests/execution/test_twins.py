@@ -51,7 +51,7 @@ def test_a_zero_push_changes_no_bit() -> None:
 
 @pytest.mark.parametrize("name", ["live-4g", "live-paper"])
 def test_a_live_run_is_repeated_bit_for_bit(name: str) -> None:
-    """With its recorded arrivals: late samples, lost samples, and early samples."""
+    """The run is repeated with its recorded arrivals: late, lost and early samples."""
     log = tn.open_log(GOLDEN / f"{name}.mcap")
     twins = Twins.of_log(log, Push.choose(log.scenario, 1))
     assert twins.same

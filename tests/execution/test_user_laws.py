@@ -57,7 +57,7 @@ def test_own_paper_law_gives_equal_bits(name: str) -> None:
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_laws_resume_behind_gaps_from_memory(session: dict[str, str] | None) -> None:
-    """As much can be judged as of a shipped law."""
+    """As many records are judged as with a shipped law."""
     verdict = verify(make_log_without({"s": range(50, 61)}, make_own_law_bytes(), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
@@ -80,7 +80,7 @@ def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
 
 @pytest.mark.parametrize("law", [LAW, "adaptive"])
 def test_restarted_sites_are_the_same(law: str) -> None:
-    """Also after changes that were ordered while the run lasted, over a link whose delay varies."""
+    """The records are the same also after changes ordered during the run, over a link whose delay varies."""
     link = {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}
     scenario = load_scenario("paper", {"duration_s": 0.3, "control.law": law, "link": link})
     orders = [
@@ -258,7 +258,7 @@ def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
 
 
 def test_external_arms_are_executed_behind_gaps() -> None:
-    """As much can be judged as of a simulated arm."""
+    """As many records are judged as with a simulated arm."""
     verdict = verify(make_log_without({"s": range(40, 45)}, make_external_arm_bytes()))
     assert verdict.agreed
     ours = verify(make_log_without({"s": range(40, 45)}, make_log_bytes("two_sites", SHORT)))

@@ -274,7 +274,7 @@ def test_gaps_with_lost_samples_are_no_difference(
     lost: dict[str, set[int]],
     whole_run: bool,
 ) -> None:
-    """On links that keep their order, as those of a session do."""
+    """The links keep their order, as those of a session do."""
     data = make_delivered_bytes(first_in_first_out(delays), never)
     verdict = verify(make_log_without(lost, data, {} if whole_run else OTHER_PLATFORM))
     assert verdict.agreed, str(verdict.first)

@@ -115,7 +115,8 @@ def test_overdue_samples_change_the_run() -> None:
 
 
 def test_records_show_whether_limits_held() -> None:
-    fine, wild = io.BytesIO(), io.BytesIO()
+    fine = io.BytesIO()
+    wild = io.BytesIO()
     assert virtual.write_virtual_log(make_small_scenario((1000,) * 3), fine)
     assert not virtual.write_virtual_log(
         load_scenario("free", {"limits.qd_limit_rad_s": 0.3}), wild
@@ -138,7 +139,8 @@ def test_simulate_applies_overrides() -> None:
 
 @pytest.mark.parametrize("site", ["m1", "s"])
 def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
-    scenario, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
+    scenario = load_scenario("paper")
+    other = load_scenario("paper", {"seed": 2})
     assert virtual.compute_boot(scenario, site) == virtual.compute_boot(
         load_scenario("paper"), site
     )
@@ -230,7 +232,7 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
 @pytest.mark.parametrize("entry", [[70_000, 3, 0], [-1, 3, 0], [0, 2**58, 0], [0, -5, 0]])
 @pytest.mark.parametrize("gap", [range(0), range(5, 80)])
 def test_foreign_samples_are_never_late(entry: list[int], gap: range) -> None:
-    """Also if so many records are missing that no arrivals are assumed."""
+    """This holds also if so many records are missing that no arrivals are assumed."""
 
     def record(r: dict) -> dict | None:
         if (r["site"], r["tick"]) == ("s", 90):

@@ -47,7 +47,8 @@ def in_order(under_way: Way) -> Way:
 
 def make_record(k: int) -> TickRecord:
     """Returns the record of a tick at which nothing moves."""
-    two, five = [0.0] * 2, [0.0] * 5
+    two = [0.0] * 2
+    five = [0.0] * 5
     return TickRecord(
         k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], []
     )
@@ -94,10 +95,8 @@ def test_whole_logs_give_their_recorded_arrivals() -> None:
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
 def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> None:
-    whole, deliveries = (
-        make_site_log(make_steady_way(ticks)),
-        complete_deliveries(make_site_log(make_steady_way(ticks), lost), *SENDERS),
-    )
+    whole = make_site_log(make_steady_way(ticks))
+    deliveries = complete_deliveries(make_site_log(make_steady_way(ticks), lost), *SENDERS)
     assert deliveries.unrecorded == lost
     pairs = {k: sorted(entry[:2] for entry in at) for k, at in deliveries.entries.items() if at}
     assert pairs == {
@@ -107,8 +106,9 @@ def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> 
 
 @given(under_way=delays, lost=lost_ticks)
 def test_every_arrived_sample_is_listed_once(under_way: Way, lost: set[int]) -> None:
-    """In order, for samples older than the newest that a record lists; later samples are unknown."""
-    whole, gapped = make_site_log(in_order(under_way)), make_site_log(in_order(under_way), lost)
+    """Samples older than the newest one in a record are listed in order; later samples are unknown."""
+    whole = make_site_log(in_order(under_way))
+    gapped = make_site_log(in_order(under_way), lost)
     deliveries = complete_deliveries(gapped, *SENDERS)
     for state in gapped.states:
         assert deliveries.entries[state.tick] == state.rx

@@ -27,7 +27,7 @@ timeline=[
 
 @pytest.mark.long
 def test_ten_timed_changes_are_executed_again_exactly(stage: Stage) -> None:
-    """With a stale peer at the end, that a site holds for."""
+    """At the end a peer is stale, and a site holds its arm."""
     options = (
         "--set",
         SCRIPT.strip().replace("\n", ""),

@@ -11,7 +11,7 @@ import pytest
 
 from tests.cli.running import trilat
 from tests.live.processes import connection_options
-from tests.truth import judge_link, members, offset_errors
+from tests.truth import judge_link, list_members, offset_errors
 
 from .processes import PAPER, Session, Stage
 
@@ -50,24 +50,24 @@ def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
             if np.median(samples.bound_us) <= IDLE_US:
                 assert np.abs(errors[errors[:, 0] >= 10.0, 1]).max() <= 100.0
                 assert np.abs(errors[errors[:, 0] >= 10.0, 2]).max() <= 20.0
-    clocks = members(log)
-    for own, other, about_s in (("m1", "m2", 3.0), ("recorder", "m1", -86_400.0)):
-        found = re.search(
+    clocks = list_members(log)
+    for clock_owner, other, about_s in (("m1", "m2", 3.0), ("recorder", "m1", -86_400.0)):
+        match = re.search(
             rf"clock of {other}: another one, offset (\S+) s \+- (\d+) us",
-            session.processes[own].text(),
+            session.processes[clock_owner].text(),
         )
-        assert found is not None, session.processes[own]
-        true_s = clocks[own].offset_to_ns(clocks[other], 0) / 1e9
+        assert match is not None, session.processes[clock_owner]
+        true_s = clocks[clock_owner].offset_to_ns(clocks[other], 0) / 1e9
         assert true_s == pytest.approx(about_s, abs=0.1)
         # it prints whole us
-        assert float(found[1]) == pytest.approx(true_s, abs=1e-6 * (float(found[2]) + 1.0))
-    told = json.loads(seen.succeeds())
-    pinged = {member["member"]: member for member in told["members"]}
+        assert float(match[1]) == pytest.approx(true_s, abs=1e-6 * (float(match[2]) + 1.0))
+    report = json.loads(seen.succeeds())
+    pinged = {member["member"]: member for member in report["members"]}
     assert set(pinged) == {*PAPER}
     assert pinged["m1"]["same_clock"]
     assert abs(pinged["m2"]["offset_ns"] - 3_000_000_000) <= 20_000_000
     assert pinged["m2"]["rtt_us"]["min"] > 0
-    assert {(link["from"], link["to"]) for link in told["links"]} == {
+    assert {(link["from"], link["to"]) for link in report["links"]} == {
         (peer, site) for site in PAPER for peer in log.scenario.peers(site)
     }
 

@@ -48,7 +48,12 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
     path = disk.folder / "run.mcap"
     small = stage.start(
         "on a small disk",
-        *("record", "--session", "t", "-o", str(path), *session.ways("recorder")),
+        "record",
+        "--session",
+        "t",
+        "-o",
+        str(path),
+        *session.ways("recorder"),
         before=disk.before,
     )
     for name in SITES:
@@ -90,10 +95,10 @@ def test_a_restarted_recorder_writes_the_next_part(stage: Stage) -> None:
     second = session.log.with_name("run-002.mcap")
     log = open_log(session.log, second)
     for name in SITES:
-        (made,) = (
+        (tick_count,) = (
             event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
         )
-        assert [state.tick for state in log[name].states] == list(range(made))
+        assert [state.tick for state in log[name].states] == list(range(tick_count))
     with second.open("rb") as stream:
         metadata = {entry.name: entry.metadata for entry in make_reader(stream).iter_metadata()}
     assert metadata["trilat.part"] == {"index": "2", "previous": "run.mcap"}

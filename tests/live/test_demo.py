@@ -24,9 +24,9 @@ def start_demo(stage: Stage, duration: str = "3") -> Process:
     )
 
 
-def find_child(demo: Process, words: str) -> int:
+def find_child(demo: Process, phrase: str) -> int:
     return until(
-        lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30
+        lambda: next((pid for pid, line in demo.children().items() if phrase in line), 0), 30
     )
 
 
@@ -90,7 +90,7 @@ def test_signals_before_sessions_leave_no_log(number: int, when: str, stage: Sta
 
 
 def test_demos_bear_their_scenarios_name_and_errors(stage: Stage) -> None:
-    """So `tn.hand("play", "m1")` finds it, as sites that are started one by one."""
+    """`tn.hand("play", "m1")` finds the demo like sites that are started one by one."""
     running = stage.start(
         "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
     )
@@ -115,8 +115,8 @@ def test_ctrl_c_while_drawing_keeps_the_log(stage: Stage) -> None:
     log = open_log(stage.folder / "out" / "run.mcap")
     assert log.complete
     assert verify(log).identical == 1000
-    words = next(line for line in running.text().splitlines() if "drawn later: " in line)
-    assert f"the log is kept: {log.source}" in words
-    later = shlex.split(words.partition("drawn later: trilat ")[2])
+    last_line = next(line for line in running.text().splitlines() if "drawn later: " in line)
+    assert f"the log is kept: {log.source}" in last_line
+    later = shlex.split(last_line.partition("drawn later: trilat ")[2])
     done = trilat(*later, cwd=stage.folder)
     assert (done.code, (stage.folder / "out" / "report.html").exists()) == (0, True), done

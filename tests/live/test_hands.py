@@ -11,13 +11,14 @@ import pytest
 
 import trilat_net
 from tests.cli.running import trilat
+from tests.live.browsers import wait_until_page
 from tests.live.namespaces import connect_by_bridge
 from tests.live.processes import connection_options
 from tests.net.waiting import until
 from trilat_net.analysis.certificate.stability_certificate import BROKEN_BALANCE_SHARE
 from trilat_net.log.log_reader import Log
 
-from .browsers import browser_page, needs_browser, page_address, shows, take_hold
+from .browsers import browser_page, needs_browser, page_address, take_hold
 from .namespaces import Machines
 from .processes import PAPER, Holder, Session, Stage, assert_let_go
 
@@ -27,8 +28,10 @@ class Circling(threading.Thread):
 
     def __init__(self, session: Session, site: str, seconds: float, turn_s: float) -> None:
         super().__init__(name=f"hand at {site}", daemon=True)
-        self._places, self._site = session.endpoints, site
-        self._rounds, self._turn = round(60.0 * seconds), 2.0 * math.pi / (60.0 * turn_s)
+        self._places = session.endpoints
+        self._site = site
+        self._rounds = round(60.0 * seconds)
+        self._turn = 2.0 * math.pi / (60.0 * turn_s)
         self.felt_n = 0.0
         self._wait = threading.Event()
 
@@ -79,9 +82,9 @@ def hold_by_page(session: Session, moves: int) -> None:
         "page", "live", "--session", "t", "--no-browser", *connection_options(session.endpoints)
     )
     with browser_page(page_address(server)) as page:
-        shows(page, "trilat.frame && trilat.takesPart")
+        wait_until_page(page, "trilat.frame && trilat.takesPart")
         x, y = take_hold(page, 2, 20.0, 0.0)
-        shows(page, "trilat.frame.holds.includes('s')")
+        wait_until_page(page, "trilat.frame.holds.includes('s')")
         for n in range(moves):
             page.mouse.move(x + 20.0 * math.cos(0.2 * n), y + 20.0 * math.sin(0.2 * n))
         page.mouse.up()
@@ -123,9 +126,12 @@ def test_a_minute_of_hands_verifies_and_repeats(stage: Stage) -> None:
     assert any(text.startswith("s: page 1 takes hold") for text in said)
     assert np.abs(log["s"].hand[:, 0]).max() == 1.0
     assert sum(len(log.changes(name)) for name in PAPER) == 10
-    found = trilat_net.certify(log)
-    assert found.balance is not None
-    assert np.abs(found.balance.residual).max() < BROKEN_BALANCE_SHARE * found.balance.scale
+    certificate = trilat_net.certify(log)
+    assert certificate.balance is not None
+    assert (
+        np.abs(certificate.balance.residual).max()
+        < BROKEN_BALANCE_SHARE * certificate.balance.scale
+    )
 
 
 LINKS = [("m1", "s"), ("m2", "s"), ("s", "m1"), ("s", "m2"), ("m1", "m2"), ("m2", "m1")]
@@ -134,7 +140,7 @@ SHARED = (0.9, 0.1, 0.7, 0.5)
 
 @pytest.mark.long
 def test_a_killed_program_leaves_no_force(stage: Stage, tmp_path: Path) -> None:
-    """By the log: from its last message to the last force, and the event that says so."""
+    """The log shows the time from the last message to the last force, and the event that reports it."""
     session = Session(stage, "play", PAPER, "--duration", "15")
     session.all()
     holder = Holder(session, tmp_path)

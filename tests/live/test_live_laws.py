@@ -52,7 +52,8 @@ def run_unit_arms(
 
 def test_waves_through_200_ms(stage: Stage) -> None:
     log = run_unit_arms(stage, {"law": "wave"}, FOLLOWER)
-    m, s = log["m"], log["s"]
+    m = log["m"]
+    s = log["s"]
     assert [m.q[-1, 0], s.q[-1, 0]] == pytest.approx([0.3, 0.3], abs=2e-3)
     assert np.abs(m.q - s.q)[:, 0].max() == pytest.approx(0.0476, rel=0.01)
     assert -m.tau[:, 0].min() == pytest.approx(1.763, rel=0.01)
@@ -97,12 +98,14 @@ def test_live_laws_are_executed_again_exactly(law: str, stage: Stage) -> None:
     changes = {**changes, "duration_s": 2.0, "link.delay_ms": 20.0, "control.law": law}
     changes |= {f"sites.s.control.{key}": value for key, value in STORED.get(law, {}).items()}
     options = [
-        word for key, value in changes.items() for word in ("--set", f"{key}={_written(value)}")
+        word
+        for key, value in changes.items()
+        for word in ("--set", f"{key}={_format_value(value)}")
     ]
     sites = tuple(load_scenario(scenario).names)
     log = run_live(stage, scenario, sites, *options)
     assert sum(len(log[name]) for name in sites) == 2000 * len(sites)
 
 
-def _written(value: object) -> str:
+def _format_value(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -37,14 +37,14 @@ def test_slow_laws_end_sessions_in_order(stage: Stage, monkeypatch: pytest.Monke
     session = Session(stage, "two_sites", ("m", "s"), *law, "--duration", "20")
     session.all()
     assert session.codes() == {"recorder": 0, "m": 1, "s": 1}
-    (told,) = (
+    (failure,) = (
         line
         for line in session.processes["s"].text().splitlines()
         if line.startswith("error: ")
     )
-    assert "the law slow_law:Law of s failed at tick 4" in told
-    assert "the code is too slow" in told
-    assert told.removeprefix("error: ") in session.processes["m"].text()
+    assert "the law slow_law:Law of s failed at tick 4" in failure
+    assert "the code is too slow" in failure
+    assert failure.removeprefix("error: ") in session.processes["m"].text()
     log = open_log(session.log)
     assert log.complete
     assert [event.member for event in log.events if event.kind == "failed"] == ["s"]
@@ -70,7 +70,7 @@ def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
 
 def drive_arm(session: Session, scenario: str, *options: str) -> str:
     """Runs the program of the example until it ends; what it printed."""
-    words = (
+    arguments = (
         "s",
         "--scenario",
         scenario,
@@ -81,7 +81,7 @@ def drive_arm(session: Session, scenario: str, *options: str) -> str:
         *options,
     )
     done = subprocess.run(
-        [sys.executable, str(ARM), *words],
+        [sys.executable, str(ARM), *arguments],
         env=PLAIN,
         capture_output=True,
         text=True,
@@ -100,7 +100,7 @@ def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
     session.all()
     site = session.processes["s"]
     site.prints("waiting for its arm on trilat/t/s/measured")
-    words = (
+    arguments = (
         "s",
         "--scenario",
         "six_joints",
@@ -109,7 +109,7 @@ def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
         "--connect",
         session.endpoints[-1],
     )
-    wrong = subprocess.Popen([sys.executable, str(ARM), *words], env=PLAIN)
+    wrong = subprocess.Popen([sys.executable, str(ARM), *arguments], env=PLAIN)
     try:
         site.prints("its arm sends measurements of 6 joints; the scenario has 7")
     finally:

@@ -13,7 +13,7 @@ from .processes import Process, Session, Stage
 VECTORS = ("q", "qd", "tau", "hand")
 
 
-def overrides(*, process: bool) -> list[str]:
+def make_options(*, process: bool) -> list[str]:
     keys = f'kind="own", class="my_hand:MyHand", delay_ms=100, process={str(process).lower()}'
     hand = f"sites.m2.hands=[{{{keys}}}]"
     return ["--set", hand, "--set", "link.delay_ms=200", "--duration", "6"]
@@ -23,7 +23,8 @@ def assert_bits_of_virtual_time(log: Log) -> None:
     virtual = tn.simulate(log)
     for name in log.sites:
         for vector in VECTORS:
-            live, ours = getattr(log[name], vector), getattr(virtual[name], vector)
+            live = getattr(log[name], vector)
+            ours = getattr(virtual[name], vector)
             assert np.array_equal(live, ours), (name, vector)
 
 
@@ -34,7 +35,9 @@ def test_records_are_those_of_virtual_time(
 ) -> None:
     monkeypatch.chdir(stage.folder)
     tn.new_hand("my_hand.py")
-    running = stage.start("demo", "demo", "paper", *overrides(process=process), "--out", "out")
+    running = stage.start(
+        "demo", "demo", "paper", *make_options(process=process), "--out", "out"
+    )
     assert running.code(120.0) == 0, running
     log = open_log(stage.folder / "out" / "run.mcap", law=stage.folder / "my_hand.py")
     assert log.complete
@@ -62,13 +65,13 @@ def test_a_person_takes_over_from_a_running_program(
         f"timeline=[{ramps}]",
         "duration_s=9",
     ]
-    words = [word for key in keys for word in ("--set", key)]
-    running = stage.start("demo", "demo", "paper", *words, "--out", "out")
+    options = [word for key in keys for word in ("--set", key)]
+    running = stage.start("demo", "demo", "paper", *options, "--out", "out")
     assert running.code(120.0) == 0, running
     log = open_log(stage.folder / "out" / "run.mcap", law=stage.folder / "my_hand.py")
-    found = tn.metrics(log).run
-    assert found["takeovers"].value == 2
-    assert 0.0 < found["lead_jump"].value <= 1.2
+    run_metrics = tn.metrics(log).run
+    assert run_metrics["takeovers"].value == 2
+    assert 0.0 < run_metrics["lead_jump"].value <= 1.2
     assert {state.mode for name in log.sites for state in log[name].states} == {"run"}
     assert tn.verify(log).passed
 
@@ -80,10 +83,10 @@ def test_a_killed_program_lets_go_without_harm(
     """SIGKILL in the middle: silence of 200 ms, a grip that fades within 100 ms, no site that holds."""
     monkeypatch.chdir(stage.folder)
     tn.new_hand("my_hand.py")
-    chosen = overrides(process=True)
+    chosen = make_options(process=True)
     session = Session(stage, "paper", ("m1", "m2", "s"), *chosen)
     endpoint = session.endpoints[1]
-    words = (
+    arguments = (
         "hand",
         "m2",
         "--scenario",
@@ -94,7 +97,7 @@ def test_a_killed_program_lets_go_without_harm(
         endpoint,
         *chosen,
     )
-    program: Process = stage.start("hand", *words)
+    program: Process = stage.start("hand", *arguments)
     session.all()
     session.processes["m2"].prints("takes hold")
     program.signal(signal.SIGKILL)

@@ -27,23 +27,23 @@ def write_chain_scenario(folder: Path, count: int) -> Path:
     return path
 
 
-def run_demo(stage: Stage, *words: str) -> tuple[Process, Log]:
+def run_demo(stage: Stage, *arguments: str) -> tuple[Process, Log]:
     running = stage.start(
-        "demo", "demo", *words, "--duration", "10", "--out", str(stage.folder / "out")
+        "demo", "demo", *arguments, "--duration", "10", "--out", str(stage.folder / "out")
     )
     assert running.code(PATIENCE_S) == 0, running
     return running, open_log(stage.folder / "out" / "run.mcap")
 
 
 def assert_accounted(log: Log) -> None:
-    """Of every site the end is in the log, and every record that it made is there or counted as missing."""
+    """Asserts that the log has the end of every site, and each record or its mention as missing."""
     assert log.complete
     for name in log.sites:
-        (made,) = (
+        (tick_count,) = (
             event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
         )
-        assert made == log.scenario.ticks(name)
-        assert len(log[name]) + log.missing(name) == made
+        assert tick_count == log.scenario.ticks(name)
+        assert len(log[name]) + log.missing(name) == tick_count
     verdict = verify(log)
     assert verdict.passed
     assert verdict.differing == 0

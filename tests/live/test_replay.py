@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.live.processes import assert_executed_again
-from tests.log.builders import make_log_bytes
+from tests.log.builders import make_log_bytes, write_log
 from tests.recorder.play.logs import read_session_payloads
 from tests.sites.sessions import Session as Sites
 from tests.sites.sessions import make_gliding_scenario
@@ -20,33 +20,38 @@ class Again:
     """A replay on an endpoint of its own, and those who listen to it."""
 
     def __init__(self, stage: Stage, log: Path) -> None:
-        self._stage, self._log = stage, log
+        self._stage = stage
+        self._log = log
         (self.endpoint,) = find_free_endpoints(1)
 
     def replay(self, *options: str, called: str = "replay", listen: str = "") -> Process:
         return self._stage.start(
             called,
-            *(
-                "replay",
-                str(self._log),
-                "--session",
-                "again",
-                "--listen",
-                listen or self.endpoint,
-                *options,
-            ),
+            "replay",
+            str(self._log),
+            "--session",
+            "again",
+            "--listen",
+            listen or self.endpoint,
+            *options,
         )
 
     def recorder(self, log: Path) -> Process:
         return self._stage.start(
             "second recorder",
-            *("record", "--session", "again", "-o", str(log), "--connect", self.endpoint),
+            "record",
+            "--session",
+            "again",
+            "-o",
+            str(log),
+            "--connect",
+            self.endpoint,
         )
 
 
 def sort_payloads(log: Path) -> dict[str, list[bytes]]:
-    """What sites published, per channel in an order that does not depend on the file's."""
-    return {key: sorted(found) for key, found in read_session_payloads(log).items()}
+    """Returns the payloads of sites by channel, sorted, because their order in the file may differ."""
+    return {key: sorted(payloads) for key, payloads in read_session_payloads(log).items()}
 
 
 @pytest.mark.parametrize("live", [False, pytest.param(True, marks=pytest.mark.long)])
@@ -59,7 +64,8 @@ def test_replayed_and_recorded_logs_are_equal_bytewise(live: bool, stage: Stage)
         path = session.log
     again = Again(stage, path)
     second = stage.folder / "second.mcap"
-    recorder, replay = again.recorder(second), again.replay("--needs-recorder")
+    recorder = again.recorder(second)
+    replay = again.replay("--needs-recorder")
     assert (replay.code(), recorder.code()) == (0, 0)
     assert "none dropped" in replay.text()
     assert "the recorder has everything" in replay.text()
@@ -70,9 +76,7 @@ def test_replayed_and_recorded_logs_are_equal_bytewise(live: bool, stage: Stage)
 
 
 def write_virtual_log(folder: Path) -> Path:
-    path = folder / "virtual.mcap"
-    path.write_bytes(make_log_bytes("two_sites", {"duration_s": 1.0}))
-    return path
+    return write_log(folder, make_log_bytes("two_sites", {"duration_s": 1.0}), "virtual.mcap")
 
 
 @pytest.mark.long
@@ -120,7 +124,8 @@ def test_logs_of_restarted_sites_are_played_whole(stage: Stage) -> None:
     path = session.run().source
     again = Again(stage, Path(path))
     second = stage.folder / "second.mcap"
-    recorder, replay = again.recorder(second), again.replay("--needs-recorder")
+    recorder = again.recorder(second)
+    replay = again.replay("--needs-recorder")
     assert (replay.code(), recorder.code()) == (0, 0), (replay, recorder)
     assert sort_payloads(second) == sort_payloads(Path(path))
     assert open_log(second).starts["m"] == open_log(path).starts["m"]

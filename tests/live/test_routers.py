@@ -25,7 +25,7 @@ class Routed(Session):
         self._network = network
 
     def network(self, name: str) -> list[str]:  # noqa: ARG002 - all of them alike
-        """How a member is secured."""
+        """Returns the options that secure a member."""
         return [*self._network]
 
     def ways(self, name: str) -> list[str]:
@@ -64,8 +64,8 @@ def test_sites_with_keys_that_meet_without_a_router(stage: Stage) -> None:
 
 @pytest.mark.long
 def test_sessions_run_over_mutual_tls(stage: Stage) -> None:
-    own = Certificates(stage.folder).zenoh_file()
-    session = Routed(stage, "1", "tls", "--zenoh-config", str(own))
+    zenoh_file = Certificates(stage.folder).zenoh_file()
+    session = Routed(stage, "1", "tls", "--zenoh-config", str(zenoh_file))
     router = session.router()
     session.all()
     session.is_reproduced()
@@ -116,12 +116,12 @@ def test_all_may_stop_but_only_operators_enable(stage: Stage) -> None:
     def keys(name: str) -> tuple[str, str]:
         return "--keys", str(stage.folder / "keys" / name)
 
-    def order(words: str, whose: str) -> tuple[int, str]:
+    def order(command: str, whose: str) -> tuple[int, str]:
         ways = connection_options(session.endpoints)
-        asked = stage.start(
-            f"{words} by {whose}", *words.split(), "--session", "t", *ways, *keys(whose)
+        process = stage.start(
+            f"{command} by {whose}", *command.split(), "--session", "t", *ways, *keys(whose)
         )
-        return asked.code(), asked.text()
+        return process.code(), process.text()
 
     session.recorder(*keys(RECORDER))
     for name in SITES:
@@ -163,8 +163,8 @@ class Joined(Keyed):
     def routers(self) -> None:
         _ = self.router("public")
         for name, place in self.local.items():
-            words = ("--listen", place, "--connect", self.endpoint, *self.network(ROUTER))
-            self.stage.start(f"router of {name}", "router", *words)
+            arguments = ("--listen", place, "--connect", self.endpoint, *self.network(ROUTER))
+            self.stage.start(f"router of {name}", "router", *arguments)
 
 
 @pytest.mark.long

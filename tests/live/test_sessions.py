@@ -11,7 +11,7 @@ from tests.live.processes import (
     connection_options,
     open_whole_log,
 )
-from tests.net.waiting import until
+from tests.net.waiting import sleep_for_ns, until
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import find_absent_samples
 from trilat_net.log.log_reader import open_log
@@ -58,23 +58,21 @@ def test_live_arms_of_many_joints_equal_virtual_time(
 
 @pytest.mark.long
 def test_garbage_is_counted_and_changes_nothing(stage: Stage) -> None:
-    """With the `digital` scheme and a leader that comes last; and a second m1 is refused meanwhile."""
+    """The scheme is `digital`, the leader comes last, and a second m1 is refused meanwhile."""
     session = Session(stage, "paper", PAPER, "--duration", "16", "--set", 'scheme="digital"')
     session.all("recorder", "s", "m2", "m1")
     session.begun()
     (elsewhere,) = find_free_endpoints(1)
     second = stage.start(
-        *(
-            "second m1",
-            "site",
-            "m1",
-            "--scenario",
-            "paper",
-            "--session",
-            "t",
-            "--listen",
-            elsewhere,
-        ),
+        "second m1",
+        "site",
+        "m1",
+        "--scenario",
+        "paper",
+        "--session",
+        "t",
+        "--listen",
+        elsewhere,
         *connection_options(session.endpoints),
     )
     junk = [b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000]
@@ -92,7 +90,7 @@ def test_garbage_is_counted_and_changes_nothing(stage: Stage) -> None:
             for payload in junk:
                 for publish in publishers:
                     publish(payload)
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
             return session.processes["s"].ended()
 
         until(shouted, 30.0)
@@ -116,7 +114,7 @@ def test_frozen_sites_on_slow_links_keep_bits(stage: Stage) -> None:
     session.recording()
     clock = SystemClock()
     session.processes["m2"].signal(signal.SIGSTOP)
-    clock.sleep_until(clock.monotonic_ns() + 1_000_000_000)
+    sleep_for_ns(clock, 1_000_000_000)
     session.processes["m2"].signal(signal.SIGCONT)
     log = session.is_reproduced()
     assert max(log["m2"].late_us) > 800_000

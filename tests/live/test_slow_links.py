@@ -36,7 +36,7 @@ def queue(apart: Machines) -> str:
 
 
 def delays_ms(log: Log, site: str, peer: str) -> NDArray[np.float64]:
-    """From the stamp of each sample that came to the tick that took it in."""
+    """Returns the time from the stamp of each arrived sample to the tick that received it, in ms."""
     place = log.scenario.peers(site).index(peer)
     return np.array(
         [
@@ -68,7 +68,7 @@ def test_sites_hold_during_long_delays_then_follow(
     holds = ticks_to_hold(log)
     assert holds["m2"]
     assert holds["s"]
-    assert max(max(found, default=0) for found in holds.values()) <= 21
+    assert max(max(ticks, default=0) for ticks in holds.values()) <= 21
     assert {str(log[name].mode[-1]) for name in PAPER} == {"run"}
 
 
@@ -76,7 +76,7 @@ def test_sites_hold_during_long_delays_then_follow(
 def test_jitter_within_the_delay_changes_no_record(
     queue: str, stage: Stage, apart: Machines
 ) -> None:
-    """What m1 sends waits for moments, some tens of milliseconds; the session is that of virtual time."""
+    """The messages of m1 wait for some tens of milliseconds, and the session equals virtual time."""
     session = Apart(stage, apart, "--duration", "8")
     session.all()
     session.begun()

@@ -14,12 +14,13 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.cli.running import COMMAND, PLAIN
+from tests.live.browsers import wait_until_page
 from tests.live.processes import assert_executed_again
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import list_shipped, load_scenario
 
-from .browsers import browser_page, needs_browser, page_address, shows, take_hold
+from .browsers import browser_page, needs_browser, page_address, take_hold
 from .page_client import PageClient, page_client
 from .processes import Process, Stage
 
@@ -35,10 +36,11 @@ HELD = [
 def watch_session(stage: Stage, session: str) -> Iterator[int]:
     """`trilat watch` with a terminal, whose keys are pressed at the other end, once it shows the session."""
     keys, terminal = pty.openpty()
-    printed, words = stage.folder / "watch.printed", [*COMMAND, "watch", "--session", session]
+    printed = stage.folder / "watch.printed"
+    command = [*COMMAND, "watch", "--session", session]
     with printed.open("wb") as sink:
         owns = {"stdin": terminal, "start_new_session": True, "preexec_fn": own_terminal}
-        watch = subprocess.Popen(words, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
+        watch = subprocess.Popen(command, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
     try:
         until(
             lambda: "m1" in printed.read_text(encoding="utf-8") or watch.poll() is not None,
@@ -67,8 +69,8 @@ def start_live(stage: Stage, scenario: str, *options: str) -> Process:
     return stage.start("live", "live", scenario, "--no-browser", "--out", out, *rate, *options)
 
 
-def run_command(stage: Stage, *words: str) -> Process:
-    done = stage.start(f"{words[0]}-{len(list(stage.folder.iterdir()))}", *words)
+def run_command(stage: Stage, *command: str) -> Process:
+    done = stage.start(f"{command[0]}-{len(list(stage.folder.iterdir()))}", *command)
     assert done.code() == 0, done
     return done
 
@@ -109,14 +111,14 @@ def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
     running = start_live(stage, "play")
     modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
     with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && " + modes("run"))
+        wait_until_page(page, "trilat.frame && " + modes("run"))
         for stop in (lambda: page.click("#stop"), lambda: page.keyboard.press("Escape")):
             stop()
-            shows(page, modes("stopped"))
+            wait_until_page(page, modes("stopped"))
             if "TRILAT_PICTURES" in os.environ:
                 page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stop.png")
             run_command(stage, "enable", "--session", page.evaluate("trilat.hello.session"))
-            shows(page, modes("run"))
+            wait_until_page(page, modes("run"))
     running.signal(signal.SIGINT)
     running.prints("checking the log")
 
@@ -126,15 +128,17 @@ def is_asked(first: Page, second: Page) -> bool:
     if not first.evaluate("trilat.frame.holds.includes('m1')"):
         first.mouse.up()
         take_hold(first, 0, 20.0, 5.0)
-        shows(first, "trilat.frame.holds.includes('m1')")
+        wait_until_page(first, "trilat.frame.holds.includes('m1')")
     second.evaluate("document.getElementById('part').click()")
     until(lambda: second.evaluate("trilat.takesPart || trilat.frame.asks"))
     # the first was too slow for a moment, so nobody was in its way
     if second.evaluate("trilat.takesPart"):
         second.evaluate("document.getElementById('part').click()")
-        shows(second, "!trilat.takesPart")
+        wait_until_page(second, "!trilat.takesPart")
         return False
-    shows(first, "trilat.frame.asked.length === 1 && !document.getElementById('ask').hidden")
+    wait_until_page(
+        first, "trilat.frame.asked.length === 1 && !document.getElementById('ask').hidden"
+    )
     return True
 
 
@@ -144,17 +148,19 @@ def test_holders_are_asked_before_others_take_part(stage: Stage) -> None:
     running = start_live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as first:
-        shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
+        wait_until_page(
+            first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable"
+        )
         second = first.context.browser.new_page()  # type: ignore[union-attr]
         second.goto(address)
-        shows(second, "trilat.frame && trilat.frame.pages === 2")
+        wait_until_page(second, "trilat.frame && trilat.frame.pages === 2")
         first.bring_to_front()
         for answer in ("no", "yes"):
             assert any(is_asked(first, second) for _ in range(5))
             assert not second.evaluate("trilat.takesPart")
             first.evaluate(f"document.getElementById('ask-{answer}').click()")
-            shows(second, "!trilat.frame.asks")
-            shows(second, f"trilat.takesPart === {str(answer == 'yes').lower()}")
+            wait_until_page(second, "!trilat.frame.asks")
+            wait_until_page(second, f"trilat.takesPart === {str(answer == 'yes').lower()}")
         first.mouse.up()
     running.signal(signal.SIGINT)
     running.prints("checking the log")

@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from tests.cli.running import trilat
 from tests.live.processes import open_whole_log
-from tests.log.programs import rerun_faults
+from tests.programs import list_rerun_faults
 
 from .processes import Session, Stage
 
@@ -19,7 +19,7 @@ BUCKET_NS = 20_000_000
 
 @pytest.mark.long
 def test_a_recorded_session_is_read_by_everybody(stage: Stage) -> None:
-    """Its views have the extremes of its records; its bag has them all."""
+    """The views have the extremes of the records, and the bag has all records."""
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "1.5")
     session.all()
     session.ends_well()
@@ -48,4 +48,4 @@ def test_a_recorded_session_is_read_by_everybody(stage: Stage) -> None:
         counts[f"/{log.session['session']}/{site}/joint_states"] == len(log[site])
         for site in log.sites
     )
-    assert rerun_faults(session.log) == []
+    assert list_rerun_faults(session.log) == []

@@ -1,4 +1,4 @@
-"""Files whose pages a disk lost, kept from before, or wrote elsewhere; and what recovery makes of them."""
+"""Files whose pages a disk lost, did not update, or wrote elsewhere, and their recovery."""
 
 import io
 import random
@@ -23,8 +23,9 @@ DAMAGES = ("none", "zeroed", "stale", "misdirected", "random")
 
 
 def rewrite_as_other_program(data: bytes, chunk_bytes: int, **options: object) -> bytes:
-    """A log as another program writes it: its definitions in the first chunk, without a digest chain."""
-    reader, stream = make_reader(io.BytesIO(data)), io.BytesIO()
+    """Returns a log as another program writes it: definitions in the first chunk, and no digest chain."""
+    reader = make_reader(io.BytesIO(data))
+    stream = io.BytesIO()
     writer = Writer(stream, chunk_size=chunk_bytes, **options)  # type: ignore[arg-type]
     writer.start()
     metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
@@ -57,7 +58,7 @@ def rewrite_as_other_program(data: bytes, chunk_bytes: int, **options: object) -
 
 
 def make_log_collection() -> dict[str, bytes]:
-    """Whole logs of every kind of writer: live and virtual ones, and as other programs write them."""
+    """Returns whole logs of every kind of writer, by name: live, virtual, and of other programs."""
     long = make_log_bytes("paper", {"duration_s": 1.5})
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     return {
@@ -89,7 +90,7 @@ class DamagedFile:
 def draw_damaged_file(
     files: Mapping[str, bytes], names: Sequence[str], draw: random.Random
 ) -> DamagedFile:
-    """One of some logs with up to two bad pages, in six of ten cases cut off anywhere."""
+    """Draws one of some logs with up to two bad pages, which in six of ten cases is cut off anywhere."""
     name = draw.choice(names)
     whole = files[name]
     data = bytearray(whole)
@@ -98,7 +99,8 @@ def draw_damaged_file(
         del data[draw.randrange(PAGE_BYTES, len(whole)) :]
     pages = []
     for _ in range(draw.choice([1, 1, 1, 2])):
-        kind, page = draw.choice(DAMAGES), draw.randrange(-(-len(data) // PAGE_BYTES))
+        kind = draw.choice(DAMAGES)
+        page = draw.randrange(-(-len(data) // PAGE_BYTES))
         pages.append((kind, page))
         offset = page * PAGE_BYTES
         length = len(data[offset : offset + PAGE_BYTES])
@@ -106,7 +108,7 @@ def draw_damaged_file(
         if kind == "zeroed":
             content = bytes(length)
         elif kind == "stale":
-            older = files[draw.choice([one for one in names if one != name])]
+            older = files[draw.choice([other for other in names if other != name])]
             content = (older * (offset // len(older) + 2))[offset : offset + length]
         elif kind == "misdirected":
             place = draw.randrange(max(1, len(whole) // PAGE_BYTES)) * PAGE_BYTES
@@ -148,7 +150,7 @@ def recovered_all(
     *,
     verified: bool = True,
 ) -> RecoveryTally:
-    """Recovers files one after the other, and compares what is in them with the undamaged ones."""
+    """Recovers damaged files, and compares their messages with those of the undamaged files."""
     truth = {name: Counter(read_messages(data)) for name, data in files.items()}
     tally = RecoveryTally(Counter(), [], [], [], [])
     for case in cases:
@@ -164,7 +166,8 @@ def _judge_recovery(
     tally: RecoveryTally,
     verified: bool,
 ) -> str:
-    source, output = folder / "damaged.mcap", folder / "recovered.mcap"
+    source = folder / "damaged.mcap"
+    output = folder / "recovered.mcap"
     source.write_bytes(case.data)
     try:
         result = recover(source, output, force=True)

@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -63,6 +64,13 @@ def make_log(name: str, overrides: Mapping[str, Any] | None = None) -> Log:
 def open_bytes(data: bytes) -> Log:
     """Returns a log that is stored in memory."""
     return open_log(io.BytesIO(data))
+
+
+def write_log(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
+    """Writes the bytes of a log to a file, and returns its path."""
+    path = folder / name
+    path.write_bytes(data)
+    return path
 
 
 def edit_log_bytes(

@@ -37,14 +37,40 @@ LENGTHS = (
     (1 << 64) - 1,
 )
 NUMBERS = (
-    *(0, -1, 1, 3, 119, 120, 255, 1 << 31, 1 << 40, (1 << 40) - 1),
-    *((1 << 63) - 1, -(1 << 63), (1 << 64) - 1),
+    0,
+    -1,
+    1,
+    3,
+    119,
+    120,
+    255,
+    1 << 31,
+    1 << 40,
+    (1 << 40) - 1,
+    (1 << 63) - 1,
+    -(1 << 63),
+    (1 << 64) - 1,
 )
 VALUES: tuple[Any, ...] = (
     *NUMBERS,
-    *(float("nan"), float("inf"), 1e308, -1e308, 5e-324),
-    *("", "x", "m1", "diverged", "end", None, True, [], {}),
-    *([0, 0], [0.0] * 3, [float("nan")] * 3, [1e300] * 3),
+    float("nan"),
+    float("inf"),
+    1e308,
+    -1e308,
+    5e-324,
+    "",
+    "x",
+    "m1",
+    "diverged",
+    "end",
+    None,
+    True,
+    [],
+    {},
+    [0, 0],
+    [0.0] * 3,
+    [float("nan")] * 3,
+    [1e300] * 3,
     [[0, 0, 0]] * 300,
     [[1 << 40, (1 << 40) - 1, -(1 << 58)]],
     [[0, 5, 0], [0, 5, 0], [1, (1 << 58), 3]],
@@ -54,7 +80,7 @@ VALUES: tuple[Any, ...] = (
     ["{}", '{"link": "m2->m1"}', "[" * 2000, '{"at_s": 1e999}'],
     ["x" * 5000],
 )
-"""What a field of a message may be turned into."""
+"""Hostile values of a field of a message."""
 TEXTS = (
     "",
     "0",
@@ -69,8 +95,19 @@ TEXTS = (
     "²",
 )
 SCENARIO_VALUES = (
-    *("0x" + "f" * 300, "-1", "1e308", "5e-324", "nan", "''", "[]", "{}", "[[]]"),
-    *("true", "86400", "20000", "1"),
+    "0x" + "f" * 300,
+    "-1",
+    "1e308",
+    "5e-324",
+    "nan",
+    "''",
+    "[]",
+    "{}",
+    "[[]]",
+    "true",
+    "86400",
+    "20000",
+    "1",
     "[1e308, 1e308]",
     "'/dev/zero'",
     "'0 0, 1 lost'",
@@ -78,7 +115,7 @@ SCENARIO_VALUES = (
 
 
 class Draws(Protocol):
-    """Where choices come from: `random.Random`, or the bytes of a fuzzer."""
+    """A source of choices, such as `random.Random` or the bytes of a fuzzer."""
 
     def randrange(self, start: int, stop: int) -> int:
         """Returns a number from start to before stop."""
@@ -217,7 +254,8 @@ def change_field(data: bytes, draws: Draws) -> bytes:
         "site": "",
     }
     value = draw_other_value(kinds.get(name, 0), draws)
-    since, site = draws.randrange(0, 30), one_of(draws, ("m1", "m2", "s"))
+    since = draws.randrange(0, 30)
+    site = one_of(draws, ("m1", "m2", "s"))
 
     def change(record: dict[str, Any]) -> dict[str, Any]:
         hit = record["site"] == site and record["tick"] >= since
@@ -259,8 +297,16 @@ def change_scenario(data: bytes, draws: Draws) -> bytes:
 
 
 CHANGES: tuple[Callable[[bytes, Draws], bytes], ...] = (
-    *(flip_bits, cut_bytes, replace_length, replace_record_length, change_inside),
-    *(change_message, change_message, change_field, change_session, change_scenario),
+    flip_bits,
+    cut_bytes,
+    replace_length,
+    replace_record_length,
+    change_inside,
+    change_message,
+    change_message,
+    change_field,
+    change_session,
+    change_scenario,
 )
 
 
@@ -303,11 +349,11 @@ READERS: dict[str, Callable[[Path], object]] = {
     "recover": _recover,
     "replay": lambda path: preload_messages([path], PlaySelection(), 64 << 20),
 }
-"""Everybody who reads a log, by name."""
+"""The readers of logs, by name."""
 
 
 def read_by_all(path: Path) -> dict[str, str]:
-    """Has everybody read a file; returns what each said against it. Other than a `TrilatError` is raised."""
+    """Returns the complaints of all readers about a file, by reader; only a `TrilatError` counts as a complaint."""
     complaints = {}
     for name, reader in READERS.items():
         try:

@@ -1,4 +1,4 @@
-"""The messages of a log dealt out to several files, each of which opens on its own."""
+"""Logs whose messages are distributed over several files, each of which opens by itself."""
 
 import io
 from collections.abc import Collection, Sequence
@@ -39,7 +39,7 @@ def change_message(message: Message, **fields: object) -> Message:
 
 
 def make_foreign_bytes(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
-    """A file of another program, with these messages on one channel."""
+    """Returns a file of another program, with the given messages on one channel."""
     stream = io.BytesIO()
     writer = Writer(stream, **options)
     writer.start()
@@ -102,7 +102,7 @@ def make_bytes_of_messages(
 
 
 def make_parts(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
-    """The parts of a log: file n has the messages whose places are in hand n, in their order."""
+    """Returns the parts of a log: file n has the messages whose indices are in `hands[n]`, in their order."""
     every = read_messages(data)
     return [
         make_bytes_of_messages(
@@ -113,7 +113,7 @@ def make_parts(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) 
 
 
 def write_late_parts(folder: Path, *, refilled: range) -> list[Path]:
-    """A log in three parts, into which some records of `s` came later than others, out of its memory."""
+    """Writes a log in three parts, in which some records of `s` were requested later from the site's memory."""
     data = make_log_bytes("paper")
     scenario = open_bytes(data).scenario
     items = [item for item in McapReader(io.BytesIO(data), "log").messages() if item.topic]
@@ -124,7 +124,7 @@ def write_late_parts(folder: Path, *, refilled: range) -> list[Path]:
     items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
     accounts = {item.topic: Account() for item in items}
 
-    def told() -> dict[str, str]:
+    def describe_accounts() -> dict[str, str]:
         return {topic: account.describe() for topic, account in accounts.items()}
 
     place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
@@ -135,11 +135,11 @@ def write_late_parts(folder: Path, *, refilled: range) -> list[Path]:
             stream, scenario, "paper", "virtual", 0, collect_provenance(), part=part
         ),
     ) as log:
-        log.current_accounts = told
+        log.current_accounts = describe_accounts
         for item in items:
             now_ns = max(now_ns, item.log_time_ns)
             number = item.sequence // 100 if item.topic.endswith("/link") else item.sequence
             accounts[item.topic].receive(number)
             log.add(item.topic[1:], item.payload, item.publish_time_ns, now_ns, item.sequence)
-        log.finish(told())
+        log.finish(describe_accounts())
     return sorted(folder.glob("run-*.mcap"))

@@ -1,8 +1,9 @@
-"""Files as other people's readers get them: of a simulation, of a recorder, a part, recovered, exported."""
+"""Files for readers of other programs: simulated, recorded, in parts, recovered and exported."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
+from tests.log.builders import simulate_bytes, write_log
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
@@ -22,7 +23,7 @@ VIEWS_HZ = 100.0
 
 
 def record_live_file(storage: LogStorage) -> None:
-    """Records a session as the recorder does: records that were sent late and came later."""
+    """Writes a session as the recorder does, with records that were sent late and arrived later."""
 
     def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
         return LogWriter(
@@ -39,8 +40,11 @@ def record_live_file(storage: LogStorage) -> None:
 
     with LogParts(storage, begin) as log:
         for step in virtual.execute_virtual(SCENARIO):
-            name, k, t_ns = step.site.name, step.output.tick, step.output.t_ns
-            sent_ns, log_ns = t_ns + 80_000, EPOCH_NS + t_ns + 300_000
+            name = step.site.name
+            k = step.output.tick
+            t_ns = step.output.t_ns
+            sent_ns = t_ns + 80_000
+            log_ns = EPOCH_NS + t_ns + 300_000
             payload = encode_state(
                 name, 7, step.site.peers, step.output, step.arrivals, 70, 20, sent_ns
             )
@@ -71,7 +75,7 @@ def record_live_file(storage: LogStorage) -> None:
 
 
 def make_link_stats(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
-    """Statistics of a site with one peer, as a live loop publishes them."""
+    """Returns the statistics of a site with one peer, as a live loop publishes them."""
     counts = {name: {peer: 0} for name in ("accepted", "late", "duplicate", "refused")}
     measured = {"offset_us": {peer: -120}, "bound_us": {peer: 40}, "rtt_us": {peer: 400}}
     facts = {
@@ -89,19 +93,16 @@ def make_link_stats(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
 
 
 def write_standard_files(folder: Path) -> dict[str, Path]:
-    """Makes every kind of file, and the bag of the live one."""
-    whole = folder / "virtual.mcap"
-    with whole.open("wb") as stream:
-        virtual.write_virtual_log(SCENARIO, stream, views_hz=VIEWS_HZ)
-    record_live_file(LogStorage(folder / "live.mcap"))
+    """Writes a file of every kind, and the bag of the live one, and returns the paths by kind."""
+    whole = write_log(folder, simulate_bytes(SCENARIO, views_hz=VIEWS_HZ), "virtual.mcap")
+    live = folder / "live.mcap"
+    record_live_file(LogStorage(live))
     record_live_file(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
     parts = sorted(folder.glob("parts-*.mcap"))
-    torn = folder / "torn.mcap"
-    torn.write_bytes(
-        (folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10]
-    )
-    recover(torn, folder / "recovered.mcap")
+    torn = write_log(folder, live.read_bytes()[: live.stat().st_size * 7 // 10], "torn.mcap")
+    recovered = folder / "recovered.mcap"
+    recover(torn, recovered)
     bag = folder / "live-ros2.mcap"
-    export_ros2(open_log(folder / "live.mcap"), bag)
-    found = (whole, folder / "live.mcap", parts[0], parts[-1], folder / "recovered.mcap")
-    return {**dict(zip(KINDS, found, strict=True)), "bag": bag}
+    export_ros2(open_log(live), bag)
+    paths = (whole, live, parts[0], parts[-1], recovered)
+    return {**dict(zip(KINDS, paths, strict=True)), "bag": bag}

@@ -18,7 +18,7 @@ from tests.log.bad_pages import (
     recovered_all,
     rewrite_as_other_program,
 )
-from tests.log.builders import make_log_bytes
+from tests.log.builders import make_log_bytes, write_log
 from tests.log.split_logs import read_messages
 from trilat_net.errors import LogError, NothingSaved
 from trilat_net.execution.verification import verify
@@ -36,7 +36,8 @@ pytestmark = pytest.mark.usefixtures("unsynced")
 
 
 def test_no_message_is_invented(tmp_path: Path) -> None:
-    draw, whole = random.Random(2), make_log_bytes("paper")
+    draw = random.Random(2)
+    whole = make_log_bytes("paper")
     files = {
         "packed": whole,
         "loose": rewrite_as_other_program(whole, 30_000),
@@ -48,7 +49,8 @@ def test_no_message_is_invented(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_no_message_is_invented_in_2000_files(tmp_path: Path) -> None:
-    draw, files = random.Random(53), make_log_collection()
+    draw = random.Random(53)
+    files = make_log_collection()
     cases = [draw_damaged_file(files, list(files), draw) for _ in range(2000)]
     tally = recovered_all(files, cases, tmp_path)
     print(dict(tally.outcomes))
@@ -58,7 +60,7 @@ def test_no_message_is_invented_in_2000_files(tmp_path: Path) -> None:
 
 
 def recover_bytes(data: bytes, folder: Path) -> tuple[Recovery, bytes]:
-    (folder / "z.mcap.active").write_bytes(data)
+    write_log(folder, data, "z.mcap.active")
     result = recover(folder / "z.mcap.active", folder / "zz.mcap", force=True)
     return result, (folder / "zz.mcap").read_bytes()
 
@@ -67,7 +69,8 @@ def recover_bytes(data: bytes, folder: Path) -> tuple[Recovery, bytes]:
 def test_torn_chunks_with_zeroed_pages_add_nothing(tmp_path: Path) -> None:
     """The attack that gained nine messages."""
     data = make_log_bytes("paper", {"duration_s": 3.0})
-    truth, draw = Counter(read_messages(data)), random.Random(1)
+    truth = Counter(read_messages(data))
+    draw = random.Random(1)
     salvaged = 0
     for _ in range(40):
         torn = bytearray(data[: draw.randrange(PAGE_BYTES, len(data))])
@@ -94,7 +97,7 @@ def chunk_offsets(data: bytes) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize("finished", [True, False])
 def test_misplaced_whole_chunks_are_refused(finished: bool, tmp_path: Path) -> None:
-    """Its checksum is right; the index tells, and without an index the order of the times."""
+    """The checksum of such a chunk is right, but the index, or else the order of times, shows the error."""
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     places = chunk_offsets(live)
     begin, end = places[5]
@@ -155,7 +158,7 @@ def test_a_head_of_another_virtual_run_is_refused(whole: bool, tmp_path: Path) -
 
 
 def test_chunks_of_other_virtual_runs_are_refused(tmp_path: Path) -> None:
-    """Its checksum is right, and in an unfinished file so are its place and its times."""
+    """The checksum of such a chunk is right, and in an unfinished file its place and times are right too."""
     data, other = (
         make_log_bytes("paper", {"duration_s": 1.5, "seed": seed}) for seed in (1, 5)
     )
@@ -176,7 +179,7 @@ def test_chunks_of_other_virtual_runs_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["without checksums", "damaged chunk"])
 def test_without_valid_messages_no_file_is_made(kind: str, tmp_path: Path) -> None:
-    """Neither a message that nothing proves, nor a file that holds nothing."""
+    """Recovery neither keeps unproven messages nor writes an empty file."""
     data = bytearray(make_log_bytes("paper"))
     if kind == "without checksums":
         live = (GOLDEN / "live-paper.mcap").read_bytes()
@@ -186,7 +189,7 @@ def test_without_valid_messages_no_file_is_made(kind: str, tmp_path: Path) -> No
         del data[end + 500 :]
         data[begin + PAGE_BYTES : begin + 2 * PAGE_BYTES] = bytes(PAGE_BYTES)
     data[8:PAGE_BYTES] = bytes(PAGE_BYTES - 8)
-    (tmp_path / "zz.mcap").write_bytes(b"precious")
+    write_log(tmp_path, b"precious", "zz.mcap")
     with pytest.raises(NothingSaved, match="nothing in this file could be saved") as error:
         recover_bytes(bytes(data), tmp_path)
     expected = (
@@ -255,8 +258,7 @@ def test_check_names_a_zeroed_page(place: str, tmp_path: Path) -> None:
         "index": len(data) - 2000,
     }[place]
     data[offset : offset + 400] = bytes(400)
-    path = tmp_path / "run.mcap"
-    path.write_bytes(data)
+    path = write_log(tmp_path, data)
     assert not check_file(path).passed
 
 

@@ -67,9 +67,9 @@ def test_column_names_are_unique_with_units(which: str) -> None:
     ],
 )
 def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:
-    """In virtual time nothing is under way: a sample's delay there is no network's."""
+    """In virtual time the delay of a sample is not that of a network."""
     table = build_arrivals_table(make_paper_log()["m1"], "run.mcap", live=live)
-    (delay,) = (one for one in table.columns if one.name == "delay_us")
+    (delay,) = (column for column in table.columns if column.name == "delay_us")
     assert delay.meaning.startswith(said)
 
 
@@ -163,11 +163,11 @@ def test_empty_statistics_have_the_same_columns() -> None:
 
 def test_events_are_in_their_order_of_arrival() -> None:
     log = make_paper_log()
-    told = [
+    events = [
         Event(member="s", boot=2**64 - 1, kind="epoch", text="an epoch", boots={"m1": 5}, n=0),
         Event(member="m1", boot=1, kind="mode", text="holds, and says so", t_ns=7_000_000, n=0),
     ]
-    table = rewrite_log(log, keep=lambda s: s.tick < 2, others=told).table("events")
+    table = rewrite_log(log, keep=lambda s: s.tick < 2, others=events).table("events")
     rows = {column.name: column.rows(0, 2) for column in table.columns}
     assert table.label == "events"
     assert sorted(zip(rows["member"], rows["t_s"], rows["boot"], strict=True)) == [
@@ -237,7 +237,8 @@ def test_missing_numbers_in_columns_are_nan() -> None:
 )
 def test_a_frame_is_its_table(name: str, kind: str) -> None:
     log = make_busy_run().log
-    table, frame = log.table(name, kind), log.frame(name, kind)
+    table = log.table(name, kind)
+    frame = log.frame(name, kind)
     assert frame.columns == [column.name for column in table.columns]
     assert frame.height == len(table)
     for column in table.columns:

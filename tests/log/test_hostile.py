@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes, write_log
 from tests.log.hostility import CHANGES, make_chunk, mangle_log, read_by_all
 from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
@@ -65,7 +65,8 @@ def _make_file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) ->
     )
     framing = RecordScanner(io.BytesIO(log))
     first = next(frame for frame in framing.frames() if frame.opcode == Opcode.CHUNK)
-    inside, names = unpack_chunk(framing.content(first)), b""
+    inside = unpack_chunk(framing.content(first))
+    names = b""
     channel = 0
     for opcode, begin, end in iterate_records(inside):
         if opcode != Opcode.MESSAGE:
@@ -126,8 +127,7 @@ HUGE: dict[str, Callable[[], bytes]] = {
 )
 def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None:
     """Peak resident memory of a process that reads such a file in every way, the interpreter and all."""
-    path = tmp_path / "huge.mcap"
-    path.write_bytes(HUGE[kind]())
+    path = write_log(tmp_path, HUGE[kind](), "huge.mcap")
     assert path.stat().st_size < 1.3 * 2**20
     program = (
         "import sys; from pathlib import Path\n"

@@ -91,9 +91,9 @@ def assert_equal_columns(
     for field, rows in records.vectors([*layout.lengths(), "wrench"]).items():
         assert rows.shape == expected[field].shape
         assert rows.tobytes() == expected[field].tobytes()
-    words = records.vector_words(list(layout.columns()))
+    vector_words = records.vector_words(list(layout.columns()))
     joined = np.concatenate([expected[field] for field in layout.columns()], axis=1)
-    assert words.tobytes() == joined.tobytes()
+    assert vector_words.tobytes() == joined.tobytes()
     used = record_columns.decode_per_peer(payloads, "used", PEERS, -1)
     assert records.used.T.tolist() == [used[peer].tolist() for peer in PEERS]
     for mine, theirs in zip(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.log.builders import edit_log_bytes, simulate_bytes
+from tests.log.builders import edit_log_bytes, simulate_bytes, write_log
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError
@@ -60,9 +60,7 @@ def data() -> bytes:
 
 @pytest.fixture
 def path(data: bytes, tmp_path: Path) -> Path:
-    file = tmp_path / "run.mcap"
-    file.write_bytes(data)
-    return file
+    return write_log(tmp_path, data)
 
 
 @pytest.mark.parametrize(
@@ -137,13 +135,13 @@ def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("link", "words"),
+    ("link", "phrase"),
     [("m1->ss", "did you mean 'm1->s'"), ("x", "The links are m2->m1"), ("m1->m1", "no link")],
 )
-def test_missing_links_name_the_nearest(path: Path, link: str, words: str) -> None:
+def test_missing_links_name_the_nearest(path: Path, link: str, phrase: str) -> None:
     with pytest.raises(ValueError, match="no link") as error:
         read_link_delays(path, link)
-    assert words in str(error.value)
+    assert phrase in str(error.value)
 
 
 def test_links_without_arrivals_have_no_delays(data: bytes, path: Path) -> None:
@@ -157,7 +155,7 @@ def test_links_without_arrivals_have_no_delays(data: bytes, path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"t_s,delay_ms\n0,1\n", b"\x89MCAP0\r\n"])
 def test_invalid_logs_are_refused_with_their_key(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "run.mcap").write_bytes(content)
+    write_log(tmp_path, content)
     with pytest.raises(ScenarioError) as error:
         load_scenario("paper", {"link": {"model": "trace", "file": str(tmp_path / "run.mcap")}})
     assert error.value.path == "link.file"

@@ -73,9 +73,11 @@ def test_only_flushed_data_is_in_the_file(tmp_path: Path) -> None:
         container.flush()
         assert active_path(path).stat().st_size > before
         with active_path(path).open("rb") as stream:
-            found = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
+            records = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
         assert (
-            sum(isinstance(record, Message) for record in found) == container.messages == n + 1
+            sum(isinstance(record, Message) for record in records)
+            == container.messages
+            == n + 1
         )
     file.close()
 
@@ -242,11 +244,11 @@ def test_logs_end_in_order_at_full_disks(tmp_path: Path) -> None:
         assert refusal.value.exit_code == 5
         assert f"{path}: the disk is full; the log ends there, finished" in text
         assert "make room" in text
-        found = read_messages(path)
-        assert found == wanted[: len(flushed) + CHUNK]
-        assert f"{len(found)} other messages" in text
+        stored = read_messages(path)
+        assert stored == wanted[: len(flushed) + CHUNK]
+        assert f"{len(stored)} other messages" in text
         assert not active_path(path).exists()
-        seen.add(len(found))
+        seen.add(len(stored))
         path.unlink()
     assert len(seen) > 4  # the chunk that did not fit was not always the same
 
@@ -419,7 +421,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_flushed_data_survives_a_kill(tmp_path: Path) -> None:
-    path, count = tmp_path / "run.mcap", 100
+    path = tmp_path / "run.mcap"
+    count = 100
     done = subprocess.run(
         [sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60
     )

@@ -17,6 +17,7 @@ from tests.log.builders import (
     make_log_bytes,
     open_bytes,
     simulate_bytes,
+    write_log,
 )
 from tests.log.split_logs import make_foreign_bytes
 from trilat_net.core.step.fingerprint import compute_fingerprint
@@ -69,7 +70,7 @@ def test_plain_readers_find_every_payload_byte() -> None:
         for site, arrivals, output in virtual.execute_virtual(scenario)
     }
     reader = make_reader(io.BytesIO(make_log_bytes("paper")), validate_crcs=True)
-    found = 0
+    count = 0
     for schema, channel, message in reader.iter_messages():
         assert schema is not None
         assert schema.id != 0
@@ -79,11 +80,11 @@ def test_plain_readers_find_every_payload_byte() -> None:
         root, session, member, kind = channel.topic.removeprefix("/").split("/")
         assert (root, session) == ("trilat", "paper")
         if kind == "state":
-            found += 1
+            count += 1
             assert message.data == sent[member, message.sequence]
             assert message.publish_time == message.sequence * 1_000_000
             assert channel.metadata == {"member": member, "rate_hz": "1000"}
-    assert found == len(sent) == 3 * TICKS
+    assert count == len(sent) == 3 * TICKS
 
 
 def required_and_typed(schema: dict, value: object) -> None:
@@ -230,8 +231,7 @@ def test_cut_files_open_as_far_as_whole() -> None:
 def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(LogError):
         open_bytes(data)
-    path = tmp_path / "no.mcap"
-    path.write_bytes(data)
+    path = write_log(tmp_path, data, "no.mcap")
     with pytest.raises(LogError, match=r"no\.mcap"):
         open_log(path)
 

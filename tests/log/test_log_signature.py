@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from tests.cli.running import trilat
-from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.log.builders import edit_log_bytes, make_log_bytes, write_log
 from trilat_net.errors import LogError, LogRefused, UsageError
 from trilat_net.log.log_signature import check_signatures, create_signing_keys, sign_log
 from trilat_net.log.mcap_reader import McapReader
@@ -28,8 +28,7 @@ from trilat_net.log.recovery import recover
 @pytest.fixture
 def signed(tmp_path: Path) -> tuple[Path, Path]:
     """A signed log, and the public key."""
-    path = tmp_path / "run.mcap"
-    path.write_bytes(make_log_bytes("paper"))
+    path = write_log(tmp_path, make_log_bytes("paper"))
     private, public = create_signing_keys(tmp_path / "lab")
     assert private.stat().st_mode & 0o777 == 0o600
     assert sign_log(path, private) == tmp_path / "run.mcap.sig"
@@ -37,9 +36,9 @@ def signed(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def find_problem(path: Path, key: Path) -> str:
-    found = check_signatures([path], key)
-    assert found.passed == (not found.places)
-    return "" if found.passed else found.text
+    report = check_signatures([path], key)
+    assert report.passed == (not report.places)
+    return "" if report.passed else report.text
 
 
 def test_signatures_hold_without_touching_the_log(signed: tuple[Path, Path]) -> None:
@@ -93,14 +92,13 @@ def test_any_change_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) 
 
 def test_only_logs_agreeing_with_chains_are_signed(tmp_path: Path) -> None:
     private, key = create_signing_keys(tmp_path / "lab")
-    path = tmp_path / "run.mcap"
-    path.write_bytes(make_log_bytes("paper")[:-200])
+    path = write_log(tmp_path, make_log_bytes("paper")[:-200])
     with pytest.raises(LogError, match=r"is not signed: .*trilat log recover"):
         sign_log(path, private)
-    made = recover(path).output
-    assert find_problem(made, key) == f"there is no signature file {made}.sig"
-    sign_log(made, private)
-    assert find_problem(made, key) == ""
+    recovered = recover(path).output
+    assert find_problem(recovered, key) == f"there is no signature file {recovered}.sig"
+    sign_log(recovered, private)
+    assert find_problem(recovered, key) == ""
 
 
 def test_invalid_or_open_keys_are_refused(signed: tuple[Path, Path], tmp_path: Path) -> None:
@@ -140,7 +138,7 @@ def test_keys_are_private_and_full_disks_leave_none(tmp_path: Path) -> None:
 
 
 def test_the_command_exits_0_or_1(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(make_log_bytes("paper"))
+    write_log(tmp_path, make_log_bytes("paper"))
     trilat("keys", "pair", "lab", cwd=tmp_path).succeeds()
     trilat("log", "sign", "run.mcap", "--key", "lab.key", cwd=tmp_path).succeeds()
     assert (
@@ -150,6 +148,6 @@ def test_the_command_exits_0_or_1(tmp_path: Path) -> None:
     (tmp_path / "run.mcap.sig").unlink()
     done = trilat("log", "check", "run.mcap", "--key", "lab.pub", "--json", cwd=tmp_path)
     assert done.code == 1
-    assert [one["check"] for one in json.loads(done.out)["checks"] if not one["passed"]] == [
-        "signature"
-    ]
+    assert [
+        check["check"] for check in json.loads(done.out)["checks"] if not check["passed"]
+    ] == ["signature"]

@@ -42,7 +42,7 @@ def open_parts(*parts: bytes) -> Log:
     return open_log(*map(io.BytesIO, parts))
 
 
-def holds(log: Log) -> dict[str, object]:
+def list_content(log: Log) -> dict[str, object]:
     """All that a log holds, as its file has it."""
     return {
         "records": {name: list(log[name].payloads) for name in log.sites},
@@ -71,7 +71,7 @@ def test_parts_in_any_order_read_as_the_whole(dealing, chance) -> None:
     parts = make_parts(make_whole_bytes(), dealing)
     chance.shuffle(parts)
     log = open_parts(*parts)
-    assert holds(log) == holds(open_bytes(make_whole_bytes()))
+    assert list_content(log) == list_content(open_bytes(make_whole_bytes()))
     assert log.complete
 
 
@@ -121,15 +121,16 @@ def test_contradicting_parts_are_refused_by_name(
 def test_other_sessions_are_refused_with_differences(
     session: dict[str, str], scenario: str | None, named: str, tmp_path: Path
 ) -> None:
-    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
-    one.write_bytes(make_whole_bytes())
+    first = tmp_path / "one.mcap"
+    two = tmp_path / "two.mcap"
+    first.write_bytes(make_whole_bytes())
     two.write_bytes(
         make_bytes_of_messages(make_whole_bytes(), [], session=session, scenario=scenario)
     )
     with pytest.raises(
         LogError, match=rf"two\.mcap: is not a part of the session in .*one\.mcap: {named}"
     ):
-        open_log(one, two)
+        open_log(first, two)
 
 
 def test_parts_fill_holes_of_torn_parts() -> None:
@@ -216,17 +217,18 @@ def test_progress_covers_all_parts(tmp_path: Path) -> None:
     paths = [tmp_path / f"run-{n}.mcap" for n in range(2)]
     for path, data in zip(paths, parts, strict=True):
         path.write_bytes(data)
-    told: list[tuple[int, int]] = []
-    open_log(*paths, progress=lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int]] = []
+    open_log(*paths, progress=lambda done, total: reported.append((done, total)))
     total = sum(map(len, parts))
-    assert {of for _, of in told} == {total}
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert total - 100 < told[-1][0] <= total
+    assert {of for _, of in reported} == {total}
+    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
+    assert total - 100 < reported[-1][0] <= total
 
 
 def test_parts_with_invalid_messages_are_named(tmp_path: Path) -> None:
     every = read_messages(make_whole_bytes())
-    first, second = tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"
+    first = tmp_path / "run-001.mcap"
+    second = tmp_path / "run-002.mcap"
     first.write_bytes(make_bytes_of_messages(make_whole_bytes(), every[:100]))
     second.write_bytes(
         make_bytes_of_messages(

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
@@ -23,6 +23,7 @@ from tests.log.builders import (
     edit_log_bytes,
     make_log,
     make_log_bytes,
+    write_log,
 )
 from tests.log.hostility import make_chunk as packed_chunk
 from tests.log.split_logs import Message, make_foreign_bytes, read_messages
@@ -56,23 +57,25 @@ def list_chunks(data: bytes) -> list[Chunk]:
     summary = make_reader(io.BytesIO(data)).get_summary()
     assert summary is not None
     every = iter(read_messages(data))
-    found = []
+    all_chunks = []
     for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-        begin, length = index.chunk_start_offset, index.chunk_length
+        begin = index.chunk_start_offset
+        length = index.chunk_length
         entries = 0
         at = begin + length
         while at < begin + length + index.message_index_length:
             (size,) = struct.unpack_from("<Q", data, at + 1)
             entries += (size - 6) // 16
             at += 9 + size
-        found.append(Chunk(begin, begin + length, [next(every) for _ in range(entries)]))
-    return found
+        all_chunks.append(Chunk(begin, begin + length, [next(every) for _ in range(entries)]))
+    return all_chunks
 
 
 @cache
 def make_chunked_bytes() -> bytes:
     """A log of twenty chunks, as it is written today."""
-    whole, stream = make_log("paper"), io.BytesIO()
+    whole = make_log("paper")
+    stream = io.BytesIO()
     writer = LogWriter(stream, whole.scenario, "paper", "virtual", 0, collect_provenance())
     for n, message in enumerate(read_messages(make_log_bytes("paper"))):
         topic, payload, log_ns, publish_ns, sequence = message
@@ -95,7 +98,7 @@ LOGS = st.sampled_from([make_chunked_bytes, make_earlier_bytes])
 def recover_bytes(
     data: bytes, folder: Path, name: str = "run.mcap.active"
 ) -> tuple[Recovery, bytes]:
-    """What becomes of a file with these bytes."""
+    """Returns the recovery of a file with the given bytes, and the bytes of the new file."""
     for path in folder.iterdir():
         path.unlink()
     path = folder / name
@@ -122,17 +125,17 @@ def test_cut_files_keep_every_whole_chunk(
     except NothingSaved:
         assert not kept
         return
-    found = read_messages(saved)
-    assert found[: len(kept)] == kept
-    assert found == read_messages(data)[: len(found)]
-    assert result.salvaged == len(found) - len(kept)
+    recovered = read_messages(saved)
+    assert recovered[: len(kept)] == kept
+    assert recovered == read_messages(data)[: len(recovered)]
+    assert result.salvaged == len(recovered) - len(kept)
     if any(chunk.begin < end < chunk.end for chunk in list_chunks(data)):
         assert not result.lossless
     # before the accounts
     elif list_chunks(data)[0].end <= end <= data.find(b"trilat.accounts") - 13:
         assert result.lossless, result.lost
     assert result.finished == (end == len(data))
-    if len(found):
+    if len(recovered):
         again = open_log(tmp_path / "run.mcap")
         assert again.complete
         verdict = verify(again)
@@ -160,19 +163,33 @@ def test_damaged_files_keep_every_intact_chunk(
         for message in chunk.messages
     ]
     result, saved = recover_bytes(bytes(data), tmp_path, "run.mcap")
-    found = read_messages(saved)
+    recovered = read_messages(saved)
     summary_begins = list_chunks(whole)[-1].end
     # what names the channels may be damaged twice
     if any(place >= summary_begins for place in places):
         intact = [message._replace(topic="") for message in intact]
-        found = [message._replace(topic="") for message in found]
-    rest = iter(found)
+        recovered = [message._replace(topic="") for message in recovered]
+    rest = iter(recovered)
     assert all(message in rest for message in intact)  # in order
-    assert {message[1:] for message in found} <= {
+    assert {message[1:] for message in recovered} <= {
         message[1:] for message in read_messages(whole)
     }
-    if len(found) < len(read_messages(whole)):
+    if len(recovered) < len(read_messages(whole)):
         assert not result.lossless
+
+
+def list_definitions(reader: McapReader) -> tuple[list[Any], list[Any]]:
+    """Returns the channels and the schemas in the summary of a file."""
+    summary = reader.get_summary()
+    assert summary is not None
+    channels = [
+        (channel.topic, channel.message_encoding, sorted(channel.metadata.items()))
+        for channel in summary.channels.values()
+    ]
+    schemas = [
+        (schema.name, schema.encoding, schema.data) for schema in summary.schemas.values()
+    ]
+    return sorted(channels), sorted(schemas)
 
 
 def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
@@ -192,18 +209,7 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
     )
     assert set(after["trilat.accounts"]) == set(before["trilat.accounts"])
     assert all("missing 0" in account for account in after["trilat.accounts"].values())
-    defined = [
-        (
-            sorted(
-                (c.topic, c.message_encoding, sorted(c.metadata.items()))
-                for c in s.channels.values()
-            ),
-            sorted((c.name, c.encoding, c.data) for c in s.schemas.values()),
-        )
-        for s in (old.get_summary(), new.get_summary())
-        if s is not None
-    ]
-    assert defined[0] == defined[1]
+    assert list_definitions(old) == list_definitions(new)
 
 
 def test_missing_records_are_counted_by_site(tmp_path: Path) -> None:
@@ -271,10 +277,10 @@ def test_foreign_files_are_recovered_at_any_cut(
         except NothingSaved:
             assert not before
             continue
-        found = read_messages(saved)
-        assert found == everything[: len(found)]
-        assert len(found) >= before
-        before = len(found)
+        recovered = read_messages(saved)
+        assert recovered == everything[: len(recovered)]
+        assert len(recovered) >= before
+        before = len(recovered)
     assert before == 60
     reader = make_reader(io.BytesIO(saved))
     header = reader.get_header()
@@ -293,11 +299,11 @@ def test_complete_records_of_cut_chunks_are_kept(
     data = make_foreign_bytes([os.urandom(300) for _ in range(2000)], compression=compression)
     (chunk,) = list_chunks(data)
     result, saved = recover_bytes(data[: (chunk.begin + chunk.end) // 2], tmp_path)
-    found = read_messages(saved)
-    assert found == read_messages(data)[: len(found)]
-    assert len(found) == result.salvaged > 600
+    recovered = read_messages(saved)
+    assert recovered == read_messages(data)[: len(recovered)]
+    assert len(recovered) == result.salvaged > 600
     assert not result.lossless
-    assert f"{len(found)} messages could be saved" in result.lost[0]
+    assert f"{len(recovered)} messages could be saved" in result.lost[0]
 
 
 # What is hostile.
@@ -364,9 +370,8 @@ def test_recovered_names_follow_their_file() -> None:
 
 
 def test_only_permitted_files_are_replaced(tmp_path: Path) -> None:
-    torn = tmp_path / "run.mcap.active"
-    torn.write_bytes(make_chunked_bytes()[:-100])
-    (tmp_path / "run.mcap").write_bytes(b"precious")
+    torn = write_log(tmp_path, make_chunked_bytes()[:-100], "run.mcap.active")
+    write_log(tmp_path, b"precious")
     with pytest.raises(UsageError, match=r"run\.mcap: already exists"):
         recover(torn)
     with pytest.raises(UsageError, match="is the source file"):
@@ -381,8 +386,7 @@ def test_only_permitted_files_are_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"no log at all", HEAD])
 def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(content)
+    path = write_log(tmp_path, content, "x.mcap")
     with pytest.raises(NothingSaved, match="nothing in this file could be saved"):
         recover(path)
     assert list(tmp_path.iterdir()) == [path]
@@ -394,7 +398,7 @@ def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("change", "code", "told"),
+    ("change", "code", "phrases"),
     [
         (
             lambda data: data[:-60],
@@ -407,12 +411,12 @@ def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> Non
     ids=["lossless", "lossy", "nothing to save"],
 )
 def test_exit_codes_give_the_outcome(
-    change: Callable[[bytes], bytes], code: int, told: list[str], tmp_path: Path
+    change: Callable[[bytes], bytes], code: int, phrases: list[str], tmp_path: Path
 ) -> None:
-    (tmp_path / "run.mcap.active").write_bytes(change(make_chunked_bytes()))
+    write_log(tmp_path, change(make_chunked_bytes()), "run.mcap.active")
     done = trilat("log", "recover", "run.mcap.active", cwd=tmp_path)
     assert done.code == code, done
-    for fact in told:
+    for fact in phrases:
         assert fact in done.out
     if code == 1:
         done.refuses("nothing in this file could be saved", code=1)
@@ -427,8 +431,10 @@ def test_exit_codes_give_the_outcome(
     assert done.code == code
     assert facts["lossless"] == (code == 0)
     assert facts["coverage"].keys() == {"m1", "m2", "s"}
-    assert all(one["ticks"] == 120 for one in facts["coverage"].values())
-    assert all((one["records"] == 120) == (code == 0) for one in facts["coverage"].values())
+    assert all(coverage["ticks"] == 120 for coverage in facts["coverage"].values())
+    assert all(
+        (coverage["records"] == 120) == (code == 0) for coverage in facts["coverage"].values()
+    )
     assert facts["digest_chain"] == ("intact" if code == 0 else "not closed")
     assert facts["output"] == "other.mcap"
     assert facts["messages"] == len(read_messages((tmp_path / "other.mcap").read_bytes()))
@@ -444,6 +450,6 @@ def test_missing_files_are_bad_input(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", [["log", "recover"], ["verify"]])
 def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Path) -> None:
-    (tmp_path / "run.mcap.active").write_bytes(make_chunked_bytes()[:-60])
+    write_log(tmp_path, make_chunked_bytes()[:-60], "run.mcap.active")
     done = trilat(*command, "run.mcap", cwd=tmp_path)
     done.refuses("run.mcap: cannot be read", "trilat log recover run.mcap.active")

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, write_log
 from tests.log.hostility import make_chunk
 from tests.log.split_logs import make_foreign_bytes, write_late_parts
 from trilat_net.errors import LogError
@@ -44,8 +44,8 @@ def check_bytes(folder: Path, *files: bytes) -> LogCheckResult:
     return check_file(*paths)
 
 
-def list_failed_checks(found: LogCheckResult) -> set[str]:
-    return {finding.check for finding in found.findings if not finding.passed}
+def list_failed_checks(result: LogCheckResult) -> set[str]:
+    return {finding.check for finding in result.findings if not finding.passed}
 
 
 def find_first_record(opcode: int) -> RecordFrame:
@@ -67,10 +67,10 @@ def flip_in_first_record(opcode: int, place: int = 0) -> bytes:
 
 @pytest.mark.parametrize("data", [WHOLE, DATA, make_log_bytes("jitter", {"duration_s": 0.1})])
 def test_a_log_as_it_was_written_is_sound(data: bytes, tmp_path: Path) -> None:
-    found = check_bytes(tmp_path, data)
-    assert found.passed, found
-    assert found.ours
-    assert {finding.check for finding in found.findings} == BUILT | OURS
+    result = check_bytes(tmp_path, data)
+    assert result.passed, result
+    assert result.ours
+    assert {finding.check for finding in result.findings} == BUILT | OURS
 
 
 ZSTD = bytes.fromhex("28b52ffd")
@@ -118,10 +118,10 @@ WRONG: dict[str, tuple[bytes, set[str]]] = {
 @pytest.mark.parametrize("kind", WRONG)
 def test_file_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks = WRONG[kind]
-    found = check_bytes(tmp_path, data)
-    built = list_failed_checks(found) & BUILT
-    assert built == checks, found.findings
-    named = [finding for finding in found.findings if finding.check in built]
+    result = check_bytes(tmp_path, data)
+    built = list_failed_checks(result) & BUILT
+    assert built == checks, result.findings
+    named = [finding for finding in result.findings if finding.check in built]
     assert all(finding.places[0].offset is not None for finding in named)
 
 
@@ -129,7 +129,7 @@ def test_file_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
 @given(st.integers(0, len(WHOLE) - 1), st.integers(0, 7))
 def test_no_changed_bit_stays_unseen(place: int, bit: int) -> None:
     """Every byte is under a checksum, an index or a rule; what MCAP itself leaves open is said here."""
-    found = _check_bytes(flip_byte(WHOLE, place, 1 << bit))
+    result = _check_bytes(flip_byte(WHOLE, place, 1 << bit))
     frame = next((f for f in _FRAMES if f.offset <= place < f.end), None)
     inside = place - (frame.offset + RECORD_HEAD_BYTES) if frame is not None else 0
     free = frame is not None and (
@@ -139,7 +139,7 @@ def test_no_changed_bit_stays_unseen(place: int, bit: int) -> None:
         or (frame.opcode == Opcode.CHUNK and inside > 40)
         or inside < 0
     )
-    assert free or not found.passed
+    assert free or not result.passed
 
 
 _FRAMES = list(RecordScanner(io.BytesIO(WHOLE)).frames())
@@ -210,10 +210,10 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
 @pytest.mark.parametrize("kind", SAID)
 def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks, text = SAID[kind]
-    found = check_bytes(tmp_path, data())
-    assert list_failed_checks(found) == checks, found.findings
-    assert any(text in f"{f.text} {f.places}" for f in found.findings if not f.passed), (
-        found.findings
+    result = check_bytes(tmp_path, data())
+    assert list_failed_checks(result) == checks, result.findings
+    assert any(text in f"{f.text} {f.places}" for f in result.findings if not f.passed), (
+        result.findings
     )
 
 
@@ -230,15 +230,15 @@ def test_parts_with_late_records_are_whole(tmp_path: Path) -> None:
     """Nothing is missing over the seams; what a site's memory filled is there, and executes like the rest."""
     parts = write_late_parts(tmp_path, refilled=range(30, 50))
     assert len(parts) >= 3
-    found = check_file(*parts)
-    assert found.passed, found.findings
-    assert "20 came late" in next(f.text for f in found.findings if f.check == "sequence")
+    result = check_file(*parts)
+    assert result.passed, result.findings
+    assert "20 came late" in next(f.text for f in result.findings if f.check == "sequence")
     verdict = verify(open_log(*parts))
     assert (verdict.records, verdict.identical, verdict.gaps) == (360, 360, [])
 
 
 def test_parts_are_judged_from_their_beginning(tmp_path: Path) -> None:
-    """What came before is in the parts before; what it lacks itself is missing all the same."""
+    """Records of earlier parts are expected there; records that the part itself lacks are missing."""
     parts = write_late_parts(tmp_path, refilled=range(0))
     assert check_file(*parts[1:2]).passed
     first_and_last = check_file(parts[0], parts[2])
@@ -247,15 +247,14 @@ def test_parts_are_judged_from_their_beginning(tmp_path: Path) -> None:
 
 
 def test_recovered_files_lack_only_lost_records(tmp_path: Path) -> None:
-    torn = tmp_path / "run.mcap.active"
-    torn.write_bytes(DATA[: len(DATA) // 2])
+    torn = write_log(tmp_path, DATA[: len(DATA) // 2], "run.mcap.active")
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):
-        made = recover(torn).output
+        recovered = recover(torn).output
     assert "whole" in list_failed_checks(check_file(torn))
-    found = check_file(made)
-    assert list_failed_checks(found) & BUILT == set(), found.findings
-    assert "accounts" not in list_failed_checks(found), found.findings
-    verdict = verify(open_log(made))
+    result = check_file(recovered)
+    assert list_failed_checks(result) & BUILT == set(), result.findings
+    assert "accounts" not in list_failed_checks(result), result.findings
+    verdict = verify(open_log(recovered))
     assert verdict.agreed
     assert verdict.records == sum(len(open_log(torn)[site]) for site in ("m1", "m2", "s"))
 
@@ -266,10 +265,10 @@ def test_files_of_different_sessions_are_refused(tmp_path: Path) -> None:
 
 
 def test_foreign_files_are_judged_by_structure(tmp_path: Path) -> None:
-    found = check_bytes(tmp_path, make_foreign_bytes())
-    assert found.passed
-    assert not found.ours
-    assert {finding.check for finding in found.findings} == BUILT
+    result = check_bytes(tmp_path, make_foreign_bytes())
+    assert result.passed
+    assert not result.ours
+    assert {finding.check for finding in result.findings} == BUILT
 
 
 def test_forbidden_chunk_contents_are_reported(tmp_path: Path) -> None:
@@ -278,9 +277,9 @@ def test_forbidden_chunk_contents_are_reported(tmp_path: Path) -> None:
     lost = struct.pack("<BQHIQQ", 5, 22, 999, 0, 0, 0)
     for more, text in ((lost, "channel 999"), (make_chunk(b""), "kind 6")):
         new = make_chunk(records + more)
-        found = check_bytes(tmp_path, DATA[: CHUNK.offset] + new + DATA[CHUNK.end :])
-        assert "records" in list_failed_checks(found)
-        assert any(text in str(f.places) for f in found.findings)
+        result = check_bytes(tmp_path, DATA[: CHUNK.offset] + new + DATA[CHUNK.end :])
+        assert "records" in list_failed_checks(result)
+        assert any(text in str(f.places) for f in result.findings)
 
 
 @pytest.mark.parametrize("data", [b"", b"text", MAGIC])

@@ -56,16 +56,16 @@ def test_site_logs_equal_lists_of_records(count: int, looks: list[int | slice]) 
 
 
 def test_only_recent_blocks_are_held() -> None:
-    asked: list[int] = []
+    first_ticks: list[int] = []
 
     def counted(payloads: Sequence[bytes]) -> list[State]:
-        asked.append(int(payloads[0]))
+        first_ticks.append(int(payloads[0]))
         return decode_ticks(payloads)
 
     some = LazyRecords([str(n).encode() for n in range(16)], counted)
     for n in (0, 1, 4, 0, 8, 0, 4):  # 4 was looked at longest ago when 8 came
         assert some[n].tick == n
-    assert asked == [0, 4, 8, 4]
+    assert first_ticks == [0, 4, 8, 4]
 
 
 def test_few_records_are_a_list() -> None:
@@ -103,12 +103,13 @@ def test_orientation_errors_equal_scipys_turns() -> None:
     x_des[:100, 3:] = x[:100, 3:] + 10.0 ** rng.uniform(-12.0, -1.0, (100, 1)) * rng.normal(
         size=(100, 3)
     )
-    x_des[100:110, 3:], x[110:120, 3:] = x[100:110, 3:], 0.0
+    x_des[100:110, 3:] = x[100:110, 3:]
+    x[110:120, 3:] = 0.0
     # half a turn
     x[120:140, 3:] *= np.pi / np.linalg.norm(x[120:140, 3:], axis=1, keepdims=True)
-    there, here = (Rotation.from_rotvec(one[:, 3:]) for one in (x_des, x))
+    reference, actual = (Rotation.from_rotvec(poses[:, 3:]) for poses in (x_des, x))
     e = compute_task_errors(x, x_des, [1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
-    assert np.abs(e[:, 3:] - (here * there.inv()).as_rotvec()).max() <= 1e-14
+    assert np.abs(e[:, 3:] - (actual * reference.inv()).as_rotvec()).max() <= 1e-14
     assert not e[100:110, 3:].any()
     assert np.array_equal(e[:, :2], x[:, :2] - x_des[:, :2])
     assert not e[:, 2].any()

@@ -104,16 +104,16 @@ def make_record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> T
     )
 
 
-def joint_row(one: TickRecord) -> list[float]:
-    return [x for name in CURVES for x in getattr(one, name)]
+def joint_row(record: TickRecord) -> list[float]:
+    return [x for name in CURVES for x in getattr(record, name)]
 
 
-def error_row(one: TickRecord) -> list[float]:
-    return [a - b for a, b in zip(one.q, one.q_des, strict=True)]
+def error_row(record: TickRecord) -> list[float]:
+    return [a - b for a, b in zip(record.q, record.q_des, strict=True)]
 
 
-def slow_row(one: TickRecord) -> list[float]:
-    return [*one.tau_x, *one.theta_hat, float(one.mode)]
+def slow_row(record: TickRecord) -> list[float]:
+    return [*record.tau_x, *record.theta_hat, float(record.mode)]
 
 
 def error_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
@@ -130,7 +130,7 @@ def slow_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
 
 
 def joint_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
-    """Of the joint states what `joint_row` has; of a reference there are angles alone."""
+    """Returns the numbers of `joint_row` in the joint states; a reference has angles only."""
     rows = desk.arrays("/viz/m/joint_states")
     assert all(math.isnan(x) for _, row in rows for x in row[6:8] + row[10:])
     return [(t_ns, row[:6] + row[8:10]) for t_ns, row in rows]
@@ -149,7 +149,7 @@ def test_an_envelope_is_the_extremes_in_their_order(
 
 @st.composite
 def draw_records(draw: st.DrawFn) -> list[TickRecord]:
-    """Some ticks of a second, in any order, with small or arbitrary numbers."""
+    """Draws records of some ticks of a second, in any order, with small or arbitrary numbers."""
     ticks = draw(st.lists(st.integers(0, 450), unique=True, min_size=1, max_size=120))
     if draw(st.booleans()):
         ticks.sort()
@@ -164,14 +164,14 @@ def draw_records(draw: st.DrawFn) -> list[TickRecord]:
 
 def group_records(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRecord]]:
     by: dict[int, list[TickRecord]] = defaultdict(list)
-    for one in records:
-        by[one.tick // length].append(one)
+    for record in records:
+        by[record.tick // length].append(record)
     return by
 
 
 @given(draw_records())
 def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> None:
-    """In whatever order the records come."""
+    """The extremes appear in whatever order the records come."""
     desk = Desk(100.0)
     desk.take(records)
     desk.finish()
@@ -198,11 +198,11 @@ def test_view_messages_keep_log_time_order(records: list[TickRecord]) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.take(records)
     desk.finish()
-    have = {EPOCH_NS + one.t_ns for one in records}
+    have = {EPOCH_NS + record.t_ns for record in records}
     assert {seen.publish_ns for seen in desk.seen} <= have
     log_ns = [seen.log_ns for seen in desk.seen]
     assert log_ns == sorted(log_ns)
-    if [one.tick for one in records] == sorted(one.tick for one in records):
+    if [record.tick for record in records] == sorted(record.tick for record in records):
         for topic in ("/viz/m/joint_states", "/viz/m/error", "/viz/m/theta_hat"):
             times = [t_ns for t_ns, _ in desk.arrays(topic)]
             assert times == sorted(set(times))
@@ -212,8 +212,8 @@ def test_view_messages_keep_log_time_order(records: list[TickRecord]) -> None:
 def test_disorder_within_a_bucket_is_invisible(
     records: list[TickRecord], chance: random.Random
 ) -> None:
-    in_order = sorted(records, key=lambda one: one.tick)
-    shuffled = sorted(in_order, key=lambda one: (one.tick // BUCKET, chance.random()))
+    in_order = sorted(records, key=lambda record: record.tick)
+    shuffled = sorted(in_order, key=lambda record: (record.tick // BUCKET, chance.random()))
     desks = Desk(100.0), Desk(100.0)
     for desk, ones in zip(desks, (in_order, shuffled), strict=True):
         desk.take(ones)
@@ -237,14 +237,16 @@ def test_full_views_hold_every_record(views_hz: float) -> None:
     desk = Desk(views_hz)
     desk.take(records)
     desk.finish()
-    assert joint_arrays(desk) == [(one.t_ns, joint_row(one)) for one in records]
+    assert joint_arrays(desk) == [(record.t_ns, joint_row(record)) for record in records]
     if views_hz == FULL_RATE_HZ:
-        assert slow_arrays(desk) == [(one.t_ns, slow_row(one)) for one in records]
+        assert slow_arrays(desk) == [(record.t_ns, slow_row(record)) for record in records]
 
 
 @given(draw_records())
 def test_wire_and_simulated_records_look_equal(records: list[TickRecord]) -> None:
-    states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
+    states = [
+        decode(encode_state("m", 1, ["s"], record, [], 0, 0), State) for record in records
+    ]
     assert stack_signals(states) == stack_signals(records)
 
 
@@ -335,18 +337,21 @@ def test_early_events_have_their_arrival_time() -> None:
 
 
 def test_views_leave_other_messages_unchanged() -> None:
-    own, shown = [], []
+    other_messages = []
+    shown = []
     for views_hz in (0.0, 100.0):
         scenario = load_scenario("paper", {"duration_s": 0.5})
         every = read_messages(simulate_bytes(scenario, views_hz=views_hz))
-        own.append([message for message in every if not message.topic.startswith("/viz")])
-        shown.append(len(every) > len(own[-1]))
-    assert own[0] == own[1]
+        other_messages.append(
+            [message for message in every if not message.topic.startswith("/viz")]
+        )
+        shown.append(len(every) > len(other_messages[-1]))
+    assert other_messages[0] == other_messages[1]
     assert shown == [False, True]
 
 
 def test_parts_end_with_all_extremes() -> None:
-    """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
+    """The extremes of the parts are those of the whole, so that none is lost between parts."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
     outputs = execute_ticks(scenario)["m"]
     shown = []
@@ -361,10 +366,10 @@ def test_parts_end_with_all_extremes() -> None:
             collect_provenance(),
             make_views=offer_views(scenario, 100.0),
         )
-        for one in part:
-            payload = encode_state("m", 1, ["s"], one, [], 0, 0)
+        for output in part:
+            payload = encode_state("m", 1, ["s"], output, [], 0, 0)
             state = decode(payload, State)
-            writer.add(KEY, payload, one.t_ns, EPOCH_NS + one.t_ns, one.tick, state)
+            writer.add(KEY, payload, output.t_ns, EPOCH_NS + output.t_ns, output.tick, state)
         writer.finish({})
         reader = make_reader(
             io.BytesIO(stream.getvalue()), decoder_factories=[DecoderFactory()]
@@ -373,7 +378,7 @@ def test_parts_end_with_all_extremes() -> None:
             [*ros.position, *ros.velocity[:2], *ros.effort[:2]]
             for _, _, _, ros in reader.iter_decoded_messages("/viz/m/joint_states")
         ]
-    whole = np.array([joint_row(one) for one in outputs])
+    whole = np.array([joint_row(output) for output in outputs])
     assert np.array_equal(np.max(shown, axis=0), whole.max(axis=0))
     assert np.array_equal(np.min(shown, axis=0), whole.min(axis=0))
 

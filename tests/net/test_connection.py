@@ -27,8 +27,11 @@ from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
 
 from .local_bus import LocalNetwork
 
-HERE, THERE = ["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"]
-A, B, C = "tcp/a:1", "tcp/b:1", "tcp/c:1"
+HERE = ["tcp/127.0.0.1:1"]
+THERE = ["tcp/127.0.0.1:2"]
+A = "tcp/a:1"
+B = "tcp/b:1"
+C = "tcp/c:1"
 
 
 def check_file(**stated: object) -> ZenohFile:
@@ -39,14 +42,14 @@ def make_member_connection(
     listen: list[str] | None = None,
     connect: list[str] | None = None,
     routers: list[str] | None = None,
-    own: ZenohFile | None = None,
+    zenoh_file: ZenohFile | None = None,
 ) -> Connection:
-    return Connection.of_member(listen, connect, routers, own, HERE, THERE)
+    return Connection.of_member(listen, connect, routers, zenoh_file, HERE, THERE)
 
 
 def test_defaults_stay_on_this_machine() -> None:
     assert make_member_connection() == Connection(HERE, THERE, "peer", {})
-    assert make_member_connection(own=check_file(namespace="n")) == Connection(
+    assert make_member_connection(zenoh_file=check_file(namespace="n")) == Connection(
         HERE, THERE, "peer", {"namespace": "n"}
     )
 
@@ -55,11 +58,15 @@ def test_named_places_replace_the_local_ones() -> None:
     assert make_member_connection(listen=[A]) == Connection([A], THERE)
     assert make_member_connection(connect=[A, B]) == Connection(HERE, [A, B])
     assert make_member_connection(listen=[], connect=[]) == Connection([], [])
-    assert make_member_connection(own=check_file(listen={"endpoints": [A]})).listen == [A]
-    assert make_member_connection(own=check_file(connect={"endpoints": [A]})).connect == [A]
+    assert make_member_connection(zenoh_file=check_file(listen={"endpoints": [A]})).listen == [
+        A
+    ]
+    assert make_member_connection(
+        zenoh_file=check_file(connect={"endpoints": [A]})
+    ).connect == [A]
     # --connect first
     assert make_member_connection(
-        connect=[B], own=check_file(connect={"endpoints": [A, B]})
+        connect=[B], zenoh_file=check_file(connect={"endpoints": [A, B]})
     ).connect == [
         B,
         A,
@@ -69,40 +76,42 @@ def test_named_places_replace_the_local_ones() -> None:
 def test_clients_of_routers_listen_nowhere() -> None:
     assert make_member_connection(routers=[A, B]) == Connection((), [A, B], "client", {})
     stated = check_file(mode="client", connect={"endpoints": [C]})
-    assert make_member_connection(routers=[A], own=stated) == Connection(
+    assert make_member_connection(routers=[A], zenoh_file=stated) == Connection(
         (), [A, C], "client", {"connect": {}}
     )
-    assert make_member_connection(own=stated) == Connection((), [C], "client", {"connect": {}})
-    assert make_member_connection(connect=[A], own=stated).connect == [A, C]
+    assert make_member_connection(zenoh_file=stated) == Connection(
+        (), [C], "client", {"connect": {}}
+    )
+    assert make_member_connection(connect=[A], zenoh_file=stated).connect == [A, C]
 
 
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
         (
-            {"listen": [A], "own": check_file(listen={"endpoints": [B]})},
+            {"listen": [A], "zenoh_file": check_file(listen={"endpoints": [B]})},
             "listen/endpoints are also given by listen",
         ),
         ({"routers": [A], "listen": [B]}, "router: a client of a router does not listen"),
         ({"routers": [A], "connect": [B]}, "router: a client connects only to a router"),
         (
-            {"routers": [A], "own": check_file(listen={"endpoints": [B]})},
+            {"routers": [A], "zenoh_file": check_file(listen={"endpoints": [B]})},
             "router: a client .* does not listen",
         ),
         (
-            {"routers": [A], "own": check_file(mode="peer")},
+            {"routers": [A], "zenoh_file": check_file(mode="peer")},
             'mine.json5: mode "peer" contradicts router',
         ),
         (
-            {"own": check_file(mode="client")},
+            {"zenoh_file": check_file(mode="client")},
             'mine.json5: mode "client": there is no router to connect to',
         ),
         (
-            {"own": check_file(mode="client"), "listen": [A]},
+            {"zenoh_file": check_file(mode="client"), "listen": [A]},
             'mine.json5: mode "client": a client .* does not listen',
         ),
         (
-            {"own": check_file(mode="router")},
+            {"zenoh_file": check_file(mode="router")},
             'mine.json5: mode "router" can be used only with `trilat router`',
         ),
         *(
@@ -167,11 +176,9 @@ class Answering(ManualClock):
         super().__init__()
         self.sleeps = 0
         self.router: ZenohBus | None = None
-        self._endpoints, self._comes_after, self._stops_after = (
-            endpoints,
-            comes_after,
-            stops_after,
-        )
+        self._endpoints = endpoints
+        self._comes_after = comes_after
+        self._stops_after = stops_after
 
     def sleep_until(self, deadline_ns: int) -> None:
         super().sleep_until(deadline_ns)
@@ -185,7 +192,8 @@ class Answering(ManualClock):
 
 def test_late_routers_are_awaited() -> None:
     endpoints = find_free_endpoints(1)
-    clock, said = Answering(endpoints, comes_after=3), []
+    clock = Answering(endpoints, comes_after=3)
+    said = []
     bus = Connection((), endpoints, "client").open_bus(clock, clock.stopped, 5.0, said.append)
     assert bus is not None
     bus.close()
@@ -255,7 +263,7 @@ def test_free_endpoints_can_be_used_together() -> None:
 
 
 def test_sessions_keep_free_ports() -> None:
-    """So that `trilat set` and `trilat ping` find the session without its ports."""
+    """`trilat set` and `trilat ping` find the session without its ports."""
     sites = ("a", "b", "c")
     places = list(default_endpoints("endpoints-test", sites).values())
     with reserve_session_endpoints("endpoints-test", sites) as reserved:

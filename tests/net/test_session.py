@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
@@ -208,7 +209,7 @@ def polled_until_refused(*members: Member, clock: ManualClock) -> list[str]:
                 except SessionError as error:
                     left[member.info.boot] = str(error)
                     member.bus.close()
-        clock.sleep_until(clock.monotonic_ns() + STEP_NS)
+        sleep_for_ns(clock, STEP_NS)
     return list(left.values())
 
 
@@ -288,7 +289,8 @@ def test_other_clocks_begin_at_the_same_instant(ahead_ns: dict[str, int], unix_n
 def test_readiness_needs_all_other_clocks() -> None:
     session = make_party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
-    bus, deaf = session.members["m2"].bus, LocalNetwork().join().inbox("nothing")
+    bus = session.members["m2"].bus
+    deaf = LocalNetwork().join().inbox("nothing")
     ask = bus.query
     bus.query = lambda key: deaf if key.endswith(topics.PING) else ask(key)
     session.rounds(300)
@@ -323,7 +325,8 @@ def delay_answers(
 
     class Late:
         def __init__(self, inbox: Inbox) -> None:
-            self._inbox, self._from_ns = inbox, clock.monotonic_ns() + after_ns
+            self._inbox = inbox
+            self._from_ns = clock.monotonic_ns() + after_ns
 
         def poll(self) -> tuple[str, bytes] | None:
             return self._inbox.poll() if clock.monotonic_ns() >= self._from_ns else None

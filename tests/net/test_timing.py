@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.net.crossing import make_queueing_delay
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.step.ticks import tick_ns
 from trilat_net.net.clock import SkewedClock
@@ -30,7 +31,7 @@ from trilat_net.net.timing import (
     find_turn_ns,
 )
 
-from .crossing import Delay, Other, S, queueing
+from .crossing import Delay, Other, S
 
 RATE_HZ = 200
 NAMES = ("a", "b")
@@ -60,21 +61,24 @@ class Session:
         self, skews: tuple[tuple[int, int], tuple[int, int]], ways: tuple[Delay, Delay]
     ) -> None:
         self.true = ManualClock(10**12)
-        self.ways, self.rnd = ways, random.Random(5)
+        self.ways = ways
+        self.rnd = random.Random(5)
         clocks = [SkewedClock(self.true, *skew) for skew in skews]
         epochs = [clock.monotonic_ns() + S for clock in clocks]
         epochs[1] += 300_000  # b converted it wrong by so much
         self.step_at: dict[int, tuple[int, int]] = {}
         self.step = {0: 0, 1: 0}
         self.sites = []
-        for own, other in ((0, 1), (1, 0)):
-            ahead = clocks[other].monotonic_ns() - clocks[own].monotonic_ns()
-            now_ns = clocks[own].monotonic_ns()
+        for side, other in ((0, 1), (1, 0)):
+            ahead = clocks[other].monotonic_ns() - clocks[side].monotonic_ns()
+            now_ns = clocks[side].monotonic_ns()
             first = OffsetEstimate(
                 now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5
             )
             peer = PeerClock(NAMES[other], epochs[other], 0, first, OffsetEstimator())
-            self.sites.append(Site(clocks[own], SiteTiming(epochs[own], RATE_HZ, [peer], "a")))
+            self.sites.append(
+                Site(clocks[side], SiteTiming(epochs[side], RATE_HZ, [peer], "a"))
+            )
             self.sites[-1].news += self.sites[-1].timing.list_initial_notices()
 
     def run(self, seconds: float, cut: range = range(0)) -> None:
@@ -114,7 +118,8 @@ class Session:
         return sent
 
     def _take(self, n: int, message: PeerSample, true_ns: int) -> None:
-        site, other = self.sites[n], self.sites[1 - n]
+        site = self.sites[n]
+        other = self.sites[1 - n]
         arrived_ns = site.clock.monotonic_ns() + self.step[n]
         (meter,) = site.timing.monitors
         bound_ns = meter.offset.error_bound_ns(arrived_ns)
@@ -123,12 +128,12 @@ class Session:
         site.errors_ns.append((message.tick, delay_ns - true_delay_ns, bound_ns))
 
 
-LAN = queueing(80, 60)
+LAN = make_queueing_delay(80, 60)
 
 
 @pytest.mark.parametrize("skew", [(-2 * S, -100_000), (86_400 * S, 30_000)])
 def test_delays_stay_inside_bounds_and_grid_follows(skew: tuple[int, int]) -> None:
-    session = Session(((0, 0), skew), (LAN, queueing(140, 90)))
+    session = Session(((0, 0), skew), (LAN, make_queueing_delay(140, 90)))
     session.run(20.0)
     for site in session.sites:
         assert len(site.errors_ns) == 20 * RATE_HZ
@@ -150,7 +155,8 @@ def test_delays_stay_inside_bounds_and_grid_follows(skew: tuple[int, int]) -> No
 def test_logged_figures_are_true() -> None:
     session = Session(((0, 0), (3 * S, 100_000)), (LAN, LAN))
     session.run(12.0)
-    site, start_ns = session.sites[0], 10**12
+    site = session.sites[0]
+    start_ns = 10**12
     clock_events = [news for news in site.news if news["kind"] == "clock"]
     assert len(clock_events) >= 12
     for news in clock_events:
@@ -178,9 +184,11 @@ ways = st.tuples(st.floats(0, 5000), st.floats(1, 5000))
 @given(skews, skews, ways, ways, st.integers(0, 600), st.integers(0, 600))
 @settings(max_examples=8, deadline=None)
 def test_bounds_hold_for_any_clocks_and_ways(
-    one: Pair, two: Pair, there: Pair, back: Pair, begin: int, ticks: int
+    first_clock: Pair, two: Pair, way: Pair, back: Pair, begin: int, ticks: int
 ) -> None:
-    session = Session((one, two), (queueing(*there), queueing(*back)))
+    session = Session(
+        (first_clock, two), (make_queueing_delay(*way), make_queueing_delay(*back))
+    )
     session.run(4.0, range(begin, begin + ticks))
     for site in session.sites:
         for _, error_ns, bound_ns in site.errors_ns:
@@ -248,9 +256,9 @@ def test_figures_cover_windows_and_faults_cover_everything() -> None:
 def test_the_newest_sample_is_echoed_once() -> None:
     peers = [PeerClock(name, 0, 0, exact_offset(0), None) for name in ("b", "c")]
     timing = SiteTiming(0, 1000, peers, "a")
-    one, two = timing.monitors
+    first, two = timing.monitors
     for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
-        one.receive(make_sample(tick, 0), at_ns)
+        first.receive(make_sample(tick, 0), at_ns)
     two.receive(make_sample(9, 0), 80)
     assert timing.pop_echo() == [(0, 6, 60), (1, 9, 80)]
     assert timing.pop_echo() == []
@@ -306,7 +314,8 @@ def test_unsteered_grids_are_absolute_to_the_nanosecond(k: int, rate_hz: int) ->
 def test_steering_never_steps_or_exceeds_its_slew(
     steers: list[tuple[int, int, float]], rate_hz: int
 ) -> None:
-    grid, k = TickSchedule(EPOCH_NS, rate_hz), 0
+    grid = TickSchedule(EPOCH_NS, rate_hz)
+    k = 0
     for ticks, error_ns, drift in steers:
         k += ticks
         before = grid.due_ns(k)
@@ -322,7 +331,7 @@ def test_steering_never_steps_or_exceeds_its_slew(
 @pytest.mark.parametrize("drift_ppb", [-150_000, -100_000, 0, 37_000, 150_000])
 @pytest.mark.parametrize("begin_ns", [-400_000, 0, 400_000])
 def test_steered_grids_follow_the_leaders_drifting_clock(drift_ppb: int, begin_ns: int) -> None:
-    """From an epoch that was converted wrong by begin_ns, steered ten times a second by the true offset."""
+    """The epoch is wrong by begin_ns at first, and the true offset steers the grid ten times a second."""
     leader = Other(0, drift_ppb)
     grid = TickSchedule(begin_ns, 1000)
     errors = []

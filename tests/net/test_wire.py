@@ -117,11 +117,11 @@ def make_sample_payload(**changes: Any) -> bytes:
 
 
 @settings(max_examples=40)
-@given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
+@given(output=outputs, arrivals_in=arrivals, boot=boots, late_us=st.integers(0, 2**40))
 def test_records_return_bit_for_bit(
-    output: TickRecord, came: list[Arrival], boot: int, late_us: int
+    output: TickRecord, arrivals_in: list[Arrival], boot: int, late_us: int
 ) -> None:
-    data = encode_state("m1", boot, PEERS, output, came, late_us, 12)
+    data = encode_state("m1", boot, PEERS, output, arrivals_in, late_us, 12)
     state = decode(data, State)
     plain = msgpack.unpackb(data)
     for name in STATE_VECTORS:
@@ -131,7 +131,7 @@ def test_records_return_bit_for_bit(
     assert (state.tick, state.t_ns, state.boot) == (output.tick, output.t_ns, boot)
     assert state.mode == output.mode.name.lower() == plain["mode"]
     assert state.used == dict(zip(PEERS, output.used, strict=True)) == plain["used"]
-    assert state.rx == [[a.peer, a.tick, a.latency_us] for a in came] == plain["rx"]
+    assert state.rx == [[a.peer, a.tick, a.latency_us] for a in arrivals_in] == plain["rx"]
     assert (state.rx_crc, state.late_us, state.busy_us) == (output.rx_crc, late_us, 12)
 
 
@@ -190,7 +190,8 @@ def test_sample_fields_equal_their_records(
         of_state = (
             {"q": "x", "qd": "xd", "tau_x": "wrench"}.get(name, name) if task[0] else name
         )
-        ours, theirs = getattr(small, name), getattr(state, of_state)
+        ours = getattr(small, name)
+        theirs = getattr(state, of_state)
         assert ours == theirs
         assert name not in ("q", "qd", "tau_x", "ch") or pack_numbers(ours) == pack_numbers(
             theirs
@@ -224,10 +225,10 @@ def test_an_invalid_block_is_refused(block: bytes) -> None:
 
 
 @settings(max_examples=30)
-@given(output=outputs, came=arrivals)
-def test_msgspec_and_msgpack_agree(output: TickRecord, came: list[Arrival]) -> None:
+@given(output=outputs, arrivals_in=arrivals)
+def test_msgspec_and_msgpack_agree(output: TickRecord, arrivals_in: list[Arrival]) -> None:
     """Either library reads the other's bytes."""
-    state = decode(encode_state("m1", 1, PEERS, output, came, 0, 0), State)
+    state = decode(encode_state("m1", 1, PEERS, output, arrivals_in, 0, 0), State)
     again = decode(msgspec.msgpack.encode(state), State)
     assert all(
         pack_numbers(getattr(again, name)) == pack_numbers(getattr(state, name))
@@ -484,7 +485,9 @@ def test_schemas_are_equal_without_docstrings() -> None:
 
 def test_waiting_records_are_read_despite_strangers() -> None:
     ring: BoundedRing[tuple[str, bytes]] = BoundedRing(9)
-    one, two, bad = make_state_payload(tick=1), make_state_payload(tick=2), b"\xc1"
-    for sent in (one + two, b"no record", one + bad + two, b"", two):
+    first = make_state_payload(tick=1)
+    two = make_state_payload(tick=2)
+    bad = b"\xc1"
+    for sent in (first + two, b"no record", first + bad + two, b"", two):
         ring.put(("t/m1/state", sent))
     assert [record.tick for record in read_records(ring)] == [1, 2, 1, 2]

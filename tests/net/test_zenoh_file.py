@@ -152,7 +152,7 @@ def test_stock_files_without_gossip_are_accepted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
 def test_values_equal_to_the_sessions_are_accepted(mode: str) -> None:
-    """Once for the mode of the file, or by mode; those of another mode are refused."""
+    """A value may stand once, or by mode; values of another mode are refused."""
     plain = make_zenoh_config([], [], mode)  # type: ignore[arg-type]
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
         used = look_up(plain, key)

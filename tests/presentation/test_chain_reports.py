@@ -9,6 +9,7 @@ import pytest
 
 import trilat_net as tn
 from tests.core.chain_references import chain_references
+from tests.presentation.figure_content import list_misplaced
 from tests.scenario.builders import six_joint_text
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
@@ -18,8 +19,6 @@ from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize
 from trilat_net.presentation.figures import arm_poses, joint_motion
 from trilat_net.presentation.style import arrange_joints
 from trilat_net.scenario import parse_scenario
-
-from .drawn_words import misplaced
 
 SIX = six_joint_text(1.0, delay_ms=40.0)
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
@@ -83,7 +82,7 @@ def test_panels_of_joints_fill_their_rows():
 def test_every_joint_has_its_panel(form, draw, panels):
     figure = draw(simulate_six_joints(), form)
     assert panels in (None, len(figure.axes))
-    assert misplaced(figure) == []
+    assert list_misplaced(figure) == []
     text = " ".join(
         axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes
     )

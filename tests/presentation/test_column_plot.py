@@ -8,24 +8,20 @@ import pytest
 
 import trilat_net as tn
 from tests.analysis.builders import make_busy_run, make_short_log
+from tests.presentation.figure_content import list_curves
 from tests.scenario.builders import planar_task_text
 from trilat_net.errors import UnknownName, UsageError
 from trilat_net.presentation import style
 from trilat_net.presentation.column_plot import DEFAULT_QUANTITIES
 
 
-def titles(figure):
+def list_titles(figure):
     return [axes.get_title() for axes in figure.axes]
-
-
-def curves(axes):
-    """Lines over time, without those that mark a change."""
-    return [line for line in axes.lines if line.get_transform() == axes.transData]
 
 
 def test_the_default_is_the_overview():
     log = make_short_log("four")
-    assert titles(log.plot()) == titles(tn.figure(log, "overview", width_in=7.0))
+    assert list_titles(log.plot()) == list_titles(tn.figure(log, "overview", width_in=7.0))
 
 
 def test_a_notebook_displays_the_figure():
@@ -36,9 +32,9 @@ def test_a_notebook_displays_the_figure():
 
 def test_a_quantity_has_a_panel_per_column():
     figure = make_short_log("paper").plot("q", "tau", "theta_hat")
-    assert titles(figure)[:2] == ["q1 (rad)", "q2 (rad)"]
-    assert titles(figure)[2:4] == ["tau1 (N m)", "tau2 (N m)"]
-    assert titles(figure)[4:] == [
+    assert list_titles(figure)[:2] == ["q1 (rad)", "q2 (rad)"]
+    assert list_titles(figure)[2:4] == ["tau1 (N m)", "tau2 (N m)"]
+    assert list_titles(figure)[4:] == [
         "theta_hat1 (kg m²)",
         "theta_hat2 (kg m²)",
         "theta_hat3 (kg m²)",
@@ -51,7 +47,7 @@ def test_a_quantity_has_a_panel_per_column():
 def test_curves_have_the_extremes_of_the_records(name):
     log = make_short_log("paper")
     for joint, axes in enumerate(log.plot(name).axes):
-        for site, curve in zip(log.sites, curves(axes), strict=True):
+        for site, curve in zip(log.sites, list_curves(axes), strict=True):
             values = getattr(log[site], name)[:, joint]
             drawn = curve.get_ydata()
             assert (np.nanmin(drawn), np.nanmax(drawn)) == (values.min(), values.max())
@@ -60,7 +56,7 @@ def test_curves_have_the_extremes_of_the_records(name):
 
 @pytest.mark.parametrize("name", ["q2", "q2_rad"])
 def test_a_single_column_has_two_names(name):
-    assert titles(make_short_log("four").plot(name)) == ["q2 (rad)"]
+    assert list_titles(make_short_log("four").plot(name)) == ["q2 (rad)"]
 
 
 def test_every_column_of_the_table_can_be_drawn():
@@ -72,14 +68,14 @@ def test_every_column_of_the_table_can_be_drawn():
 def test_sites_joints_and_times_restrict_a_figure():
     log = make_short_log("paper")
     figure = log.plot("q", "age", sites=["s", "m1"], joints=2, from_s=1.0, until_s=1.5)
-    assert titles(figure) == ["q2 (rad)", "age_m2 (ms)", "age_s (ms)", "age_m1 (ms)"]
+    assert list_titles(figure) == ["q2 (rad)", "age_m2 (ms)", "age_s (ms)", "age_m1 (ms)"]
     angles = figure.axes[0]
-    assert [len(curves(axes)) for axes in figure.axes] == [2, 2, 1, 1]
+    assert [len(list_curves(axes)) for axes in figure.axes] == [2, 2, 1, 1]
     assert angles.get_xlim() == (1.0, 1.5)
-    for curve in curves(angles):
+    for curve in list_curves(angles):
         assert curve.get_xdata().min() >= 1.0
         assert curve.get_xdata().max() <= 1.5
-    assert titles(log.plot(joints="q1")) == [
+    assert list_titles(log.plot(joints="q1")) == [
         f"{name}1 ({unit})"
         for name, unit in zip(DEFAULT_QUANTITIES, ("rad", "rad", "N m"), strict=True)
     ]
@@ -92,7 +88,7 @@ def test_modes_are_steps_between_words():
     recorded = {mode for site in log.sites for mode in log[site].mode}
     assert set(labels) == recorded
     assert labels[0] == "run"
-    assert {line.get_drawstyle() for line in curves(axes)} == {"steps-post"}
+    assert {line.get_drawstyle() for line in list_curves(axes)} == {"steps-post"}
 
 
 def test_changes_outside_the_time_are_not_marked():
@@ -104,8 +100,8 @@ def test_changes_outside_the_time_are_not_marked():
 
 def test_sites_with_poses_have_errors_along_axes():
     log = tn.simulate(planar_task_text(), duration_s=0.05)
-    assert titles(log.plot("e")) == ["e_x (m)", "e_y (m)", "e_z (m)"]
-    assert titles(log.plot("q_des", "q", joints=1)) == [
+    assert list_titles(log.plot("e")) == ["e_x (m)", "e_y (m)", "e_z (m)"]
+    assert list_titles(log.plot("q_des", "q", joints=1)) == [
         "q_des_x (m)",
         "q_des_y (m)",
         "q_des_z (m)",

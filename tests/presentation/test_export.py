@@ -168,7 +168,8 @@ def test_live_stamps_are_exact_in_matlab(tmp_path: Path) -> None:
 
 
 def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
-    path, wanted = export_log("ros2", tmp_path), list_expected_values()
+    path = export_log("ros2", tmp_path)
+    wanted = list_expected_values()
     columns: dict[str, list[list[float]]] = {}
     with path.open("rb") as stream:
         for _, channel, message, decoded in make_reader(
@@ -220,10 +221,12 @@ def test_exports_have_no_stamp_of_their_own(form: str, tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         export_log(form, tmp_path / name)
-    one, two = (
+    first, two = (
         {p.name: p.read_bytes() for p in (tmp_path / n).rglob("*") if p.is_file()}
         for n in ("one", "two")
     )
     if form == "mat":  # its first 116 bytes are a text with the date
-        one, two = ({name: data[128:] for name, data in files.items()} for files in (one, two))
-    assert one == two
+        first, two = (
+            {name: data[128:] for name, data in files.items()} for files in (first, two)
+        )
+    assert first == two

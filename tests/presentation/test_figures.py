@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 import trilat_net
 from tests.analysis.builders import make_busy_run, make_short_log
 from tests.log.builders import add_clock_readings
+from tests.presentation.figure_content import list_curves
 from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.link_summary import DelayDistribution
@@ -34,18 +35,13 @@ BACKGROUND = 0.6
 """What marks are drawn at or below, so that lines cover them."""
 
 
-def marked(figure):
+def list_marks(figure):
     """Returns the marks behind the lines of all panels: shades, and lines at changes."""
     shades = [p for axes in figure.axes for p in axes.patches if p.get_zorder() < BACKGROUND]
     changes = [
         line for axes in figure.axes for line in axes.lines if line.get_zorder() == BACKGROUND
     ]
     return shades, changes
-
-
-def lines(axes):
-    """Returns lines over time, without the horizontal ones that span the panel."""
-    return [line for line in axes.lines if line.get_transform() == axes.transData]
 
 
 def test_a_site_has_one_colour_in_every_figure():
@@ -55,10 +51,10 @@ def test_a_site_has_one_colour_in_every_figure():
         joint_motion.draw_parameter_estimates(log),
         joint_motion.draw_operator_displacement(log, twin=log),
     ):
-        drawn = [to_hex(line.get_color()) for line in lines(figure.axes[0])]
+        drawn = [to_hex(line.get_color()) for line in list_curves(figure.axes[0])]
         assert drawn[: len(log.sites)] == [style.site_colour(log, site) for site in log.sites]
     for site, axes in zip(log.sites, joint_motion.draw_positions(log).axes[::2], strict=True):
-        assert to_hex(lines(axes)[0].get_color()) == style.site_colour(log, site)
+        assert to_hex(list_curves(axes)[0].get_color()) == style.site_colour(log, site)
 
 
 def test_a_single_site_has_the_widest_line():
@@ -84,7 +80,7 @@ def test_a_log_without_events_has_no_markers():
     for name in registry.list_drawable_figures(log):
         drawn = registry.figure(log, name)
         if name != "certificate":  # which marks a rise of V
-            assert marked(drawn) == ([], []), name
+            assert list_marks(drawn) == ([], []), name
         assert drawn.get_supxlabel() == ""
 
 
@@ -103,7 +99,7 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
             assert drawn == pytest.approx(
                 [edge for span in find_mode_intervals(log[site]) for edge in span[1:]]
             )
-    shades, changes = marked(joint_motion.draw_tracking_errors(log))
+    shades, changes = list_marks(joint_motion.draw_tracking_errors(log))
     assert len(changes) == 3 * 3
     assert len(shades) == 3 * sum(len(find_mode_intervals(log[site])) for site in log.sites)
     assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
@@ -116,14 +112,14 @@ def test_the_stated_mean_is_drawn_while_valid():
     log = make_busy_run().log
     figure = age_and_lateness.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
-    t_s, mean_ms = lines(panel)[-1].get_data()
+    t_s, mean_ms = list_curves(panel)[-1].get_data()
     assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
     assert mean_ms == pytest.approx([50.0, 50.0, np.nan, 90.0, 90.0, np.nan], nan_ok=True)
     measured = trilat_net.simulate(
         "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
     )
     figure = age_and_lateness.draw_sample_age(measured)
-    assert all(np.isnan(lines(axes)[-1].get_ydata()).all() for axes in figure.axes)
+    assert all(np.isnan(list_curves(axes)[-1].get_ydata()).all() for axes in figure.axes)
     assert "mean delay as stated" not in [
         text.get_text() for text in figure.legends[0].get_texts()
     ]
@@ -131,8 +127,8 @@ def test_the_stated_mean_is_drawn_while_valid():
 
 def test_each_site_has_estimates_beside_the_truth():
     figure = joint_motion.draw_parameter_estimates(make_short_log("paper"))
-    assert [len(lines(axes)) for axes in figure.axes] == [3] * 5
-    truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
+    assert [len(list_curves(axes)) for axes in figure.axes] == [3] * 5
+    truths = [line for line in figure.axes[3].lines if line not in list_curves(figure.axes[3])]
     # m1 lc1 + m2 l1 of the paper's arm
     assert [line.get_ydata()[0] for line in truths] == [2.0]
 
@@ -148,7 +144,8 @@ def test_distributions_show_rare_long_ages():
 
 
 def test_ages_that_alternate_are_a_band():
-    seconds, swings = np.arange(4000) / 1000.0, np.arange(4000) % 5
+    seconds = np.arange(4000) / 1000.0
+    swings = np.arange(4000) % 5
     assert age_and_lateness.is_unsteady(200.0 + 10.0 * swings)
     assert not age_and_lateness.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
     axes = Figure().subplots()
@@ -243,7 +240,7 @@ def test_torque_limits_are_drawn_where_reached():
     figure = joint_motion.draw_control_torques(log)
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
     axes = figure.axes[0]
-    assert {line.get_ydata()[0] for line in axes.lines if line not in lines(axes)} == {
+    assert {line.get_ydata()[0] for line in axes.lines if line not in list_curves(axes)} == {
         20.0,
         -20.0,
     }
@@ -261,7 +258,7 @@ def test_shares_are_drawn_as_they_change():
     assert joint_motion.list_sites_with_changing_dominance(log) == ["s"]
     figure = joint_motion.draw_authority(log)
     assert len(figure.axes) == 3
-    m1, m2 = (line.get_data() for line in lines(figure.axes[0])[:2])
+    m1, m2 = (line.get_data() for line in list_curves(figure.axes[0])[:2])
     assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx(
         [0.5, 0.625, 0.75, 0.375, 0.0]
     )
@@ -273,20 +270,20 @@ def test_overview_has_all_extremes_and_the_verdict():
     log = make_short_log("paper")
     overview = run_overview.draw_overview(log)
     errors, _, torques, _ = overview.axes
-    for site, error, torque in zip(log.sites, lines(errors), lines(torques), strict=False):
+    for site, error, torque in zip(
+        log.sites, list_curves(errors), list_curves(torques), strict=False
+    ):
         assert np.nanmax(error.get_ydata()) == np.abs(log[site].e).max()
         assert np.nanmax(torque.get_ydata()) == np.abs(log[site].tau).max()
     assert str(trilat_net.certify(log).stability) in overview.legends[0].get_title().get_text()
 
 
 def test_overlaid_runs_share_sites_and_kind():
-    paper, task = (
-        make_short_log("paper"),
-        trilat_net.simulate(parse_scenario(planar_task_text(0.02))),
-    )
+    paper = make_short_log("paper")
+    task = trilat_net.simulate(parse_scenario(planar_task_text(0.02)))
     overlay = run_overview.draw_overlay({"one": paper, "two": make_short_log("four")})
-    one, _ = lines(overlay.axes[2])
-    assert np.nanmax(one.get_ydata()) == max(
+    curve, _ = list_curves(overlay.axes[2])
+    assert np.nanmax(curve.get_ydata()) == max(
         np.abs(paper[site].tau).max() for site in paper.sites
     )
     texts = [text.get_text() for text in overlay.legends[0].get_texts()]
@@ -311,7 +308,8 @@ def test_compared_runs_have_a_line_per_run(name: str, field: str) -> None:
     sites = runs["soft"].sites
     assert len(figure.axes) == 2 * len(sites)
     for panel, axes in enumerate(figure.axes):
-        site, joint = sites[panel // 2], panel % 2
+        site = sites[panel // 2]
+        joint = panel % 2
         assert len({line.get_linestyle() for line in axes.lines}) == len(runs)
         assert {line.get_color() for line in axes.lines} == {
             style.site_colour(runs["soft"], site)

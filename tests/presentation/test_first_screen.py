@@ -30,7 +30,7 @@ CHECKS = [Finding("records", "all present"), Finding("executed again", "differs"
 UNFOLD = "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
 
 
-def measure(page: Page, expression: str) -> float:
+def measure_page(page: Page, expression: str) -> float:
     value: float = page.evaluate(expression)
     return value
 
@@ -53,14 +53,14 @@ def test_report_fits_screens_and_axe_finds_nothing(
             with watched_page(browser, **options) as watched:
                 page = watched.page
                 page.goto(path.as_uri())
-                whole_px = measure(page, "document.documentElement.scrollHeight")
+                whole_px = measure_page(page, "document.documentElement.scrollHeight")
                 assert screen == "phone" or whole_px <= MOST_SCREENS * height
                 if has_records:
                     picture = page.locator("#arms svg").first.bounding_box()
                     assert picture is not None
                     assert picture["y"] + picture["height"] <= FIRST_PICTURE_PX
                 page.evaluate(UNFOLD)
-                assert measure(page, "document.documentElement.scrollWidth") <= width
+                assert measure_page(page, "document.documentElement.scrollWidth") <= width
                 assert grave_findings(page) == []
 
 

@@ -113,7 +113,7 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fps", [30, 7])
 def test_frames_have_the_newest_earlier_records(fps: int, tmp_path: Path) -> None:
-    """Of a run of 6 s, whose last ticks are at 5.995 s and, of b, at 5.9933 s."""
+    """The last ticks of the run of 6 s are at 5.995 s, and at 5.9933 s for b."""
     frames = read_frames(export_logs(tmp_path, make_users_log(), fps=fps))
     assert len(frames) == 6 * fps
     for column, site, field in (
@@ -280,17 +280,18 @@ def test_the_plugin_needs_a_holdable_arm(tmp_path: Path) -> None:
 
 
 def test_episodes_end_before_gaps(tmp_path: Path) -> None:
-    """Without 1.0 to 1.5 s: 1.0 s still has a record of 5 ms before it; so has 3.0 s in the short gap."""
+    """Records from 1.0 to 1.5 s are missing, but 1.0 s and 3.0 s still have a record of 5 ms before."""
     folder = export_logs(tmp_path, make_users_log_without((1.0, 1.5), (3.0, 3.02)))
     lengths = read_frames(folder, "meta/episodes")["length"].to_list()
     assert lengths == [31, 135]
     assert read_info(folder, "about")["sessions"][0]["frames_left_out"] == 180 - 31 - 135
-    frames, own = read_frames(folder), read_newest(make_users_log(), "c", "q", 180, 30)
+    frames = read_frames(folder)
+    recorded = read_newest(make_users_log(), "c", "q", 180, 30)
     assert frames["timestamp"][31] == frames["frame_index"][31] == 0
     q = frames["observation.state"].to_numpy()[:, :2]
-    assert np.array_equal(q[:30], own[:30])
+    assert np.array_equal(q[:30], recorded[:30])
     assert q[30].tolist() == np.float32(make_users_log()["c"].by_tick[199].q).tolist()
-    assert (np.flatnonzero((q[31:] != own[45:]).any(axis=1)) + 45).tolist() == [90]
+    assert (np.flatnonzero((q[31:] != recorded[45:]).any(axis=1)) + 45).tolist() == [90]
     assert q[31 + 45].tolist() == np.float32(make_users_log()["c"].by_tick[599].q).tolist()
 
 

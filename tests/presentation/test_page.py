@@ -69,7 +69,7 @@ def read_column(table, n):
 
 
 def test_a_report_has_numbers_and_pictures(tmp_path):
-    """With a certificate: of a run in which V rose."""
+    """The report has the certificate of a run in which V rose."""
     log = make_run("free", {**JITTER, "rate_hz": 100}).log
     paths = write_report(
         log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS

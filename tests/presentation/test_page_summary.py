@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from tests.analysis.builders import make_run, make_short_log
-from tests.log.builders import edit_log_bytes, make_log_bytes, replace_fields, rewrite_log
+from tests.log.builders import (
+    edit_log_bytes,
+    make_log_bytes,
+    replace_fields,
+    rewrite_log,
+    write_log,
+)
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
@@ -214,8 +220,9 @@ def test_log_without_records_has_dashes() -> None:
 
 def test_sessions_without_records_get_no_judgement(tmp_path: Path) -> None:
     """A session that ended before any site published anything is neither stable nor open."""
-    path = tmp_path / "run.mcap"
-    path.write_bytes(edit_log_bytes(make_log_bytes("two_sites"), record=lambda _: None))
+    path = write_log(
+        tmp_path, edit_log_bytes(make_log_bytes("two_sites"), record=lambda _: None)
+    )
     conclusion = conclude(open_log(path), tmp_path)
     assert conclusion.verdict.text == "nothing to judge: no site has a record in this log"
     assert conclusion.exit_code == 1

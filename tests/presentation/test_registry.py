@@ -14,6 +14,7 @@ from matplotlib.text import Text
 import trilat_net
 from tests.analysis.builders import make_busy_run, make_short_log
 from tests.log.builders import add_clock_readings
+from tests.presentation.figure_content import list_misplaced
 from trilat_net.errors import UsageError
 from trilat_net.presentation.appearance import COLUMN_IN, PAGE_IN, FigureSize
 from trilat_net.presentation.figures import age_and_lateness, joint_motion
@@ -24,8 +25,6 @@ from trilat_net.presentation.figures.registry import (
     write_figures,
 )
 from trilat_net.presentation.style import FIGURE_FORMATS, write_figure
-
-from .drawn_words import misplaced
 
 UNIT = re.compile(r"\((s|rad|rad/s|m|mm|N|N m|kg m|kg m²|J|ms|µs|count|%|1)\)$")
 WALLED = {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 20}
@@ -69,7 +68,7 @@ def draw_example(name, width_in):
 def test_words_have_8_pt_without_overlap(name, width_in):
     figure_drawn = draw_example(name, width_in)
     assert figure_drawn.get_figwidth() == width_in
-    assert misplaced(figure_drawn) == []
+    assert list_misplaced(figure_drawn) == []
     assert {
         text.get_fontsize() for text in figure_drawn.findobj(Text) if text.get_text().strip()
     } == {8.0}
@@ -103,7 +102,8 @@ def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
 
 @pytest.mark.parametrize("kind", FIGURE_FORMATS)
 def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
-    first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
+    first = tmp_path / f"a.{kind}"
+    second = tmp_path / f"b.{kind}"
     for path in (first, second):
         write_figure(
             figure(simulate_walled(), "contact"), path, FigureSize.for_print(COLUMN_IN).dpi
@@ -141,7 +141,8 @@ def test_wall_force_equals_the_recorded_torque():
     other force acts.
     """
     log = simulate_walled()
-    part, wall = log["s"], log.scenario.sites["s"].environment[0]
+    part = log["s"]
+    wall = log.scenario.sites["s"].environment[0]
     above = joint_motion.draw_contact(log).axes[0]
     t_s, force = above.lines[0].get_data()
     rows = np.rint(t_s * part.rate_hz).astype(int)

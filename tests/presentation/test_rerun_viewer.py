@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.log.programs import RERUN, run_program
+from tests.log.builders import write_log
 from tests.log.standard_files import SCENARIO
+from tests.programs import RERUN, run_program
 from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.log.log_reader import Log, open_log
@@ -39,10 +40,12 @@ class Rerun:
         self.topics: set[str] = set()
 
     def __call__(self, command: list[str], environment: Mapping[str, str]) -> int:
-        self.command, self.environment = command, environment
+        self.command = command
+        self.environment = environment
         for file in map(Path, command):
             if file.suffix == ".mcap":
-                self.log, self.topics = file, set(read_ros2_channels(file))
+                self.log = file
+                self.topics = set(read_ros2_channels(file))
             if file.suffix == ".rbl":
                 self.layout = file
                 assert file.stat().st_size > 0
@@ -83,8 +86,7 @@ def test_temporary_files_end_with_the_viewer(files: dict[str, Path]) -> None:
 
 def test_parts_and_torn_logs_are_shown_whole(files: dict[str, Path], tmp_path: Path) -> None:
     parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
-    torn = tmp_path / "run.mcap.active"
-    torn.write_bytes(files["live"].read_bytes()[:150_000])
+    torn = write_log(tmp_path, files["live"].read_bytes()[:150_000], "run.mcap.active")
     for paths, name in ((parts, parts[0].name), ([torn], "run.mcap")):
         rerun, _ = run_viewer(paths, ViewerOptions(save=Path("x.rrd")))
         assert rerun.log.name == name
@@ -102,7 +104,7 @@ def test_names_unsuitable_for_rerun_are_replaced(
         "ü.mcap": "log",
     }
     assert {name: make_application_id(Path(name)) for name in names} == names
-    (tmp_path / "ü.mcap").write_bytes(files["live"].read_bytes())
+    write_log(tmp_path, files["live"].read_bytes(), "ü.mcap")
     rerun, _ = run_viewer([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
     assert rerun.log.stem == "log"
     assert "/viz/m/error" in rerun.topics
@@ -194,7 +196,8 @@ def test_a_bag_shows_the_reference_beside_the_joints(
     files: dict[str, Path],
 ) -> None:
     of = build_layouts(files)
-    bag, views = of["bag"][1].pages["Motion"], of["live"][1].pages["Motion"]
+    bag = of["bag"][1].pages["Motion"]
+    views = of["live"][1].pages["Motion"]
     assert [c.entity for c in bag[0][0].curves] == [
         "/lab/m/joint_states/position",
         "/lab/m/reference/position",
@@ -227,5 +230,5 @@ def test_two_dimensional_numbers_are_named_by_both(files: dict[str, Path]) -> No
 
 def test_files_without_index_have_no_channels(files: dict[str, Path], tmp_path: Path) -> None:
     for content in (b"", b"nonsense" * 100, files["live"].read_bytes()[:50_000]):
-        (tmp_path / "x.mcap").write_bytes(content)
+        write_log(tmp_path, content, "x.mcap")
         assert read_ros2_channels(tmp_path / "x.mcap") == {}

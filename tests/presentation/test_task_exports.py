@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 
 import trilat_net
 from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
-from tests.log.programs import RERUN, rerun_faults, run_program
+from tests.programs import RERUN, list_rerun_faults, run_program
 from tests.scenario.builders import planar_task_text
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import write_virtual_log
@@ -127,11 +127,12 @@ def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
-    source, saved = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    source = tmp_path / "run.mcap"
+    saved = tmp_path / "run.rrd"
     with source.open("wb") as stream:
         write_virtual_log(make_task_log().scenario, stream)
-    assert rerun_faults(source) == []
-    assert rerun_faults(export_log("ros2", tmp_path)) == []
+    assert list_rerun_faults(source) == []
+    assert list_rerun_faults(export_log("ros2", tmp_path)) == []
     open_rerun([source], make_task_log, ViewerOptions(save=saved), lambda _: None)
     text = run_program(*RERUN, "rrd", "print", "-vvv", str(saved))
     assert [name for name in read_ros2_channels(source) if name not in text] == []
@@ -140,7 +141,8 @@ def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
 def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
-    path, log_times = tmp_path / "bag.mcap", list[int]()
+    path = tmp_path / "bag.mcap"
+    log_times = list[int]()
     export_ros2(make_log("paper"), path, log_times.append)
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages(log_time_order=False))

@@ -50,7 +50,7 @@ LAW_SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
     "tanks": ("two_sites", {"scheme": "digital"}),
     "own": ("two_sites", {"control": {"law": "tests.laws:Adaptive"}}),
 }
-"""Per law a scenario that it runs in, and settings."""
+"""A scenario and settings for each law."""
 
 SHORT = {"duration_s": 2.0, "rate_hz": 200}
 
@@ -138,4 +138,4 @@ VARIED: dict[str, MakeLog] = {
     "one of three sites": lambda: make_torn_log(200, "m1"),
     "single records": make_log_with_gaps,
 }
-"""What is varied, and a run of it."""
+"""The makers of the runs, by the property that is varied."""

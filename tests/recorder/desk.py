@@ -14,6 +14,7 @@ from recorder.site_reception import InboundQueue
 from tests.net import parties
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.log.log_reader import Log, open_log
@@ -29,8 +30,10 @@ from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import Scenario, load_scenario
 
 SESSION = "t"
-MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
-MS, S = 1_000_000, 1_000_000_000
+MONO_NS = 3_000_000_000
+UNIX_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+S = 1_000_000_000
 BOOTS = {"m": 11, "s": 12, topics.RECORDER: 13}
 EPOCH = Epoch(MONO_NS, UNIX_NS, BOOTS)
 SCENARIO = load_scenario("two_sites", {"duration_s": 0.05})
@@ -81,7 +84,8 @@ class Memory:
     """
 
     def __init__(self, network: LocalNetwork, name: str, chunk: int = 64) -> None:
-        self.name, self.chunk = name, chunk
+        self.name = name
+        self.chunk = chunk
         self.made: dict[str, Sequence[bytes]] = {"state": [], "link": [], "event": []}
         self.oldest = dict.fromkeys(self.made, 0)
         self.asked: list[BackfillRequest] = []
@@ -140,7 +144,7 @@ class Desk:
         )
 
     def wait(self, for_ns: int) -> None:
-        self.clock.sleep_until(self.clock.monotonic_ns() + for_ns)
+        sleep_for_ns(self.clock, for_ns)
 
     def take(self, name: str, channel: str, *payloads: bytes) -> None:
         for payload in payloads:
@@ -152,7 +156,7 @@ class Desk:
         self.recording.write(self.tap, self.clock.monotonic_ns())
 
     def rounds(self, count: int, *sites: Memory, step_ns: int = 10 * MS) -> None:
-        """Lets time pass, while the recorder works and the given sites answer."""
+        """Advances the time, while the recorder works and the given sites answer."""
         for _ in range(count):
             self.wait(step_ns)
             self.write()

@@ -20,10 +20,10 @@ from trilat_net.scenario import load_scenario
 from .desk import BOOTS, SESSION, TICKS, Desk, Memory, S
 
 
-def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
+def late_desk(*names: str) -> tuple[Desk, dict[str, Memory]]:
     """Returns a recorder that comes 40 s late into a session in which these sites remain."""
     desk = Desk()
-    sites = {name: Memory(desk.network, name) for name in there}
+    sites = {name: Memory(desk.network, name) for name in names}
     for name, site in sites.items():
         events = [
             encode_event(name, 0, "ready", t_ns=-1),
@@ -37,7 +37,7 @@ def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
         }
     desk.wait(40 * S)
     desk.recording.assume_gone()
-    for name in there:
+    for name in names:
         desk.recording.note_presence(
             topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True
         )

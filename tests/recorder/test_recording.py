@@ -12,6 +12,7 @@ from recorder.record_process import FLUSH_NS, POLL_NS, Recorder
 from recorder.session_recording import LAST_NS, RECONNECT_NS, SETTLE_NS
 from recorder.site_reception import AWAY_NS, EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
+from tests.net.waiting import sleep_for_ns
 from tests.recorder.desk import encode_end, encode_event, encode_states, encode_statistics
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.app.recorded_session import make_scenario_reader
@@ -114,7 +115,7 @@ def test_foreign_messages_are_dropped_and_others_kept(
 LONG = load_scenario("two_sites", {"duration_s": 60.0})
 
 
-def ahead(tick: int) -> bytes:
+def encode_early_state(tick: int) -> bytes:
     site = Site(LONG.setup("m"))
     return encode_state(
         "m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=tick), [], 0, 0
@@ -124,8 +125,8 @@ def ahead(tick: int) -> bytes:
 @pytest.mark.parametrize(
     ("reason", "channel", "payload"),
     [
-        ("m is ahead of the clock", topics.STATE, ahead(50_000)),
-        ("m is ahead of the clock", topics.STATE, ahead(2_100)),
+        ("m is ahead of the clock", topics.STATE, encode_early_state(50_000)),
+        ("m is ahead of the clock", topics.STATE, encode_early_state(2_100)),
         ("m is ahead of the clock", topics.LINK, encode_statistics("m", 50_000, LONG)),
         ("m is ahead of the clock", topics.EVENT, encode_end("m", 50_000)),
         ("m is ahead of the clock", topics.EVENT, encode_event("m", -1, "join", ticks=50_000)),
@@ -174,7 +175,7 @@ def test_clocks_may_differ_within_tolerance() -> None:
     """Two seconds, and a thousandth of the time."""
     desk = Desk(LONG)
     desk.wait(40 * 1_000_000_000)
-    desk.take("m", topics.STATE, ahead(42_000))
+    desk.take("m", topics.STATE, encode_early_state(42_000))
     assert desk.recording.dropped == {}
 
 
@@ -264,7 +265,7 @@ def test_stored_means_every_record_is_stored() -> None:
     assert (account.expected, account.received) == (1, 1)
 
 
-def alive(name: str, boot: int | str) -> str:
+def alive_key(name: str, boot: int | str) -> str:
     return topics.key(SESSION, name, topics.ALIVE) + f"/{boot}"
 
 
@@ -272,12 +273,12 @@ def test_dying_sites_end_recording_and_are_named() -> None:
     desk = Desk()
     desk.whole("m")
     desk.take("s", topics.STATE, *encode_states("s")[:20])
-    desk.recording.note_presence(alive("s", BOOTS["s"]), False)
+    desk.recording.note_presence(alive_key("s", BOOTS["s"]), False)
     assert not desk.over()
     # a site stays no longer after its last tick
     desk.clock.sleep_until(MONO_NS + 50_000_000 + LAST_NS)
     assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
+    sleep_for_ns(desk.clock, 1)
     assert desk.over()
     assert desk.recording.describe_problem() == "s disappeared after 20 records"
     assert "s: 20 records, its end is unknown" in desk.recording.render_summary()[1]
@@ -289,35 +290,36 @@ def test_dying_sites_end_recording_and_are_named() -> None:
     ("said_its_end", "patience_ns"), [(True, RECONNECT_NS), (False, AWAY_NS)]
 )
 def test_long_cut_off_sites_are_awaited(said_its_end: bool, patience_ns: int) -> None:
-    """Even if the recorder itself is cut off: then all sites disappear at once."""
+    """Sites are awaited even if the recorder itself is cut off, so that all sites disappear at once."""
     desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))
     if said_its_end:
         for name in ("m", "s"):
             desk.take(name, topics.EVENT, encode_end(name, 1))
     for name in ("m", "s", "m"):
-        desk.recording.note_presence(alive(name, BOOTS[name]), False)
+        desk.recording.note_presence(alive_key(name, BOOTS[name]), False)
         assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns)
+    sleep_for_ns(desk.clock, patience_ns)
     assert not desk.over()
-    desk.recording.note_presence(alive("m", BOOTS["m"]), True)
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
+    desk.recording.note_presence(alive_key("m", BOOTS["m"]), True)
+    sleep_for_ns(desk.clock, 1)
     assert not desk.over()
-    desk.recording.note_presence(alive("m", BOOTS["m"]), False)
+    desk.recording.note_presence(alive_key("m", BOOTS["m"]), False)
     assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns + 1)
+    sleep_for_ns(desk.clock, patience_ns + 1)
     assert desk.over()
 
 
 @pytest.mark.parametrize(
-    "key", [alive("s", 99), alive("s", "x"), alive("nobody", 1), "trilat", "", "a/b"]
+    "key",
+    [alive_key("s", 99), alive_key("s", "x"), alive_key("nobody", 1), "trilat", "", "a/b"],
 )
 def test_foreign_tokens_end_nothing(key: str) -> None:
     desk = Desk()
     desk.whole("m")
     desk.recording.note_presence(key, False)
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    sleep_for_ns(desk.clock, 2 * SETTLE_NS)
     desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    sleep_for_ns(desk.clock, 2 * SETTLE_NS)
     assert not desk.over()
 
 
@@ -399,9 +401,11 @@ def test_stopped_recorders_finish_their_file(tmp_path: Path) -> None:
 
 def test_lagging_recorders_catch_up(tmp_path: Path) -> None:
     """The next request follows an answer at once, before the next write to the file."""
-    network, relay = LocalNetwork(), Relay()
+    network = LocalNetwork()
+    relay = Relay()
     ended_ns = MONO_NS + 50 * MS
-    grace_ns, answer_ns = 50 * MS, 2 * POLL_NS
+    grace_ns = 50 * MS
+    answer_ns = 2 * POLL_NS
     stop_ns = ended_ns + grace_ns + TICKS * answer_ns + 2 * FLUSH_NS
     memory = Memory(network, "m", chunk=1)
     memory.made["state"] = encode_states("m")
@@ -412,7 +416,7 @@ def test_lagging_recorders_catch_up(tmp_path: Path) -> None:
         clock.sleep_until(ended_ns)
         send(encode_end("m"))
         while clock.monotonic_ns() < stop_ns:
-            clock.sleep_until(clock.monotonic_ns() + MS)
+            sleep_for_ns(clock, MS)
             memory.answer()
 
     relay.add(
@@ -430,7 +434,7 @@ def test_scenarios_come_from_members_only(tmp_path: Path) -> None:
 
 
 def test_ending_recorders_wait_for_held_records() -> None:
-    """For a running site only until no record is missing."""
+    """The recorder waits for a running site only until no record is missing."""
     desk = Desk()
     ending_ns = desk.clock.monotonic_ns()
     desk.whole("m")

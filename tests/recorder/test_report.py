@@ -35,7 +35,8 @@ def test_reports_give_stored_and_missing_records() -> None:
     assert (stats.mono_ns, stats.unix_ns) == (desk.clock.monotonic_ns(), desk.clock.unix_ns())
     assert set(stats.expected) == {
         *(f"{site}/{channel}" for site in ("m", "s") for channel in ("state", "link", "event")),
-        *("recorder/event", "recorder/stats"),
+        "recorder/event",
+        "recorder/stats",
     }
     desk.report.publish()
     assert read_reports(desk)[0].flush_max_us == 0

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from importlib import metadata
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +93,7 @@ def two_arm_text(
 
 @functools.cache
 def find_robot_files() -> dict[str, Path]:
-    """Returns the files of `example-robot-data`, which long tests have, by their path in its
-    folder of robots.
-    """
+    """Returns the files of `example-robot-data`, if it is installed, by their path in its folder of robots."""
     files = [
         str(file)
         for file in metadata.files("example-robot-data") or ()
@@ -108,6 +106,49 @@ def find_robot_files() -> dict[str, Path]:
         for name in files
     }
     return {name: Path(str(path)) for name, path in places.items()}
+
+
+ROUGH_PARTS = """
+[[sites.m1.hands]]
+kind = "tip_spring"
+to_m = [-0.4, -0.2, 0.1]
+move_start_s = 0.5
+move_end_s = 2.0
+stiffness_n_m = 100.0
+damping_n_s_m = 20.0
+end_s = 3.0
+[[sites.m2.hands]]
+kind = "pulse"
+start_s = 0.1
+end_s = 0.9
+peak_nm = [0.0, 0.0, 60.0, 0.0, 1.0, 0.0]
+[sites.s.limits]
+tau_limit_nm = [150.0, 30.0, 150.0, 28.0, 28.0, 28.0]
+[[sites.s.environment]]
+kind = "wall"
+point_m = [0.0, 0.0, 0.27]
+normal = [0.1, 0.0, 1.0]
+stiffness_n_m = 500.0
+[[sites.s.environment]]
+kind = "viscous"
+damping_nm_s_rad = 0.5
+sampled = true
+"""
+"""An operator, a pulse, limits, a wall in space and a damper for three arms of six joints."""
+
+
+def rough_arm_text() -> str:
+    """Returns the text of three arms of six joints with everything that a chain supports.
+
+    Each joint has friction, and the elbow stops at 1.55 rad.
+    """
+    file = resources.files("trilat_net") / "scenarios" / "arm6.urdf"
+    dynamics = '<dynamics damping="0.8" friction="1.5"/>'
+    urdf = file.read_text(encoding="utf-8").replace("<limit ", f"{dynamics}<limit ")
+    elbow = urdf.index('<joint name="elbow"')
+    stopped = urdf[elbow:].replace('upper="6.283185307179586"', 'upper="1.55"', 1)
+    table = f"[urdf]\n\"rough.urdf\" = '''\n{urdf[:elbow]}{stopped}'''\n"
+    return six_joint_text(4.0, 50.0, "rough.urdf") + ROUGH_PARTS + table
 
 
 PLANAR_TEMPLATE = """

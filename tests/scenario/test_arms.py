@@ -236,7 +236,8 @@ def test_unlike_joints_are_refused_in_joint_space() -> None:
 
 
 def test_links_of_meshes_alone_are_refused() -> None:
-    start, end = ARM6.index("<inertial>"), ARM6.index("</inertial>") + len("</inertial>")
+    start = ARM6.index("<inertial>")
+    end = ARM6.index("</inertial>") + len("</inertial>")
     mesh = '<visual><geometry><mesh filename="shoulder.dae"/></geometry></visual>'
     error = refusal({"urdf": {"arm6.urdf": ARM6[:start] + mesh + ARM6[end:]}})
     assert "link 'shoulder'" in error.problem
@@ -254,7 +255,8 @@ def test_links_of_meshes_alone_are_refused() -> None:
 def test_excessive_damping_of_a_joint_is_named(scheme: str, most: float) -> None:
     """The largest eigenvalue of h D M^-1 by NumPy, from Pinocchio's M of a stored pose."""
     chain, states = chain_references()["arm6"]
-    pose, armature = states[0].q, np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+    pose = states[0].q
+    armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     least = np.linalg.eigvalsh(states[0].inertia + np.diag(armature))[0]
     critical = float(most * 1000.0 * least)
     poses = {f"sites.{name}.q0_rad": pose.tolist() for name in ("m1", "m2", "s")}
@@ -476,9 +478,10 @@ def test_the_canonical_text_loads_to_the_same_scenario(
     assert again == scenario
     assert (again.text, again.sha256) == (scenario.text, scenario.sha256)
     for name in scenario.names:
-        one, other = scenario.setup(name), again.setup(name)
-        assert one.theta.tolist() == other.theta.tolist()
-        assert (one.chain, one.gains, one.q0) == (other.chain, other.gains, other.q0)
+        setup = scenario.setup(name)
+        other = again.setup(name)
+        assert setup.theta.tolist() == other.theta.tolist()
+        assert (setup.chain, setup.gains, setup.q0) == (other.chain, other.gains, other.q0)
 
 
 def test_tip_and_inertia_equal_the_references() -> None:

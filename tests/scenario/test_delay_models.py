@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.core.builders import Ints, compute_due_ns, make_channel
-from tests.scenario.links import links
+from tests.scenario.links import draw_link
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import MAX_DELAY_US, DelayKind
 from trilat_net.errors import ScenarioError
@@ -29,7 +29,7 @@ def refused(keys: dict[str, Any]) -> ScenarioError:
     return error.value
 
 
-@given(keys=links())
+@given(keys=draw_link())
 def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
     loaded = load_link(keys)
     mean_ms, deviation_ms = loaded.moments()
@@ -44,7 +44,7 @@ def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
     assert (kept >= 0).all()
 
 
-@given(keys=links())
+@given(keys=draw_link())
 def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
     loaded = load_link(keys)

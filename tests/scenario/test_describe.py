@@ -126,9 +126,7 @@ def test_sites_that_never_hold_get_no_remark() -> None:
 
 
 def test_check_states_the_time_to_rest() -> None:
-    """For every site under `glide`; and for an arm too fast for its motors, the speed that its
-    joints reach.
-    """
+    """The time stands for every site under `glide`, and the reached speed for an arm too fast for its motors."""
     scenario = load_scenario("free", {"on_stale.action": "glide"})
     bounds = find_rest_bounds(scenario, "s")
     lines = [line for line in describe_scenario(scenario) if line.startswith("arms of")]
@@ -208,8 +206,8 @@ def test_lines_share_by_site_and_average_b() -> None:
     law = {"law": "wave", "b": [6.0, 3.0]}
     scenario = make_unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
     total = np.zeros(2)
-    for name, one in zip(scenario.names, scenario.controls, strict=True):
-        lines = np.array([one.find_impedances(name, peer) for peer in scenario.peers(name)])
+    for name, control in zip(scenario.names, scenario.controls, strict=True):
+        lines = np.array([control.find_impedances(name, peer) for peer in scenario.peers(name)])
         shares = [scenario.dominance[name][peer] for peer in scenario.peers(name)]
         assert lines / lines.sum(axis=0) == pytest.approx(
             np.array([shares, shares]).T, rel=1e-9
@@ -254,14 +252,14 @@ def test_conditions_need_exact_gravity(law: str, gravity: float) -> None:
 
 
 def test_long_values_end_with_whole_entries() -> None:
-    """Of a hand with many settings the leading ones are shown, and eight digits of a hash."""
+    """A hand with many settings shows the first ones, and eight digits of a hash."""
     hand = {"kind": "own", "class": "my_policy:Reach", "source_sha256": "0123456789abcdef" * 4}
     assert describe_value([hand]) == "[own class my_policy:Reach source_sha256 01234567]"
     settings = {f"setting_{n}": 1.5 for n in range(9)}
-    words = describe_value([{**hand, **settings}]).strip("[]").split()
-    assert words[-1] == "..."
-    assert words[-2] == "1.5"
-    assert len(words) < 12
+    entries = describe_value([{**hand, **settings}]).strip("[]").split()
+    assert entries[-1] == "..."
+    assert entries[-2] == "1.5"
+    assert len(entries) < 12
     numbers = describe_value([n + 0.125 for n in range(40)]).strip("[]").split(", ")
     assert numbers[:-1] == [f"{n + 0.125:g}" for n in range(len(numbers) - 1)]
     assert numbers[-1] == "..."

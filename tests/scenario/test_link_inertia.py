@@ -57,7 +57,7 @@ def finger_text(**inertial: Any) -> str:
     )
 
 
-def moments(tensor: Matrix) -> list[float]:
+def compute_moments(tensor: Matrix) -> list[float]:
     return [float(x) for x in np.linalg.eigvalsh(np.array(tensor))]
 
 
@@ -157,8 +157,8 @@ def test_a_finger_as_end_link_is_refused() -> None:
     ):
         assert word in str(refused.value)
     assert len(make_arm_scenario(FINGER, {"balance_inertia": True}).arms["m"].joint_names) == 3
-    given = {"links": {"finger": {"inertia_kg_m2": [1e-6, 0, 1e-6, 0, 0, 1e-6]}}}
-    assert len(make_arm_scenario(FINGER, given).arms["m"].joint_names) == 3
+    keys = {"links": {"finger": {"inertia_kg_m2": [1e-6, 0, 1e-6, 0, 0, 1e-6]}}}
+    assert len(make_arm_scenario(FINGER, keys).arms["m"].joint_names) == 3
     assert len(make_arm_scenario(FINGER, {"tip": "lower"}).arms["m"].joint_names) == 2
 
 
@@ -178,7 +178,7 @@ def test_balanced_inertia_is_the_nearest_body(entries: tuple[float, ...]) -> Non
     nearest = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
     expected = np.trace(nearest) * np.eye(3) - nearest
     assert np.abs(np.array(balanced) - expected).max() < 1e-12
-    least, middle, most = moments(balanced)
+    least, middle, most = compute_moments(balanced)
     assert least >= -1e-12
     assert most <= least + middle + 1e-12
     assert np.abs(np.array(balance_tensor(balanced)) - balanced).max() < 1e-12
@@ -217,30 +217,31 @@ TURNED = TURNED.replace('ixx="0.01"', 'ixx="0.005"')
 def test_omitted_keys_keep_the_files_value() -> None:
     """The axes of the file's tensor stay turned; a tensor of the scenario stands in the link's axes."""
 
-    def upper(**given: Any) -> list[float]:
+    def upper(**keys: Any) -> list[float]:
         return list(
-            read_urdf(TURNED, tip="lower", links={"upper": LinkInertia(**given)})
+            read_urdf(TURNED, tip="lower", links={"upper": LinkInertia(**keys)})
             .joints[0]
             .inertia
         )
 
-    m, c = 2.0, (0.1, 0.0, 0.2)
+    m = 2.0
+    c = (0.1, 0.0, 0.2)
     about = [0.01, 0, 0.005, 0, 0, 0.01]  # turned by a right angle about z
 
-    def shifted(mass: float, com: tuple[float, ...], own: list[float]) -> list[float]:
+    def shifted(mass: float, com: tuple[float, ...], inertia: list[float]) -> list[float]:
         x, y, z = com
         steiner = [y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y]
-        tensor = [a + mass * b for a, b in zip(own, steiner, strict=True)]
+        tensor = [a + mass * b for a, b in zip(inertia, steiner, strict=True)]
         return [mass, *(mass * k for k in com), *tensor]
 
     assert upper(mass_kg=m) == pytest.approx(shifted(m, (0, 0, 0.1), about), abs=1e-9)
     assert upper(com_m=c) == pytest.approx(shifted(1.0, c, about), abs=1e-9)
-    own = (0.02, 0.0, 0.03, 0.0, 0.0, 0.04)
-    assert upper(inertia_kg_m2=own) == pytest.approx(
-        shifted(1.0, (0, 0, 0.1), list(own)), abs=1e-9
+    inertia = (0.02, 0.0, 0.03, 0.0, 0.0, 0.04)
+    assert upper(inertia_kg_m2=inertia) == pytest.approx(
+        shifted(1.0, (0, 0, 0.1), list(inertia)), abs=1e-9
     )
-    assert upper(mass_kg=m, com_m=c, inertia_kg_m2=own) == pytest.approx(
-        shifted(m, c, list(own))
+    assert upper(mass_kg=m, com_m=c, inertia_kg_m2=inertia) == pytest.approx(
+        shifted(m, c, list(inertia))
     )
 
 
@@ -338,7 +339,7 @@ def test_overrides_reach_links_of_arms() -> None:
 
 
 def test_sites_mend_links_beyond_their_group() -> None:
-    """Also for names that TOML quotes, and for drawn numbers."""
+    """This holds also for names that TOML quotes, and for drawn numbers."""
     text = SHAPES.replace('"tool"', '"tool.1"')
     shared = {"yaw": YAW, "tool.1": {"mass_kg": 0.4}}
     tables = {

@@ -73,7 +73,8 @@ def test_losses_without_lines_count_at_both_ends(tmp_path: Path, head: str) -> N
     first = 1 if head == IPUTILS else 0
     probes = import_text(tmp_path, head + answer_lines(3, 4) + summary_lines(8, 2))
     expected = [LOST] * 8
-    expected[3 - first], expected[4 - first] = 4.0, 5.0
+    expected[3 - first] = 4.0
+    expected[4 - first] = 5.0
     assert list_delays(probes) == expected
     assert probes.begin_known
     assert probes.end_known

@@ -106,7 +106,7 @@ def test_an_override_without_key_or_value_is_refused(text: str) -> None:
 
 
 def test_kind_overrides_replace_other_kinds() -> None:
-    """In any order of keys; other overrides of the same table stay."""
+    """The keys may have any order, and other overrides of the same table stay."""
     for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
         links = load_scenario("paper", texts).links.values()
         assert {link.describe() for link in links} == {
@@ -318,7 +318,7 @@ def test_unknown_keys_name_the_nearest(key: str, nearest: str) -> None:
     ],
 )
 def test_errors_name_the_key_as_written(key: str, value: object) -> None:
-    """Also a key of all sites or links, whether it changes a file or a resolved scenario."""
+    """An error names a key of all sites or links as written, in a file and in a resolved scenario."""
     for source in ("paper", load_scenario("paper")):
         with pytest.raises(ScenarioError) as caught:
             load_scenario(source, {key: value})

@@ -88,7 +88,8 @@ def test_start_near_a_singular_pose_is_reported(elbow_rad: float, damped: bool) 
     """The least singular value of a two-link arm of equal lengths, from its determinant sin q2."""
     lines = describe_scenario(parse_scenario(planar_task_text(elbow_rad=elbow_rad)))
     (line,) = [line for line in lines if line.startswith("s follows along x, y")]
-    c, s = np.cos(elbow_rad), np.sin(elbow_rad)
+    c = np.cos(elbow_rad)
+    s = np.sin(elbow_rad)
     squares = 3.0 + 2.0 * c  # of all entries of J
     least = np.sqrt(0.5 * (squares - np.sqrt(squares**2 - 4.0 * s * s)))
     assert f"start pose {least:.3g}," in line

@@ -113,9 +113,12 @@ def test_references_balance_power_and_position() -> None:
 
 
 def compute_pose(chain: UrdfChain, q: Array) -> tuple[Array, Array, list]:
-    R, x, axes = np.eye(3), np.zeros(3), []
+    R = np.eye(3)
+    x = np.zeros(3)
+    axes = []
     for j, qi in zip(chain.joints, q, strict=True):
-        x, R = x + R @ j.origin_m, R @ np.array(j.rotation)
+        x = x + R @ j.origin_m
+        R = R @ np.array(j.rotation)
         axes.append((j.kind, R @ j.axis, x))
         if j.kind == "revolute":
             R = R @ rotate_about(np.array(j.axis), qi)
@@ -153,16 +156,15 @@ def list_moments(I: Array) -> list[float]:  # noqa: E741 - the symbol of an iner
 
 
 def inertia_text(masses: Array, places: Array, angles: Array) -> str:
-    c, R = masses @ places / masses.sum(), rotate_by_angles(angles)
+    c = masses @ places / masses.sum()
+    R = rotate_by_angles(angles)
     moments = list_moments(R.T @ compute_tensor(masses, places - c) @ R)
     keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
     inertia = " ".join(
         f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True)
     )
-    origin, mass = (
-        f'xyz="{format_vector(c)}" rpy="{format_vector(angles)}"',
-        float(masses.sum()),
-    )
+    origin = f'xyz="{format_vector(c)}" rpy="{format_vector(angles)}"'
+    mass = float(masses.sum())
     return (
         f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
     )
@@ -179,7 +181,8 @@ def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
     joint's frame.
     """
     random = np.random.default_rng(seed)
-    angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
+    angles = random.uniform(-3, 3, (6, 3))
+    offsets = random.uniform(-1, 1, (6, 3))
     origins = [
         f'<origin xyz="{format_vector(x)}" rpy="{format_vector(a)}"/>'
         for x, a in zip(offsets, angles, strict=True)
@@ -216,12 +219,12 @@ def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
     assert np.abs(chain.tip_rotation - R[4]).max() < 1e-14
     assert chain.tip_origin_m == tuple(offsets[4])
     assert second.axis == (0.0, 0.6, 0.8)
-    for body, own, carried, n in (
+    for body, link_points, carried, n in (
         (first, clouds[0], clouds[1], 2),
         (second, clouds[2], clouds[3], 4),
     ):
-        m = np.concatenate([own[0], carried[0]])
-        p = np.concatenate([own[1], offsets[n] + carried[1] @ R[n].T])
+        m = np.concatenate([link_points[0], carried[0]])
+        p = np.concatenate([link_points[1], offsets[n] + carried[1] @ R[n].T])
         expected = [m.sum(), *(m @ p), *list_moments(compute_tensor(m, p))]
         assert np.abs(np.array(body.inertia) - expected).max() < 1e-13
 
@@ -244,16 +247,16 @@ def test_limits_friction_and_kinds() -> None:
         ),
         link_text("d"),
     ).replace('<axis xyz="0 0 1"/><limit lower="-1e16"', '<limit lower="-1e16"')
-    one, two, three, four = read_urdf(text).joints
+    first, two, three, four = read_urdf(text).joints
     inf = math.inf
-    assert (one.kind, one.lower, one.upper, one.effort_limit, one.velocity_limit) == (
+    assert (first.kind, first.lower, first.upper, first.effort_limit, first.velocity_limit) == (
         "prismatic",
         -1,
         2,
         30,
         4,
     )
-    assert (one.viscous, one.coulomb, two.viscous, two.coulomb) == (0.5, 0.25, 0, 0)
+    assert (first.viscous, first.coulomb, two.viscous, two.coulomb) == (0.5, 0.25, 0, 0)
     assert (two.kind, two.lower, two.upper, two.effort_limit) == ("revolute", -inf, inf, 30)
     assert three[7:11] == (-inf, inf, inf, inf)
     assert four[7:11] == (-inf, inf, inf, 2)
@@ -421,7 +424,7 @@ _NASTY = st.sampled_from(
 )
 
 
-def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
+def mutate_element(root: ElementTree.Element, data: st.DataObject) -> None:
     """Drops, doubles, garbles or scales one element or attribute."""
     parents = [e for e in root.iter() if len(e)]
     parent = data.draw(st.sampled_from(parents))
@@ -452,7 +455,7 @@ def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
             child.set(key, data.draw(_NASTY))
 
 
-def garble(text: str, data: st.DataObject) -> str:
+def garble_text(text: str, data: st.DataObject) -> str:
     """Cuts out a stretch of the text, or inserts characters."""
     start = data.draw(st.integers(0, len(text)))
     end = data.draw(st.integers(start, min(len(text), start + 80)))
@@ -489,10 +492,10 @@ def check_physical(chain: UrdfChain) -> None:
 def test_mutated_files_are_refused_or_physical(data: st.DataObject, source: tuple) -> None:
     text, tip = source
     if data.draw(st.booleans()):
-        text = garble(text, data)
+        text = garble_text(text, data)
     else:
         root = ElementTree.fromstring(text)
-        mutate(root, data)
+        mutate_element(root, data)
         text = ElementTree.tostring(root, encoding="unicode")
     try:
         chain = read_urdf(text, tip=tip)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.sites.sessions import execute_packed, pack_log
-from tests.truth import judge_link, members, offset_errors
+from tests.truth import judge_link, list_members, offset_errors
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
@@ -54,14 +54,14 @@ def test_any_members_clock_may_differ(names: tuple[str, ...], tmp_path: Path) ->
     session, log = run_skewed_session(tmp_path, {name: skews[name] for name in names}, 0.3)
     assert log.complete
     assert pack_log(log) == execute_packed(session.scenario)
-    clocks = members(log)
+    clocks = list_members(log)
     begun_ns = {name: clock.true_ns(0) for name, clock in clocks.items()}
     # one instant, but for drift since
     assert max(begun_ns.values()) - min(begun_ns.values()) <= 200_000
 
 
 def test_logged_delays_and_offsets_are_within_bounds(skewed: tuple[Session, Log]) -> None:
-    """Here messages take no time: the bound is the possible drift of the clocks, soon microseconds."""
+    """Messages take no time, so that the bound is the possible drift of the clocks, soon microseconds."""
     _, log = skewed
     for site in log.sites:
         for peer in log.scenario.peers(site):
@@ -76,7 +76,7 @@ def test_logged_delays_and_offsets_are_within_bounds(skewed: tuple[Session, Log]
 
 def test_grids_follow_the_leaders_as_logged(skewed: tuple[Session, Log]) -> None:
     _, log = skewed
-    clocks = members(log)
+    clocks = list_members(log)
     for site, drift_ppb in (("m1", 0), ("m2", 100_000), ("s", -100_000)):
         stats = log.link_stats(site)
         assert all(abs(statistics.grid_error_us) <= 150 for statistics in stats)
@@ -94,7 +94,7 @@ def test_members_on_other_clocks_are_reported(skewed: tuple[Session, Log]) -> No
     assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in texts)
     setups = {event.member: event for event in log.events if event.kind == "setup"}
     assert "clock of m2: another one" in setups["s"].text
-    assert setups["m2"].epoch_mono_ns == members(log)["m2"].epoch_ns
+    assert setups["m2"].epoch_mono_ns == list_members(log)["m2"].epoch_ns
     assert "skewed by 3000000000 ns" in setups["m2"].clock
     assert all("turn: 0 us after the grid" in event.text for event in setups.values())
 

@@ -26,7 +26,7 @@ WAITS = ("record", "--session", "nobody", "--connect", "tcp/127.0.0.1:9", "-o", 
 
 
 def test_compilations_are_announced_before_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if loading the scenario has compiled, and announced, a part of the code before."""
+    """This holds also if loading the scenario has compiled and announced a part of the code before."""
     said: list[str] = []
     compiled = {"dispatcher": SimpleNamespace(py_func=site_tick.py_func)}
 

@@ -64,7 +64,9 @@ class UnpunctualClock(ManualClock):
 
     def __init__(self, late_ns: int, every: int) -> None:
         super().__init__()
-        self._late_ns, self._every, self._sleeps = late_ns, every, 0
+        self._late_ns = late_ns
+        self._every = every
+        self._sleeps = 0
 
     def sleep_until(self, deadline_ns: int) -> None:
         self._sleeps += 1
@@ -164,7 +166,10 @@ class OddClock(ManualClock):
 
     def __init__(self, odd_ns: int = 0, wall_step_ns: int = 0) -> None:
         super().__init__()
-        self._reads, self._now, self._odd, self._step = 0, 0, odd_ns, wall_step_ns
+        self._reads = 0
+        self._now = 0
+        self._odd = odd_ns
+        self._step = wall_step_ns
 
     def monotonic_ns(self) -> int:
         self._reads += 1
@@ -271,7 +276,7 @@ def test_promised_findings_are_reported(
 def test_open_rights_are_no_finding_on_windows(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On Windows a mode only says whether a file can be written."""
+    """The mode of a file on Windows only says whether the file can be written."""
     (folder / "m1" / "private.key").chmod(0o666)
     try:
         monkeypatch.setattr("trilat_net.net.member_keys.sys", SimpleNamespace(platform="win32"))

@@ -25,6 +25,7 @@ from sites.external_arm import (
 from tests.log.builders import rewrite_log
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from tests.scenario.builders import make_six_joint_scenario
 from tests.sites.sessions import reach_session
 from trilat_net.analysis.file_overview import info, summarise_run
@@ -66,7 +67,8 @@ class Pendulum:
     """Uncoupled joints with friction, as an external arm."""
 
     def __init__(self, q: Sequence[float]) -> None:
-        self.q, self.qd = list(q), [0.0] * len(q)
+        self.q = list(q)
+        self.qd = [0.0] * len(q)
 
     def move(self, tau: tuple[float, ...] | None) -> None:
         for i in range(len(self.q)):
@@ -233,7 +235,8 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     session.clocks["s"].stall(at_ns, int(frozen_s * A_SECOND))
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    part, missed = log["s"], round(1e3 * frozen_s)
+    part = log["s"]
+    missed = round(1e3 * frozen_s)
     (jump,) = np.flatnonzero(np.diff(part.tick) > 1)
     assert abs(int(part.tick[jump + 1] - part.tick[jump]) - missed) <= 1
     assert part.skipped == int(part.tick[jump + 1] - part.tick[jump]) - 1
@@ -248,7 +251,8 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
         )
         < 0.05
     )
-    before, after = part.theta_hat[jump], part.theta_hat[-1]
+    before = part.theta_hat[jump]
+    after = part.theta_hat[-1]
     assert np.abs(after - before).max() <= 0.01 * np.abs(before).max()
     assert np.abs(np.diff(part.tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log["m"].mode[-1] in ("run", "hold", "return")
@@ -282,8 +286,8 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     (of_recorder,) = [line for line in summary if line.startswith("recorder: s:")]
     assert f", {skipped} skipped" in of_recorder
     assert "not made" not in of_recorder
-    own = "of them late by a period or more"
-    assert any(f"{own}, {skipped} of them skipped" in line for line in session.said)
+    phrase = "of them late by a period or more"
+    assert any(f"{phrase}, {skipped} of them skipped" in line for line in session.said)
     assert any(
         f"{skipped} missing (lost, or ticks that s skipped)" in line for line in session.said
     )
@@ -307,18 +311,18 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
     def hold(bus: Bus, clock: RelayClock) -> None:
         with SwitchClient(bus, clock, SESSION, "s") as switch:
             while switch.record is None:
-                clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
+                sleep_for_ns(clock, PERIOD_NS)
             begun_ns = clock.monotonic_ns() - switch.record.t_ns
             for from_s, to_s in ((0.2, 0.5), (0.8, 1.1)):
                 clock.sleep_until(begun_ns + round(from_s * 1e9))
                 while clock.monotonic_ns() < begun_ns + round(to_s * 1e9):
                     switch.send(held=True)
-                    clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+                    sleep_for_ns(clock, 20_000_000)
             switch.send(held=False)
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
             answers.extend(
-                (one.accepted, one.text)
-                for one in reach_session(bus, clock).send_order(["s"], "enable")
+                (answer.accepted, answer.text)
+                for answer in reach_session(bus, clock).send_order(["s"], "enable")
             )
 
     session.stranger(hold, at_ns=A_SECOND)
@@ -356,7 +360,8 @@ class Switch:
     """A switch, and programs that report whether they hold the switch."""
 
     def __init__(self) -> None:
-        self.clock, self.dropped = ManualClock(), Counter[str]()
+        self.clock = ManualClock()
+        self.dropped = Counter[str]()
         self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
         self.switch = DeadManSwitch("s", self.ring, self.clock, self.dropped)
 
@@ -364,7 +369,7 @@ class Switch:
         self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0
     ) -> bool:
         """Processes a message of one program; returns whether the switch is held then."""
-        self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
+        sleep_for_ns(self.clock, after_ns)
         self.ring.receive(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
         self.switch.poll()
         return self.switch.held
@@ -372,7 +377,10 @@ class Switch:
 
 def test_switches_hold_until_released_or_silent() -> None:
     dead_man = Switch()
-    switch, clock, ring, hear = dead_man.switch, dead_man.clock, dead_man.ring, dead_man.hear
+    switch = dead_man.switch
+    clock = dead_man.clock
+    ring = dead_man.ring
+    hear = dead_man.hear
     assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
     assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == "released"
     assert switch.pop_order(Mode.STOPPED, LifeReason.STOP_RELEASED) == ""
@@ -382,7 +390,7 @@ def test_switches_hold_until_released_or_silent() -> None:
     assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
     assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
     assert hear(2, 0, held=False)  # of one that does not hold it
-    clock.sleep_until(clock.monotonic_ns() + SWITCH_SILENCE_NS)
+    sleep_for_ns(clock, SWITCH_SILENCE_NS)
     assert switch.held
     assert not hear(1, 5, after_ns=1)  # said before
     assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == ""
@@ -397,7 +405,8 @@ def test_switches_hold_until_released_or_silent() -> None:
 @pytest.mark.parametrize("first", [1, 2])
 def test_of_two_holders_either_release_stops(first: int) -> None:
     """The other one has to let go and press anew: a hand-over goes by way of a stop."""
-    switch, other = Switch(), 3 - first
+    switch = Switch()
+    other = 3 - first
     assert switch.hear(1, 0)
     assert switch.hear(2, 0)
     assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
@@ -453,7 +462,7 @@ def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     session.stranger(drive, at_ns=4 * A_SECOND + 250_000)
     session.site("s", at_ns=4 * A_SECOND)
     log = session.run()
-    assert [end for _, end in session.told] == ["killed", 0, 0]
+    assert [end for _, end in session.start_ends] == ["killed", 0, 0]
     ((first, _),) = log.starts["s"]
     (gone,) = log.absences["s"]
     before = [(now_ns, q) for now_ns, q in poses if now_ns < 4 * A_SECOND]
@@ -492,7 +501,7 @@ def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
         for _ in range(50):
             other.send([9.0, 9.0], [0.0, 0.0])
             publish(b"garbage")
-            clock.sleep_until(clock.monotonic_ns() + 3_000_000)
+            sleep_for_ns(clock, 3_000_000)
 
     session.stranger(shout, at_ns=A_SECOND + 1_200_000_000)
     log = session.run()
@@ -599,7 +608,7 @@ def test_silence_counts_only_hearing_time() -> None:
     heard.hear()
     orders = [heard.arm.pop_order(Mode.RUN)]
     for _ in range(SILENCE_LIMIT_NS // PERIOD_NS + 1):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
+        sleep_for_ns(heard.clock, PERIOD_NS)
         heard.hear()
         orders.append(heard.arm.pop_order(Mode.HOLD if "arm_silent" in orders else Mode.RUN))
     # the sleep counts as 20 ms: no longer is it known that nothing came
@@ -617,7 +626,7 @@ def test_short_silences_end_with_a_measurement() -> None:
     heard.hear(encode_measurement())
     heard.arm.bind((0.5, 0.25))
     for _ in range(40):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
+        sleep_for_ns(heard.clock, PERIOD_NS)
         heard.hear()
     assert heard.arm.pop_order(Mode.RUN) == "arm_silent"
     heard.hear(encode_measurement(boot=9, n=1))
@@ -633,19 +642,20 @@ def test_encoder_glitches_count_as_silence() -> None:
     heard.hear(encode_measurement(n=0))
     heard.arm.bind((0.5, 0.25))
     for n in range(1, 6):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
+        sleep_for_ns(heard.clock, PERIOD_NS)
         heard.hear(encode_measurement(n=n, q=[1.5, 0.25] if n == 3 else [0.5, 0.25]))
         assert heard.arm.newest.q == [0.5, 0.25]
     assert heard.dropped["implausible measurement"] == 1
     for n in range(6, 80):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS // 10)
+        sleep_for_ns(heard.clock, PERIOD_NS // 10)
         heard.hear(encode_measurement(n=n, q=[40.0, 0.25]))
     assert heard.arm.newest.q == [0.5, 0.25]
     assert heard.dropped["implausible measurement"] == 75
 
 
 def test_torque_counts_while_fresh_and_running() -> None:
-    network, clock = LocalNetwork(), ManualClock()
+    network = LocalNetwork()
+    clock = ManualClock()
     site = network.join()
     port = ArmClient(network.join(), clock, "t", "s")
     assert port.torque() is None

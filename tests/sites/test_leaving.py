@@ -25,7 +25,7 @@ from .sessions import SESSION, Session
 S = 1_000_000_000
 
 
-def engaged_after_s(log: Log, site: str, tick: int) -> float:
+def measure_engagement_s(log: Log, site: str, tick: int) -> float:
     part = log[site]
     after = (part.tick >= tick) & (part.mode == "run")
     return float(part.tick[np.argmax(after)] - tick) / part.rate_hz
@@ -44,7 +44,7 @@ def test_killed_sites_return_and_logs_are_whole(tmp_path: Path) -> None:
     held = log["s"].mode[log.absences["m"][0][0] + 20 : first]
     assert set(held) == {"hold"}
     for site in ("m", "s"):
-        assert engaged_after_s(log, site, first) < 2.0
+        assert measure_engagement_s(log, site, first) < 2.0
         assert log.missing(site) == 0
         assert log[site].mode[-1] == "run"
     result = verify(log)
@@ -203,10 +203,7 @@ def test_late_recorders_learn_of_ticks_not_made(tmp_path: Path) -> None:
 
 
 def test_samples_without_record_leave_few_ticks_open(tmp_path: Path) -> None:
-    """Its peer used such a sample until it held: those ticks cannot be executed.
-
-    The held sample is in the peer's records.
-    """
+    """The peer used such a sample until it held, so that those ticks cannot be executed."""
     session = Session.whole(make_gliding_scenario(7.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/state", 4 * S - 14_000_000, 5 * S)
     session.clocks["m"].dies_ns = 4 * S
@@ -231,7 +228,7 @@ def test_one_way_cuts_are_in_last_messages(tmp_path: Path) -> None:
 
 
 def test_a_site_not_admitted_names_the_refusers(tmp_path: Path) -> None:
-    """Its messages do not reach one of them: the site waits, and reports why it does not join."""
+    """The site's messages do not reach one peer; the site waits, and reports why it does not join."""
     session = Session.whole(make_gliding_scenario(9.0, "asymmetric"), tmp_path, ends={})
     session.clocks["s"].dies_ns = 3 * S
     failed: list[str] = []
@@ -275,7 +272,8 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     certificate = certify(log)
     premises = {premise.name: premise for premise in certificate.premises}
     assert premises["presence"].holds is False
-    (first, last), rate_hz = log.absences["m1"][0], 200
+    first, last = log.absences["m1"][0]
+    rate_hz = 200
     assert (
         f"m1 {first / rate_hz:.4g} to {(last + 1) / rate_hz:.4g} s" in premises["presence"].text
     )
@@ -298,7 +296,7 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
 def test_starts_dead_before_tick_0_free_places(
     dies_ms: int, again_ms: int, tmp_path: Path
 ) -> None:
-    """Also if the other site admits the dead start only when the next one is there already."""
+    """The place is free also if the other site admits the dead start only after the next start has come."""
     session = Session.whole(make_gliding_scenario(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 3 * S
     session.site("m", at_ns=4 * S)
@@ -356,7 +354,7 @@ def test_frozen_starts_end_after_their_replacement(tmp_path: Path) -> None:
     session.site("m", at_ns=4 * S)
     log = session.run()
     assert len(log.starts["m"]) == 1
-    frozen, _, again = (end for _, end in session.told)
+    frozen, _, again = (end for _, end in session.start_ends)
     assert "another start of m has replaced this site" in str(frozen)
     assert again == 0
     assert log["m"].mode[-1] == "run"
@@ -389,7 +387,7 @@ def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
 
 
 def test_lost_tokens_alone_are_no_departure(tmp_path: Path) -> None:
-    """As a reconnection may report the end of a connection after its return."""
+    """A reconnection may report the end of a connection after its return."""
     session = Session.whole(
         make_gliding_scenario(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}}
     )

@@ -9,6 +9,7 @@ import pytest
 
 from sites.site_loop import PeerInbox, StateBlock, run_loop
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
@@ -54,7 +55,8 @@ class Alone:
         self.links: list[LinkStats] = []
         self.slack: list[tuple[int, int]] = []
         self.stopped: Callable[[], bool] = lambda: False
-        self._clock, self._ticks = clock, scenario.ticks("m")
+        self._clock = clock
+        self._ticks = scenario.ticks("m")
 
     def run(self, turn_ns: int = 0, *, catches_up: bool = True) -> object:
         inbox = PeerInbox((), (), (), (), self.stats.dropped)
@@ -107,7 +109,8 @@ def test_missed_ticks_run_back_to_back() -> None:
 
 
 def test_lateness_enters_no_formula() -> None:
-    prompt, late = Alone(LateClock()), Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
+    prompt = Alone(LateClock())
+    late = Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
     prompt.run()
     late.run()
     on_time = [
@@ -118,7 +121,8 @@ def test_lateness_enters_no_formula() -> None:
 
 
 def test_turns_shift_only_wake_ups() -> None:
-    clock, prompt = LateClock(), Alone(LateClock())
+    clock = LateClock()
+    prompt = Alone(LateClock())
     in_turn = Alone(clock)
     prompt.run()
     in_turn.run(turn_ns=333_000)
@@ -198,14 +202,15 @@ def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
     assert twins.late
     first = twins.late[0]
     assert first.peer == "m2"
-    live, plain = pack_log(log), execute_packed(scenario)
+    live = pack_log(log)
+    plain = execute_packed(scenario)
     for site in log.sites:
         assert live[site][: first.due_tick] == plain[site][: first.due_tick]
     assert live != plain
     assert verify(log).passed
 
 
-def shout(bus: Bus, clock: RelayClock) -> None:
+def publish_garbage(bus: Bus, clock: RelayClock) -> None:
     """Publishes invalid messages on every key of a session, while the session runs."""
     targets = [
         bus.publisher(topics.key(SESSION, member, channel))
@@ -215,20 +220,20 @@ def shout(bus: Bus, clock: RelayClock) -> None:
     for n in range(100):
         for publish in targets:
             publish((b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000)[n % 5])
-        clock.sleep_until(clock.monotonic_ns() + 17_000_000)
+        sleep_for_ns(clock, 17_000_000)
 
 
 def come_and_go(bus: Bus, clock: RelayClock) -> None:
     """Publishes a token that is no number of a start."""
     bus.announce(f"trilat/{SESSION}/m1/alive/no-number")
-    clock.sleep_until(clock.monotonic_ns() + 300_000_000)
+    sleep_for_ns(clock, 300_000_000)
     bus.close()
 
 
 def test_strangers_and_their_garbage_change_no_bit(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
-    session.stranger(shout)
+    session.stranger(publish_garbage)
     session.stranger(come_and_go, at_ns=2_000_000_000)
     log = session.run()
     assert pack_log(log) == execute_packed(scenario)

@@ -34,7 +34,8 @@ class SlowFarEnd:
     def __init__(
         self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0
     ) -> None:
-        relayed, self.came = LocalNetwork(), 0
+        relayed = LocalNetwork()
+        self.came = 0
         answer_benchmarks(relayed.join(), "far")
         forward = relayed.join()
         to_near = network.join().publisher(topics.key(SESSION, "far", topics.SAMPLE))
@@ -54,7 +55,8 @@ class SlowFarEnd:
 
 @pytest.mark.parametrize("trip_ms", [0.4, 35.0])
 def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
-    relay, network = Relay(), LocalNetwork()
+    relay = Relay()
+    network = LocalNetwork()
     far = SlowFarEnd(relay, network, round(trip_ms * MS), lost_every=10)
     network.join().publisher(topics.key(SESSION, "other", topics.SAMPLE))(b"junk")
 
@@ -76,7 +78,8 @@ def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
 
 
 def test_an_absent_far_end_is_reported() -> None:
-    relay, network = Relay(), LocalNetwork()
+    relay = Relay()
+    network = LocalNetwork()
     relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").wait_for_far_end())
     assert relay.run()["near"] is False
 
@@ -139,15 +142,15 @@ def test_meaningless_settings_are_refused(arguments: list[str], fact: str, tmp_p
 
 def check_result(result: Result, transports: list[str]) -> None:
     facts = result.to_dict()
-    assert [one["transport"] for one in facts["transports"]] == transports
+    assert [transport["transport"] for transport in facts["transports"]] == transports
     assert len(facts["rows"]) == 6 * len(transports)
-    assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
+    assert all(0 <= row["lost"] <= row["sent"] for row in facts["rows"])
     # a machine that stands still for half a second loses all of a row
-    for one in facts["rows"]:
-        assert (one["one_way_us"] is None) == (one["lost"] == one["sent"])
+    for row in facts["rows"]:
+        assert (row["one_way_us"] is None) == (row["lost"] == row["sent"])
         assert (
-            one["one_way_us"] is None
-            or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
+            row["one_way_us"] is None
+            or 0 < row["one_way_us"]["p50"] <= row["one_way_us"]["max"]
         )
     assert is_documented("ping --benchmark", facts)
     assert facts["connect"] or result.summary().startswith(

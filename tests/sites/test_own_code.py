@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sites.hand_process import HandProcess
+from tests.net.waiting import sleep_for_ns
 from tests.own_code import Circle, Failing, Follower
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
@@ -46,7 +47,9 @@ class Thinking:
     """A program that takes a time over each view."""
 
     def __init__(self, program: HandProgram, clock: RelayClock, thinks_ns: int) -> None:
-        self._program, self._clock, self._thinks_ns = program, clock, thinks_ns
+        self._program = program
+        self._clock = clock
+        self._thinks_ns = thinks_ns
 
     def act(self, now: HandView) -> Any:
         self._clock.sleep_until(self._clock.monotonic_ns() + self._thinks_ns)
@@ -65,7 +68,7 @@ def add_program(
         with HandProcess(at, thinking, session.network.join(), clock, SESSION) as hand:
             while not hand.over and (dies_ns is None or clock.monotonic_ns() < dies_ns):
                 hand.serve()
-                clock.sleep_until(clock.monotonic_ns() + MS_NS)
+                sleep_for_ns(clock, MS_NS)
 
     session.relay.add("hand", run)
 
@@ -81,7 +84,7 @@ def assert_same(log: Log, other: Log) -> None:
 
 @pytest.mark.parametrize("kind", [Circle, Follower])
 def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path) -> None:
-    """In virtual time, live in the process of its site, and live in a process of its own."""
+    """The hand runs in virtual time, live in the process of its site, and live in its own process."""
     alone = make_hand_scenario(kind.__name__, process=True)
     at, session = make_hand_session(alone, tmp_path)
     add_program(session, kind(at.describe()))
@@ -89,9 +92,9 @@ def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path)
     assert_same(log, simulate_scenario(alone))
     (tmp_path / "within").mkdir()
     within = make_hand_scenario(kind.__name__)
-    found = Session.whole(within, tmp_path / "within").run()
-    assert_same(found, simulate_scenario(within))
-    assert_same(log, found)
+    inner_log = Session.whole(within, tmp_path / "within").run()
+    assert_same(inner_log, simulate_scenario(within))
+    assert_same(log, inner_log)
     assert verify(log).passed
 
 
@@ -137,7 +140,7 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
             try:
                 while not hand.over:
                     hand.serve()
-                    clock.sleep_until(clock.monotonic_ns() + MS_NS)
+                    sleep_for_ns(clock, MS_NS)
             except RunFailed as failed:
                 ended.append(str(failed))
 
@@ -172,7 +175,7 @@ def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
             )
             publish(encode(moved))
             publish(b"\x00 nothing")
-            clock.sleep_until(clock.monotonic_ns() + 5 * MS_NS)
+            sleep_for_ns(clock, 5 * MS_NS)
 
     session.relay.add("stranger", meddle)
     assert_same(session.run(), simulate_scenario(scenario))
@@ -193,7 +196,7 @@ def test_announcements_decide_nothing(tmp_path: Path) -> None:
                     HandMessage(site="m2", boot=9, source=at.source, n=0, grip=False, sent_ns=1)
                 )
             )
-            clock.sleep_until(clock.monotonic_ns() + MS_NS)
+            sleep_for_ns(clock, MS_NS)
 
     session.relay.add("here", say)
     assert_same(session.run(), simulate_scenario(scenario))

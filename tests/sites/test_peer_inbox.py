@@ -46,12 +46,13 @@ class Desk:
         links: Sequence[LinkSetup] = SETUP.links,
     ) -> None:
         network = LocalNetwork()
-        receiver, sender = network.join(), network.join()
+        receiver = network.join()
+        sender = network.join()
         self.clock = ManualClock(EPOCH_NS)
         read = make_sample_readers(SETUP)
         rings = [
-            receiver.stamped_inbox(name, self.clock.monotonic_ns, one, capacity)
-            for name, one in zip(PEERS, read, strict=True)
+            receiver.stamped_inbox(name, self.clock.monotonic_ns, reader, capacity)
+            for name, reader in zip(PEERS, read, strict=True)
         ]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()

@@ -12,6 +12,7 @@ from trilat_people.live_page.terminal_watch import SessionWatch
 
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from tests.sites.sessions import reach_session
 from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
@@ -35,7 +36,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     titles: list[str] = []
 
     def stop(bus: Bus, clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 2_500_000_000)
+        sleep_for_ns(clock, 2_500_000_000)
         said.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
@@ -44,7 +45,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
             watch.update()
             shown.append(watch.rows())
             titles.append(watch.title)
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
 
     session.stranger(stop)
     session.stranger(look)
@@ -75,10 +76,10 @@ def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
 
     def order(bus: Bus, clock: RelayClock) -> None:
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
-            clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
+            sleep_for_ns(clock, 1_200_000_000)
             said.extend(
-                (one.accepted, one.text)
-                for one in reach_session(bus, clock).send_order(sites, name)
+                (answer.accepted, answer.text)
+                for answer in reach_session(bus, clock).send_order(sites, name)
             )
 
     raised: list[tuple[str, LifeAlarm]] = []
@@ -87,21 +88,22 @@ def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
-        pages, console = SessionFrames(watch.view), Console(file=screen, width=100)
+        pages = SessionFrames(watch.view)
+        console = Console(file=screen, width=100)
         while not watch.view.ended:
             watch.update()
             frames.extend([frame] if (frame := pages.make_frame()) else [])
             if watch.alarms and watch.alarms != raised[-1:]:
                 raised.extend(watch.alarms)
                 console.print(*frame_alarms(watch.alarms))
-            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+            sleep_for_ns(clock, 50_000_000)
         shown = [render_event(event) for event in watch.view.events.since(0, 400)]
-        told = [
+        answers = [
             re.sub(r"[\d.]+ s$", "", event["text"])
             for event in shown
             if event["kind"] == "change"
         ]
-        assert told == [
+        assert answers == [
             "s was stopped by the operator at ",
             "s was enabled by the operator at ",
         ]
@@ -139,13 +141,13 @@ def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
 
 
 def test_sites_too_far_apart_report_once(tmp_path: Path) -> None:
-    """Their start poses are 0.4 rad apart."""
+    """The start poses are 0.4 rad apart."""
     rule = {**GLIDES, "on_stale.align_limit_rad": 0.05, "duration_s": 3.2}
     log = Session.whole(load_scenario("two_sites", rule), tmp_path).run()
-    told = [event for event in log.events if event.kind == "waiting" and event.member == "s"]
-    assert [event.t_ns // 1_000_000_000 for event in told] == [1, 2, 3]
-    assert told[0].text.startswith("s waits for its peers from t = 1.000 s: ")
-    assert told[0].text.endswith("its peers are farther away than align_limit_rad")
+    events = [event for event in log.events if event.kind == "waiting" and event.member == "s"]
+    assert [event.t_ns // 1_000_000_000 for event in events] == [1, 2, 3]
+    assert events[0].text.startswith("s waits for its peers from t = 1.000 s: ")
+    assert events[0].text.endswith("its peers are farther away than align_limit_rad")
     assert set(log["s"].mode) == {"waiting"}
 
 
@@ -154,11 +156,11 @@ def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
     said: list[str] = []
 
     def order(bus: Bus, clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
+        sleep_for_ns(clock, 1_200_000_000)
         said.extend(
-            one.text
-            for one in reach_session(bus, clock).send_order(["s"], "stop")
-            if not one.accepted
+            answer.text
+            for answer in reach_session(bus, clock).send_order(["s"], "stop")
+            if not answer.accepted
         )
 
     session.stranger(order)
@@ -190,7 +192,7 @@ def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
         watch = SessionWatch(bus, clock, SESSION)
         while clock.monotonic_ns() < 9_000_000_000:
             watch.update()
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
         seen.update(
             {name: site.record.tick for name, site in watch.view.sites.items() if site.record}
         )
@@ -222,14 +224,14 @@ def test_killed_masters_are_replaced_and_return(tmp_path: Path) -> None:
         while not watch.view.ended:
             watch.update()
             raised.update((name, alarm.word) for name, alarm in watch.alarms)
-            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+            sleep_for_ns(clock, 50_000_000)
 
     session.stranger(look)
     log = session.run()
     assert {("m2", "WITHOUT m1"), ("s", "WITHOUT m1")} <= raised
     assert not [name for name, word in raised if word.startswith("WITHOUT") and name == "m1"]
     assert any("s: *** WITHOUT m1" in line for line in session.said)
-    assert [end for _, end in session.told] == ["killed", 0, 0, 0]
+    assert [end for _, end in session.start_ends] == ["killed", 0, 0, 0]
     for name in ("m2", "s"):
         reasons = [int(state.mem[5]) for state in log[name].states]
         assert "hold" not in set(log[name].mode)

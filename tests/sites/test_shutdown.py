@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.net.waiting import sleep_for_ns
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.membership import liveliness_token
@@ -55,7 +56,7 @@ def test_signals_end_waits_without_spoiling_complete_runs(tmp_path: Path) -> Non
     session = make_slow_session(tmp_path, 120.0)
 
     def ask(clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 10 * S)
+        sleep_for_ns(clock, 10 * S)
         for interrupt in session.interrupts.values():
             interrupt.number = 15
 
@@ -72,10 +73,10 @@ def test_interrupted_sites_wait_for_all_recorders(tmp_path: Path) -> None:
 
     def come_late(bus: Bus, clock: RelayClock) -> None:
         bus.announce(liveliness_token(SESSION, topics.RECORDER, 78))
-        clock.sleep_until(clock.monotonic_ns() + S)
+        sleep_for_ns(clock, S)
         for interrupt in session.interrupts.values():
             interrupt.number = 2
-        clock.sleep_until(clock.monotonic_ns() + 3 * S)
+        sleep_for_ns(clock, 3 * S)
         session.left_ns["late"] = clock.monotonic_ns()
         say = bus.publisher(topics.key(SESSION, topics.RECORDER, topics.EVENT))
         for n, name in enumerate(("m", "s")):

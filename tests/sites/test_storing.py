@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.log.disks import SmallDisk, open_file_on
+from tests.net.waiting import sleep_for_ns
 from tests.sites.sessions import pack_computed
 from trilat_net.errors import LogRefused
 from trilat_net.execution.verification import verify
@@ -45,7 +46,7 @@ def test_records_100_ms_before_a_crash_are_kept(tmp_path: Path) -> None:
 
     def look(_: Bus, clock: RelayClock) -> None:
         while not path.exists():
-            clock.sleep_until(clock.monotonic_ns() + 19 * MS)
+            sleep_for_ns(clock, 19 * MS)
             if not active_path(path).exists():
                 continue
             with active_path(path).open("rb") as stream:
@@ -106,13 +107,15 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
         assert [pack_computed(state) for state in log[site].states] == [
             pack_computed(state) for state in whole[site].states
         ]
-    made = 0
+    tick_count = 0
     for name in names:
         part = open_log(tmp_path / name)
-        made += len(part["m"])
+        tick_count += len(part["m"])
         said = part.accounts[f"/trilat/{SESSION}/m/state"]
         # the message that begins the next part has come when this one ends
-        assert any(f"received {known}, missing 0" in said for known in (made, made + 1))
+        assert any(
+            f"received {known}, missing 0" in said for known in (tick_count, tick_count + 1)
+        )
 
 
 def test_excluded_channels_are_neither_stored_nor_missing(tmp_path: Path) -> None:

@@ -37,12 +37,14 @@ class Balance:
 
     V: Array
     taken: Array
-    given: Array
+    supplied: Array
 
     @property
     def residual(self) -> float:
         """Largest error of the balance, as a share of the largest V."""
-        return float(np.abs(self.V - self.V[0] + self.taken - self.given).max() / self.V.max())
+        return float(
+            np.abs(self.V - self.V[0] + self.taken - self.supplied).max() / self.V.max()
+        )
 
 
 def left_null_vector(scenario) -> Array:
@@ -59,10 +61,14 @@ def compute_balance(run: Trajectories, beta: Array) -> Balance:
     names = list(scenario.sites)
     rate_hz = scenario.sites[names[0]].rate_hz
     h = 1.0 / rate_hz
-    V, taken, given = 0.0, 0.0, 0.0
+    V = 0.0
+    taken = 0.0
+    supplied = 0.0
     for weight, name in zip(beta, names, strict=True):
-        site, spec = run.sites[name], scenario.sites[name]
-        theta, control = theta_of(spec.arm), spec.control
+        site = run.sites[name]
+        spec = scenario.sites[name]
+        theta = theta_of(spec.arm)
+        control = spec.control
         Lambda, Kp, Kd = (np.array(getattr(control, gain)) for gain in ("Lambda", "Kp", "Kd"))
         e = site.q - site.q_des
         r = site.qd + Lambda * e
@@ -81,8 +87,8 @@ def compute_balance(run: Trajectories, beta: Array) -> Balance:
             loss += 0.5 * share * (Kd * (site.qd - delayed_speeds) ** 2).sum(1)
         V = V + weight * 0.5 * v
         taken = taken + weight * integrate(loss, h)
-        given = given + weight * integrate((r * -site.tau_x).sum(1), h)
-    return Balance(np.asarray(V), np.asarray(taken), np.asarray(given))
+        supplied = supplied + weight * integrate((r * -site.tau_x).sum(1), h)
+    return Balance(np.asarray(V), np.asarray(taken), np.asarray(supplied))
 
 
 def compute_shipped_balance(

@@ -17,9 +17,7 @@ Overrides = dict[str, Any]
 def measure_run(
     name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]
 ) -> RunMetrics:
-    """Returns a shipped scenario, changed, in virtual time; its windows are (from, to, site),
-    "" for all sites.
-    """
+    """Returns the metrics of a shipped scenario; windows are (from s, to s, site), with "" for all sites."""
     windows_of_run = [
         {
             "from_s": from_s,

@@ -35,7 +35,8 @@ def compute_residual(system: LinearLoop, s: complex) -> float:
     size = abs(s) + np.linalg.norm(system.A)
     for delayed in system.delayed:
         late = delayed.A * np.exp(-s * delayed.delay_s)
-        delta, size = delta - late, size + np.linalg.norm(late)
+        delta = delta - late
+        size = size + np.linalg.norm(late)
     return float(np.linalg.svd(delta, compute_uv=False)[-1] / size)
 
 

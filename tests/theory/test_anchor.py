@@ -88,7 +88,8 @@ def test_hands_see_115_nm_per_rad() -> None:
     pushed = sample_records(
         load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,)
     )
-    pushed_angles, from_where = read_last_angles(pushed), read_last_angles(rest)
+    pushed_angles = read_last_angles(pushed)
+    from_where = read_last_angles(rest)
     # equal torques act on q1 + q2 alone
     assert pushed_angles[0] == pytest.approx(from_where[0], abs=2e-3)
     # no error: nothing is felt
@@ -116,7 +117,7 @@ HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
 
 @pytest.mark.long
 def test_hands_feel_loads_by_ratios_of_beta() -> None:
-    """Of 5 N m on the slave: 4.79 at the expert, 16.4 at the trainee, 5.00 with all shares 1/2; 2 %."""
+    """A load of 5 N m on the slave is felt as 4.79 at the expert, 16.4 at the trainee, and 5.00 with all shares 1/2."""
     b1, b2, bs = left_null_vector(load_scenario("force_sharing"))
     windows = measure_run("force_sharing", {}, *HELD)
     felt = [-find_value(windows, "push1_mean_nm", n) for n in range(len(HELD))]

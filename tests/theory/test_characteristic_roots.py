@@ -21,7 +21,8 @@ from trilat_net.analysis.theory.characteristic_roots import (
 @pytest.mark.parametrize("E", [None, np.array([1.0, 0.0])])
 def test_guesses_beyond_exps_range_are_dropped(E: np.ndarray | None) -> None:
     """exp(-s T) of a root far to the left is no number; the root near -1 /s is found all the same."""
-    A, late = np.array([[-1.0, 0.0], [1.0, -2.0]]), np.array([[[0.0, 0.0], [1e-3, 0.0]]])
+    A = np.array([[-1.0, 0.0], [1.0, -2.0]])
+    late = np.array([[[0.0, 0.0], [1e-3, 0.0]]])
     pencil = characteristic_roots.Pencil(A, np.array([0.5]), late, E)
     with np.errstate(all="ignore"):
         roots, dropped = characteristic_roots.refine_roots(

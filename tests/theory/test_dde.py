@@ -34,8 +34,8 @@ def test_reference_solution_has_digits_to_spare() -> None:
     [
         ("paper", 1e-5),
         *(
-            pytest.param(*one, marks=pytest.mark.long)
-            for one in (("paper_rods", 1e-5), ("free", 1.1e-5))
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (("paper_rods", 1e-5), ("free", 1.1e-5))
         ),
     ],
 )

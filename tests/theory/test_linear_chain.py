@@ -100,7 +100,8 @@ def make_six_joint_loop(law: str, off: Array | None = None, **overrides: Any) ->
 
 def trace_angles(scenario: Scenario, ticks: int) -> Array:
     """Returns the angles of both sites at each tick, shape (ticks, 12)."""
-    run, rate_hz = FusedRun(scenario), scenario.sites["m"].rate_hz
+    run = FusedRun(scenario)
+    rate_hz = scenario.sites["m"].rate_hz
     angles = []
     for k in range(1, ticks + 1):
         run.advance_to(k / rate_hz)
@@ -111,12 +112,20 @@ def trace_angles(scenario: Scenario, ticks: int) -> Array:
 def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
     """Returns accelerations and rates of the estimate as a tick computes them, by the compiled leaves."""
     assert site.chain is not None
-    gains, gravity, q, qd = site.gains, np.array(site.chain.gravity_m_s2), x[at.q], x[at.qd]
+    gains = site.gains
+    gravity = np.array(site.chain.gravity_m_s2)
+    q = x[at.q]
+    qd = x[at.qd]
     rows = build_chain(site.chain.joints, MAX_JOINTS)
     place_joints(rows, q)
-    e, ed = q - x[at.q_des], qd - x[at.qd_des]
-    v, a = -np.asarray(gains.Lambda) * e, -np.asarray(gains.Lambda) * ed
-    tau, gradient, qdd, acted = np.zeros(6), np.zeros(60), np.zeros(6), np.zeros((2, 6))
+    e = q - x[at.q_des]
+    ed = qd - x[at.qd_des]
+    v = -np.asarray(gains.Lambda) * e
+    a = -np.asarray(gains.Lambda) * ed
+    tau = np.zeros(6)
+    gradient = np.zeros(60)
+    qdd = np.zeros(6)
+    acted = np.zeros((2, 6))
     propagate_motion(rows, gravity, qd, v, a)
     parameter_gradient(rows, gradient)
     inverse_dynamics(rows, x[at.estimate], v, a, tau)
@@ -132,7 +141,7 @@ def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
 
 @pytest.mark.long
 def test_rates_and_derivatives_equal_compiled_leaves() -> None:
-    """With hands on the joints and on the end effector, and walls of any direction, one of them touched."""
+    """Hands act on the joints and on the end effector, and one of the walls of any direction is touched."""
     rng = np.random.default_rng(14)
     normal = rng.normal(size=3)
     normal /= np.linalg.norm(normal)
@@ -146,17 +155,14 @@ def test_rates_and_derivatives_equal_compiled_leaves() -> None:
         TorqueSource(TorqueKind.WALL, b=tuple(normal), **wall),
         TorqueSource(TorqueKind.WALL, b=tuple(-normal), **wall, sampled=True),
     )
-    site, at = (
-        make_six_joint_loop("adaptive").scenario.setup("m")._replace(actors=actors),
-        ArgumentLayout(6, 60),
-    )
+    site = make_six_joint_loop("adaptive").scenario.setup("m")._replace(actors=actors)
+    at = ArgumentLayout(6, 60)
     for _ in range(3):
         x = rng.uniform(-1.0, 1.0, at.arguments)
-        rates, exact = evaluate_site_rates(site, x), differentiate_site_rates(site, x)
-        derivatives, wanted = (
-            np.concatenate([rates.qdd, rates.estimate]),
-            by_leaves(site, x, at),
-        )
+        rates = evaluate_site_rates(site, x)
+        exact = differentiate_site_rates(site, x)
+        derivatives = np.concatenate([rates.qdd, rates.estimate])
+        wanted = by_leaves(site, x, at)
         assert np.abs(derivatives - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
         jacobian = np.vstack([exact.qdd, exact.estimate])
         for k in range(at.arguments):
@@ -170,7 +176,8 @@ def test_rates_and_derivatives_equal_compiled_leaves() -> None:
 def test_learnt_gravity_stands_for_all_estimates() -> None:
     """Five combinations of sixty: SciPy finds the same roots of both loops, and ports answer alike."""
     case = make_six_joint_loop("adaptive")
-    whole, short = case.loop(all_estimates=True), case.loop()
+    whole = case.loop(all_estimates=True)
+    short = case.loop()
     assert [name for name in short.names if "gravity" in name] == [
         f"{site}.gravity{joint}" for site in "ms" for joint in LOADED
     ]
@@ -202,8 +209,8 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     sampled = compute_sampled_spectrum(case.conditions, case.rest, 3)
     assert sampled is not None
     assert (sampled.zeros, sampled.drifting) == (spectrum.zeros, 0)
-    for one, other in zip(sampled.roots, spectrum.roots, strict=True):
-        assert abs(one.s - other.s) <= 2e-3 * abs(other.s)
+    for sampled_root, other in zip(sampled.roots, spectrum.roots, strict=True):
+        assert abs(sampled_root.s - other.s) <= 2e-3 * abs(other.s)
 
 
 OFF = np.array([[1.0, -0.7, 0.5, 0.8, -0.6, 0.9], [-0.8, 0.6, -0.9, 0.3, 0.7, -0.4]])
@@ -214,7 +221,8 @@ def test_a_run_follows_the_delay_equation(law: str) -> None:
     """SciPy's DOP853 by the method of steps, from the same deviation; a run of 1 kHz."""
     small = 1e-6
     case = make_six_joint_loop(law, small * OFF)
-    loop, delay_s = case.loop(), 0.05
+    loop = case.loop()
+    delay_s = 0.05
     ((at_s, A_d, _),) = loop.delayed
     assert at_s == delay_s
     start = np.zeros(len(loop.names))
@@ -265,14 +273,18 @@ def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
 
 def test_joints_answer_sinusoids_by_their_admittance() -> None:
     """A torque on joint 3 of m in a run of P+d: the motion of all twelve joints."""
-    w_rad_s, amplitude_nm, rate_hz, settled_s = 2.0 * np.pi, 0.05, 500, 14.0
+    w_rad_s = 2.0 * np.pi
+    amplitude_nm = 0.05
+    rate_hz = 500
+    settled_s = 14.0
     case = make_six_joint_loop("p_d", rate_hz=rate_hz)
     Y = build_admittance(linearise_teleoperator(case.conditions, case.rest))(
         np.array([w_rad_s])
     )[0, :, 2]
     t_s = np.arange(0.0, 21.0, 0.002)
     points = np.zeros((len(t_s), 7))
-    points[:, 0], points[:, 3] = t_s, amplitude_nm * np.sin(w_rad_s * t_s)
+    points[:, 0] = t_s
+    points[:, 3] = amplitude_nm * np.sin(w_rad_s * t_s)
     hands = [{"kind": "recorded", "points": points.tolist()}]
     motion_of_joints = trace_angles(
         make_six_joint_loop("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario,
@@ -287,7 +299,7 @@ def test_joints_answer_sinusoids_by_their_admittance() -> None:
 
 
 def test_six_joint_laws_are_passive_in_r() -> None:
-    """Also with learnt gravity, which is not passive in qd at the joints that it loads."""
+    """This holds also with learnt gravity, which is not passive in qd at the joints that gravity loads."""
     case = make_six_joint_loop("adaptive")
     ports = analyse_ports(case.scenario, case.rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
@@ -330,7 +342,7 @@ def test_the_p_d_bound_holds_for_chains() -> None:
 
 @pytest.mark.long
 def test_diverging_runs_keep_their_predicted_rest() -> None:
-    """Of alike arms with alike gains the rest is near the mean of the start poses."""
+    """For equal arms with equal gains the rest is near the mean of the start poses."""
     case = make_six_joint_loop("adaptive", 0.3 * OFF)
     equilibrium = predict_equilibrium(case.scenario)
     assert equilibrium.residual <= 1e-10

@@ -209,7 +209,7 @@ def test_the_scheme_decides_the_loop() -> None:
         load_scenario("free", {**slow, "scheme": scheme})
         for scheme in ("second_order", "digital")
     ]
-    columns = [GrowthColumn.compute([one], "link.delay_ms", (0.0,)) for one in schemes]
+    columns = [GrowthColumn.compute([scheme], "link.delay_ms", (0.0,)) for scheme in schemes]
     (continuous,), (digital,) = (column.growth_per_s for column in columns)
     assert continuous < 0.0 < digital
     assert columns[0].remarks == columns[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]

@@ -121,7 +121,8 @@ def test_a_run_decays_at_its_rightmost_root() -> None:
     root = analyse_linear_loop(scenario, pose=(q1_rad, q2_rad)).decisive.rightmost
     assert root is not None
     turns = np.flatnonzero(np.diff(np.sign(run.qd[late, 0])))
-    t_s, e = run.t_s[late], np.abs((run.q - run.q_des)[late, 0])
+    t_s = run.t_s[late]
+    e = np.abs((run.q - run.q_des)[late, 0])
     half_s = np.diff(t_s[turns]).mean()
     peaks = [e[a:b].max() for a, b in itertools.pairwise(turns)]
     slope, _ = np.polyfit(half_s * np.arange(len(peaks)), np.log(peaks), 1)

@@ -97,7 +97,7 @@ def make_cartesian_scenario(law: str, space: str) -> Scenario:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
-    """Of arms that slide along x, y and z the Jacobian is 1: loop, roots, sampled roots, and ports."""
+    """For arms that slide along x, y and z the Jacobian is 1, so that loop, roots, sampled roots and ports are equal."""
     loops = []
     for space in ("joints", "position"):
         scenario = make_cartesian_scenario(law, space)
@@ -110,13 +110,13 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
             np.array([0.1, 3.0, 40.0])
         )
         loops.append((rest.q, loop, spectrum, sampled, Y))
-    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = loops
+    (q, loop, in_joints, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = loops
     assert q_task == pytest.approx(q, abs=1e-12)
     assert loop_task.names == loop.names
-    assert (other.zeros, other.drifting) == (one.zeros, one.drifting)
+    assert (other.zeros, other.drifting) == (in_joints.zeros, in_joints.drifting)
     assert sampled is not None
     assert sampled_task is not None
-    for a, b in ((one, other), (sampled, sampled_task)):
+    for a, b in ((in_joints, other), (sampled, sampled_task)):
         assert len(a.roots) == len(b.roots)
         for first, second in zip(a.roots, b.roots, strict=True):
             assert abs(first.s - second.s) <= 1e-9 * (1.0 + abs(first.s))
@@ -147,7 +147,8 @@ def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> 
 
 def trace_deviations(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
     """Returns deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
-    run, rows = FusedRun(scenario), []
+    run = FusedRun(scenario)
+    rows = []
     for k in range(1, steps + 1):
         run.advance_to(k * step_s)
         rows.append((run.q - rest.q).ravel())
@@ -155,14 +156,16 @@ def trace_deviations(scenario: Scenario, rest: Equilibrium, step_s: float, steps
     return motion[:, motion.any(axis=0)]
 
 
-def realise(outputs: Array, step_s: float, order: int) -> Array:
+def realise_system(outputs: Array, step_s: float, order: int) -> Array:
     """Returns the exponents in a free motion of many signals: Juang and Pappa's eigensystem
     realisation (1985).
     """
     half = len(outputs) // 2
     hankel = np.stack([np.concatenate(outputs[k : k + half]) for k in range(half)], axis=1)
     U, sizes, V = np.linalg.svd(hankel[:, :-1], full_matrices=False)
-    U, sizes, V = U[:, :order], np.sqrt(sizes[:order]), V[:order]
+    U = U[:, :order]
+    sizes = np.sqrt(sizes[:order])
+    V = V[:order]
     step = (U / sizes).T @ hankel[:, 1:] @ (V / sizes[:, np.newaxis]).T
     return np.log(np.linalg.eigvals(step).astype(complex)) / step_s
 
@@ -190,7 +193,9 @@ cases = pytest.mark.parametrize(
 @cases
 def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     """The companion matrix advances the deviation; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
-    (scenario, rest), rng, size = make_settled_scenario(name), np.random.default_rng(1), 1e-6
+    scenario, rest = make_settled_scenario(name)
+    rng = np.random.default_rng(1)
+    size = 1e-6
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
     angles = [
         f"{site}.q{n + 1}"
@@ -232,7 +237,7 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
         vector *= 1e-5 / vector[np.abs(vector).argmax()]
         off = dict(zip(names, vector.real.tolist(), strict=True))
         step_s = 0.3 / abs(s)
-        measured = realise(
+        measured = realise_system(
             trace_deviations(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16
         )
         assert np.abs(measured - s).min() <= 0.01 * abs(s), (s, measured)
@@ -240,7 +245,7 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
 
 @cases
 def test_the_law_is_passive_at_end_effectors(name: str) -> None:
-    """Of places, also with axes left open and with redundant joints; of poses there is no proof."""
+    """The proof holds for places, also with open axes and redundant joints; for poses there is none."""
     scenario, rest = make_settled_scenario(name)
     ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true

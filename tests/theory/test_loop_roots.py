@@ -176,7 +176,7 @@ SAME = {"link": "m->s", "to": {"model": "constant", "delay_ms": 200.0}}
 
 
 def test_command_that_changes_nothing_changes_nothing() -> None:
-    """From 200 ms to 200 ms, and the same factors again."""
+    """The command changes the delay from 200 ms to 200 ms, and sets the same factors again."""
     scenario = make_pair_scenario(**{"link.delay_ms": 200.0, "duration_s": 14.0})
     same_shares = {"dominance": "s", "to": dict(scenario.dominance["s"]), "ramp_s": 0.0}
     log = make_log_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))

@@ -163,7 +163,7 @@ REFLECTING = Network(
 )
 
 
-def same(a: LinearLoop, b: LinearLoop) -> None:
+def assert_same(a: LinearLoop, b: LinearLoop) -> None:
     np.testing.assert_allclose(build_admittance(a)(W), build_admittance(b)(W), rtol=1e-9)
 
 
@@ -171,7 +171,7 @@ def same(a: LinearLoop, b: LinearLoop) -> None:
 def test_a_load_is_spring_and_damper(K: float, B: float) -> None:
     network = make_pair()
     tied = network._replace(k=(0.0, K), d=(network.d[0], network.d[1] + B))
-    same(hold_by_spring(network.loop, "b", K, B), tied.loop)
+    assert_same(hold_by_spring(network.loop, "b", K, B), tied.loop)
 
 
 @given(K=POSITIVE, B=POSITIVE)
@@ -186,7 +186,7 @@ def test_a_loads_impedance_adds_at_its_port(K: float, B: float) -> None:
 
 @pytest.mark.parametrize("site", ["a", "b", "c"])
 def test_a_clamp_leaves_the_rest_of_the_impedance(site: str) -> None:
-    """Also if the clamp's own torque is reflected, and comes back by two delays."""
+    """This holds also if the clamp's own torque is reflected, and comes back after two delays."""
     index = "abc".index(site)
     keep = [n for n in range(3) if n != index]
     clamped = clamp_site(REFLECTING.loop, site)

@@ -98,7 +98,9 @@ def test_the_sweep_over_stiffness_is_monotone() -> None:
         assert stable == [K <= 15 for K in range(1, 41)]
 
 
-H_S, DELAY_TICKS, FORCE_N = 1e-3, 5, 20.0
+H_S = 1e-3
+DELAY_TICKS = 5
+FORCE_N = 20.0
 STIFF = np.array([60.0, 60.0, 60.0, 12.0, 12.0, 12.0])
 DAMPING = np.array([6.0, 6.0, 6.0, 0.7, 0.7, 0.7])
 HAND_NM_RAD = 40.0
@@ -152,11 +154,13 @@ def wall_stiffness(state: ChainState, K: float) -> Array:
     The column of J of joint i turns with joint j: by w_j x J_i where j comes first, else by w_i
     x J_j.
     """
-    linear, angular = state.jacobian[:3], state.jacobian[3:]
+    linear = state.jacobian[:3]
+    angular = state.jacobian[3:]
     turning = np.empty((6, 6))
     for i in range(6):
         for j in range(6):
-            first, last = min(i, j), max(i, j)
+            first = min(i, j)
+            last = max(i, j)
             turning[i, j] = NORMAL @ np.cross(angular[:, first], linear[:, last])
     along = linear.T @ NORMAL
     return K * np.outer(along, along) - FORCE_N * turning
@@ -167,12 +171,13 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
     hand acts at any time, both laws and the wall are held, and each arm uses the other's pose
     of `DELAY_TICKS` ago.
     """
-    none, one = np.zeros((6, 6)), np.eye(6)
+    none = np.zeros((6, 6))
+    identity = np.eye(6)
     inverse = np.linalg.inv(state.inertia + np.diag(DRIVES))
     step: dict[str, tuple[Array, Array]] = {}
     for site, hand in (("m", 0.0), ("s", HAND_NM_RAD)):
         rates = np.block(
-            [[none, one, none], [-hand * inverse, none, inverse], [none, none, none]]
+            [[none, identity, none], [-hand * inverse, none, inverse], [none, none, none]]
         )
         exponential = expm(H_S * rates)
         step[site] = exponential[:12, :12], exponential[:12, 12:]
@@ -186,16 +191,14 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
         A[own_rows, own_rows] = free + pushed @ (law - np.hstack([wall, none]))
         peer = oldest + 6 * (1 - n)
         A[own_rows, peer : peer + 6] = pushed @ np.diag(STIFF)
-        A[24 + 6 * n : 30 + 6 * n, 12 * n : 12 * n + 6] = one
+        A[24 + 6 * n : 30 + 6 * n, 12 * n : 12 * n + 6] = identity
     A[36:, 24:-12] = np.eye(12 * (DELAY_TICKS - 1))
     return float(np.log(np.abs(np.linalg.eigvals(A)).max()) / H_S)
 
 
 @pytest.mark.parametrize("n", range(3))
 def test_six_joints_in_contact_grow_like_pinocchios_arm(n: int) -> None:
-    """At walls in space, soft and hard; of several states the deepest counts, and without
-    contact nothing does.
-    """
+    """The walls in space are soft or hard; the deepest of several states counts, and without contact none does."""
     state = chain_references()["arm6"].states[n]
     signs = set()
     for K in (1e4, 1e6):

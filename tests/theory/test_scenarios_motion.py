@@ -48,8 +48,8 @@ SETTLED_S = {
 @pytest.mark.parametrize(
     ("delay_ms", "settled_s"),
     [
-        pytest.param(*one, marks=pytest.mark.long if n % 3 else ())
-        for n, one in enumerate(SETTLED_S.items())
+        pytest.param(*case, marks=pytest.mark.long if n % 3 else ())
+        for n, case in enumerate(SETTLED_S.items())
     ],
 )
 def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
@@ -195,7 +195,7 @@ def test_free_motion_is_calm_at_200_ms() -> None:
     ids=str,
 )
 def test_position_laws_pass_the_same_wall(law: dict[str, object]) -> None:
-    """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
+    """With one law of positions at both sites in place of force reflection, the contact comes to rest."""
     windows = measure_run(
         "contact",
         {"control": law, "sites.m.control": {}, "sites.s.control": {}, "duration_s": 25.0},

@@ -33,7 +33,8 @@ def by_leaves(site_setup: SiteSetup, x: Array) -> dict[str, Array]:
     forward dynamics.
     """
     gains = site_setup.gains
-    q, qd = x[AT.q], x[AT.qd]
+    q = x[AT.q]
+    qd = x[AT.qd]
     Lambda = np.broadcast_to(gains.Lambda, 2)
     e, ed, r = control.control_errors(q, qd, x[AT.q_des], x[AT.qd_des], Lambda)
     Y = regressor(site_setup.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
@@ -75,7 +76,8 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     random_site = draw_site(rng, law, draw_actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
-    site_rates, wanted = evaluate_site_rates(random_site, x), by_leaves(random_site, x)
+    site_rates = evaluate_site_rates(random_site, x)
+    wanted = by_leaves(random_site, x)
     for name, value in wanted.items():
         scale = 1.0 + max(
             np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()

@@ -42,7 +42,8 @@ def linearise_at_pose(
     name: str, overrides: Mapping[str, Any] | None = None
 ) -> tuple[Scenario, OperatingConditions, Equilibrium, LinearLoop]:
     scenario = load_scenario(name, dict(overrides or {}))
-    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
+    now = OperatingConditions.derive(scenario)
+    rest = find_equilibrium(scenario, POSE)
     return scenario, now, rest, linearise_teleoperator(now, rest)
 
 
@@ -80,10 +81,8 @@ def test_hands_at_ports_restore_their_loop() -> None:
     )
     rest = find_equilibrium(scenario)
     bare = linearise_teleoperator(OperatingConditions.derive(scenario), rest)
-    again, whole = (
-        hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7),
-        linearise_loop(OperatingConditions.derive(scenario), rest),
-    )
+    again = hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7)
+    whole = linearise_loop(OperatingConditions.derive(scenario), rest)
     np.testing.assert_allclose(again.A, whole.A, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(again.B, whole.B)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
@@ -147,7 +146,7 @@ def test_laws_without_r_lack_the_proofs_output() -> None:
 
 
 def test_r_is_read_as_qd_plus_lambda_e() -> None:
-    """At a frequency where the delay turns by a half: r = qd + Lambda (q + mean of the peers' q)."""
+    """At a frequency where the delay turns by a half, r = qd + Lambda (q + mean of the peers' q)."""
     _, now, _, loop = linearise_at_pose("free")
     s = to_imaginary_axis(np.array([np.pi / 0.2]))
     output = build_proof_output(now, loop)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.core import physical_arms as physics
-from tests.core.chain_references import chain_references
+from tests.core.chain_references import chain_references, find_largest_difference
 from tests.core.physical_arms import angles, links, speeds
 from tests.theory.loops import Array
 from trilat_net.analysis.arm_rows import PlacedArm
@@ -94,10 +94,6 @@ def read_parameters(name: str) -> Array:
     return np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints])
 
 
-def find_largest_difference(got: Array, wanted: Array) -> float:
-    return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
-
-
 @each
 def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
     theta = read_parameters(name)
@@ -122,22 +118,20 @@ def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
 def test_columns_are_separate_chains() -> None:
     """Many states in one call equal as many calls, and a complex step is the limit of differences."""
     first, second, _ = REFERENCES["arm7"].states
-    made, theta = (
-        make_chain_setup("arm7", first.gravity, **DRIVE, **STOPS),
-        read_parameters("arm7"),
-    )
+    setup = make_chain_setup("arm7", first.gravity, **DRIVE, **STOPS)
+    theta = read_parameters("arm7")
 
     def acceleration(q: Array, qd: Array, tau: Array, theta: Array) -> Array:
-        return PlacedChain(made, q).joint_acceleration(theta, qd, tau)
+        return PlacedChain(setup, q).joint_acceleration(theta, qd, tau)
 
     both = [np.stack(pair, axis=1) for pair in ((first.q, second.q), (first.qd, second.qd))]
     accelerations = acceleration(
         *both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1)
     )
-    for n, one in enumerate((first, second)):
+    for n, state in enumerate((first, second)):
         assert (
             find_largest_difference(
-                accelerations[:, n], acceleration(one.q, one.qd, one.tau, theta)
+                accelerations[:, n], acceleration(state.q, state.qd, state.tau, theta)
             )
             <= 1e-12
         )
@@ -153,25 +147,26 @@ def test_columns_are_separate_chains() -> None:
 @pytest.mark.parametrize("name", ["random3", "arm7"])
 def test_drives_and_stops_equal_compiled_leaves(name: str) -> None:
     for state in REFERENCES[name].states:
-        made, theta = (
-            make_chain_setup(name, state.gravity, **DRIVE, **STOPS),
-            read_parameters(name),
-        )
-        rows, qdd = build_chain(made.joints, 12), np.zeros(len(state.q))
+        setup = make_chain_setup(name, state.gravity, **DRIVE, **STOPS)
+        theta = read_parameters(name)
+        rows = build_chain(setup.joints, 12)
+        qdd = np.zeros(len(state.q))
         place_joints(rows, state.q)
         find_acceleration(rows, theta, state.gravity, state.q, state.qd, state.tau, qdd)
-        acceleration = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
+        acceleration = PlacedChain(setup, state.q).joint_acceleration(
+            theta, state.qd, state.tau
+        )
         assert find_largest_difference(acceleration, qdd) <= 1e-11
 
 
 def test_planar_arms_are_two_joint_chains() -> None:
     """Rods of different lengths, hung on z axes in the x-y plane."""
-    (l1, m1), (l2, m2), g = (0.7, 1.3), (1.1, 0.8), 9.81
-    outer, axis, upright = (
-        m2 * l2 * l2 / 3.0,
-        (0.0, 0.0, 1.0),
-        tuple(map(tuple, np.eye(3).tolist())),
-    )
+    l1, m1 = 0.7, 1.3
+    l2, m2 = 1.1, 0.8
+    g = 9.81
+    outer = m2 * l2 * l2 / 3.0
+    axis = (0.0, 0.0, 1.0)
+    upright = tuple(map(tuple, np.eye(3).tolist()))
     inner = m1 * l1 * l1 / 3.0 + m2 * l1 * l1 + outer
     theta = np.array([inner, m2 * l1 * l2 / 2.0, outer, m1 * l1 / 2.0 + m2 * l1, m2 * l2 / 2.0])
     bodies = [

@@ -13,8 +13,13 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.analysis.builders import JITTER, LYAPUNOV, find_relative_residual, make_run
-from tests.analysis.rough_arms import rough_log
+from tests.analysis.builders import (
+    JITTER,
+    LYAPUNOV,
+    find_relative_residual,
+    make_rough_log,
+    make_run,
+)
 from tests.core.guarded_runs import adaptive_text, make_stopped_log
 from tests.execution.builders import make_shipped_trajectories
 from tests.scenario.builders import planar_task_text, six_joint_text
@@ -57,7 +62,7 @@ def test_balance_closes_to_2e_5_with_second_order(name: str) -> None:
 
 
 def test_balance_closes_until_both_hands_let_go() -> None:
-    """At a tenth of the rate a hundred times the error is allowed."""
+    """At a tenth of the rate the permitted error is a hundred times larger."""
     assert of_largest_v(make_run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
 
 
@@ -79,7 +84,7 @@ def test_jitter_closes_to_1e_4_with_booked_jumps() -> None:
 
 
 def test_jitter_is_of_order_one_at_least() -> None:
-    """Over some seeds together: the jumps of a run depend on its draws, and errors cancel to order 1.5."""
+    """The order is measured over several seeds, because the jumps of a run depend on its draws."""
     seeds = [{**JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
     orders = [measure_order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
@@ -175,10 +180,8 @@ def test_beta_of_ones_is_detected_and_named() -> None:
 
 def test_v_rises_with_the_papers_weights_only() -> None:
     books = make_run("free", LYAPUNOV).energies
-    ones, right = (
-        compute_energy_balance(books, paper_weights=True),
-        compute_energy_balance(books),
-    )
+    ones = compute_energy_balance(books, paper_weights=True)
+    right = compute_energy_balance(books)
     assert ones.V[0] == pytest.approx(32.8, abs=0.1)
     rise, kept = (float((b.V - np.minimum.accumulate(b.V)).max()) for b in (ones, right))
     assert rise == pytest.approx(12.3, abs=0.5)
@@ -192,10 +195,8 @@ def test_balance_equals_an_independent_book(name: str) -> None:
     """
     overrides = {"duration_s": 2.5, "rate_hz": 500}
     run_of_program = make_shipped_trajectories(name, overrides)
-    theirs, ours = (
-        balance_by_hand(run_of_program, left_null_vector(run_of_program.scenario) * 3),
-        make_run(name, overrides).balance,
-    )
+    theirs = balance_by_hand(run_of_program, left_null_vector(run_of_program.scenario) * 3)
+    ours = make_run(name, overrides).balance
     close = {"abs": 1e-12 * float(theirs.V.max())}
     assert pytest.approx(theirs.V, **close) == ours.V
     assert sum(ours.dissipation.values()) == pytest.approx(theirs.taken, **close)
@@ -242,7 +243,9 @@ def _delayed(exact: DelayEquations, times: np.ndarray) -> np.ndarray:
 def _exact_v(exact: DelayEquations, t: float) -> float:
     at = np.array([t])
     now = exact.past(t) if t else exact.past(-1.0)
-    q, qd, estimate = now[:, :2], now[:, 2:4], now[:, 4:]
+    q = now[:, :2]
+    qd = now[:, 2:4]
+    estimate = now[:, 4:]
     e = q - exact.alpha @ _delayed(exact, at)[:, 0, :2]
     r = qd + exact.Lambda * e
     v = np.einsum("ki,kij,kj->", r, inertia(exact.theta, q), r)
@@ -259,7 +262,8 @@ def _exact_v(exact: DelayEquations, t: float) -> float:
 
 def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
     def powers(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        now, then = np.stack([exact.past(s) for s in times], axis=1), _delayed(exact, times)
+        now = np.stack([exact.past(s) for s in times], axis=1)
+        then = _delayed(exact, times)
         qd = now[..., 2:4]
         e = now[..., :2] - np.einsum("ij,jtn->itn", exact.alpha, then[..., :2])
         r = qd + exact.Lambda * e
@@ -301,7 +305,8 @@ def find_unexplained_share(balance: EnergyBalance) -> float:
 def check_six_joints(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
-    certificate, metrics = certify(log), compute_log_metrics(log)
+    certificate = certify(log)
+    metrics = compute_log_metrics(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None
     assert find_unexplained_share(certificate.balance) <= BAR
@@ -350,7 +355,7 @@ def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
 
 
 def test_premises_name_joints_at_limits_and_at_stops() -> None:
-    certificate = certify(rough_log())
+    certificate = certify(make_rough_log())
     premises = {premise.name: premise for premise in certificate.premises}
     assert (
         premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
@@ -365,7 +370,7 @@ def test_premises_name_joints_at_limits_and_at_stops() -> None:
 
 def test_every_term_of_a_rough_arm_is_needed() -> None:
     """Without its friction, its stops or its wall the energy of a site does not add up."""
-    energies = compute_site_energies(rough_log())
+    energies = compute_site_energies(make_rough_log())
     whole = compute_energy_balance(energies)
     assert np.abs(whole.unexplained).max() <= 2e-4 * whole.V.max()
     assert {"stops", "hands", "walls"} == set(whole.external)
@@ -380,7 +385,7 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
 
 
 def test_friction_and_stops_stand_in_arm_energies() -> None:
-    metrics = compute_log_metrics(rough_log())
+    metrics = compute_log_metrics(make_rough_log())
     for site in metrics.sites.values():
         assert site["friction_j"].value > 1.0
         assert site["unaccounted_j"].value <= 0.02

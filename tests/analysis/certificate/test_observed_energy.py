@@ -31,7 +31,11 @@ from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.figures.registry import figure
 from trilat_net.scenario import load_scenario
 
-B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0
+B = 10.0
+DELAY_S = 0.05
+TO = 0.3
+HAND = 50.0
+WALL = 1000.0
 PAIR = f"""
 name = "line"
 scheme = "digital"
@@ -94,7 +98,7 @@ def test_waves_held_over_an_outage_add_energy() -> None:
     log = simulate_clamped_pair.__wrapped__(**outage, duration_s=3.2)
     certificate = certify(log, own_laws=True)
     assert certificate.observed.finding is ObservedFinding.NEGATIVE
-    lowest = min(certificate.observed.least, key=lambda one: one.amount_j)
+    lowest = min(certificate.observed.least, key=lambda energy: energy.amount_j)
     assert lowest.name == "line m->s"
     last = round(1000 * lowest.at_s) + 1
     used = log["s"].used["m"][:last]
@@ -198,7 +202,7 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
 
 @pytest.mark.long
 def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
-    """As published: the follower's damper uses a velocity with which the follower is not moved."""
+    """As published, the follower's damper uses a velocity that is not the follower's own."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(make_energy_pair(law, clamped=False, duration_s=4.0))
     energies = ObservedEnergy.of_log(log)

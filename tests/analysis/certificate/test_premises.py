@@ -227,7 +227,7 @@ def find_wall_premise(log: Log) -> Premise | None:
     return next((premise for premise in premises if premise.name == "walls"), None)
 
 
-def damper(b: float, **more: object) -> list[dict[str, object]]:
+def make_damped_wall(b: float, **more: object) -> list[dict[str, object]]:
     """Returns the wall of `windup` with a damper of the arm."""
     wall = load_scenario("windup").sites["s"].environment[0]
     damper_keys = {
@@ -243,7 +243,8 @@ def damper(b: float, **more: object) -> list[dict[str, object]]:
 
 def test_sampled_walls_give_half_k_dx_squared() -> None:
     log = simulate_windup()
-    wall, s = log.scenario.sites["s"].environment[0], log["s"]
+    wall = log.scenario.sites["s"].environment[0]
+    s = log["s"]
     x = np.cos(s.q[:, 0]) + np.cos(s.q.sum(axis=1))
     depth = np.maximum(x - wall.point_m[0], 0.0)
     inside = (depth[:-1] > 0.0) & (depth[1:] > 0.0)
@@ -270,7 +271,9 @@ def test_the_sampled_wall_fails_its_premise_by_name() -> None:
 
 @pytest.mark.parametrize(("b", "holds"), [(1.0, False), (40.0, True)])
 def test_a_damper_of_the_arm_dissipates_wall_energy(b: float, *, holds: bool) -> None:
-    wall = find_wall_premise(simulate_windup(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
+    wall = find_wall_premise(
+        simulate_windup(**{SITE: make_damped_wall(b), f"{SITE}.0.sampled": True})
+    )
     assert wall is not None
     assert wall.holds is holds
 
@@ -278,7 +281,7 @@ def test_a_damper_of_the_arm_dissipates_wall_energy(b: float, *, holds: bool) ->
 def test_sampled_or_missing_dampers_dissipate_nothing() -> None:
     for more in ({"sampled": True}, {"end_s": 1.0}):
         wall = find_wall_premise(
-            simulate_windup(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True})
+            simulate_windup(**{SITE: make_damped_wall(40.0, **more), f"{SITE}.0.sampled": True})
         )
         assert wall is not None
         assert wall.holds is False
@@ -314,12 +317,14 @@ def test_damping_by_the_sampled_speed_gives_energy() -> None:
 
     For motions faster than half the tick rate there is no bound.
     """
-    ticks, rng = 200, np.random.default_rng(5)
+    ticks = 200
+    rng = np.random.default_rng(5)
     t = np.arange(ticks * 400) / 400.0
     square = np.where(t % 2.0 < 1.0, 1.0, -1.0)  # its speed changes sides at each tick
     assert most_given(square, ticks, 2.0, 1.0, differenced=True) == pytest.approx(2.0, rel=0.02)
     harmonics = np.pi * (2.0 * np.arange(20) + 1.0)
-    c, s = np.ones(20) / np.sqrt(20.0), 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
+    c = np.ones(20) / np.sqrt(20.0)
+    s = 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
     many = (
         c[:, None] * np.cos(harmonics[:, None] * t)
         - s[:, None] * np.sin(harmonics[:, None] * t)

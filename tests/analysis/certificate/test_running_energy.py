@@ -39,13 +39,13 @@ def compute_courses(
     return courses_found
 
 
-def join_courses(found: list[EnergyCourse]) -> EnergyCourse:
-    return EnergyCourse(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+def join_courses(courses: list[EnergyCourse]) -> EnergyCourse:
+    return EnergyCourse(*(np.concatenate(columns) for columns in zip(*courses, strict=True)))
 
 
 @pytest.mark.parametrize("late", [0, 7])
 def test_v_while_running_equals_that_of_log(late: int) -> None:
-    """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
+    """The run has changes of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
     whole = make_run("rich").balance
     course = join_courses(compute_courses(make_run("rich").log, late=late))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
@@ -69,9 +69,11 @@ def test_v_without_some_records_is_the_incomplete_logs() -> None:
 
 
 def test_v_begins_late_in_a_session_joined_late() -> None:
-    log, whole = make_run("rich").log, make_run("rich").balance
+    log = make_run("rich").log
+    whole = make_run("rich").balance
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
-    running, blocks = RunningEnergy(log.scenario, windows), []
+    running = RunningEnergy(log.scenario, windows)
+    blocks = []
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
             for record in log[site].states[first : first + BLOCK]:

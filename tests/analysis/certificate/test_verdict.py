@@ -269,13 +269,14 @@ def test_an_unstable_rest_never_passes_a_run() -> None:
 def test_v_that_rises_at_the_end_is_named() -> None:
     balance = certify_rest().balance
     assert balance is not None
-    t_s, V = balance.t_s, balance.unsupplied
+    t_s = balance.t_s
+    V = balance.unsupplied
 
     def growth(added: np.ndarray) -> list[str]:
         changed = replace(
             balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
         )
-        return [describe_growth(one) for one in find_unsupplied_growth(changed, 1e-3)]
+        return [describe_growth(growth) for growth in find_unsupplied_growth(changed, 1e-3)]
 
     assert growth(np.zeros(len(V))) == []
     assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []
@@ -306,9 +307,10 @@ def test_a_whole_log_is_stable_with_reasons() -> None:
 
 @pytest.mark.parametrize("cut", [range(1490, 1525), range(2965, 3000), range(35)])
 def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
-    """At the end, the beginning or in between, of one site."""
+    """The records of one site are missing at the end, at the beginning or in between."""
     taken = take_apart(make_log_bytes("free", RUN)).without_chain()
-    topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
+    topics = taken.topics()
+    accounts = taken.metadata("trilat.accounts")
     topic = "/trilat/free/s/state"
     taken.messages = [
         m for m in taken.messages if topics[m.channel] != topic or m.sequence not in cut

@@ -75,8 +75,12 @@ def test_closed_loop_impedance_depends_on_the_driver() -> None:
     The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x
     the ratio is b; the plain ratio of the two, without the drive, is far off.
     """
-    k, b, h = 5.0, 2.0, 1.0 / RATE_HZ
-    x, torque, speed = draw_noise(3), np.zeros(len(EVERYTHING)), np.zeros(len(EVERYTHING))
+    k = 5.0
+    b = 2.0
+    h = 1.0 / RATE_HZ
+    x = draw_noise(3)
+    torque = np.zeros(len(EVERYTHING))
+    speed = np.zeros(len(EVERYTHING))
 
     def shake(push: np.ndarray) -> None:
         q = 0.0
@@ -165,7 +169,7 @@ MULTISINE = {
 
 @pytest.mark.parametrize(("hand", "lines"), [(CHIRP, 15), (MULTISINE, 5)])
 def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
-    """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
+    """At every line the error is below 2 % and two random errors of the closed form, which are larger for a chirp."""
     log = make_run("two_sites", {**make_shaken_overrides(), "sites.m.hands": [hand]}).log
     measured_response = next(
         response

@@ -189,7 +189,8 @@ def test_json_has_value_and_reason_per_column() -> None:
 
 def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
     """int (a^2 + b^2 sin^2) dt over whole periods is (a^2 + b^2 / 2) times the time."""
-    a, b = 3.0, 8.0
+    a = 3.0
+    b = 8.0
     log = make_pair_log(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
     figures = compute_log_metrics(log).sites["m"]
     assert figures["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
@@ -316,7 +317,8 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
         return {"theta_hat": [*learnt, 7.0, 8.0]}
 
     measured = compute_log_metrics(make_pair_log(motion, seconds=6.0, more=LEARNS))
-    figures_of_slave, learnt = measured.sites["s"], measured.estimates["s"]
+    figures_of_slave = measured.sites["s"]
+    learnt = measured.estimates["s"]
     assert figures_of_slave["theta_error_first"].value == pytest.approx(13.0)
     assert figures_of_slave["theta_energy_first_j"].value == pytest.approx(
         0.5 * (9.0 + 16.0 + 144.0 / 2.0)

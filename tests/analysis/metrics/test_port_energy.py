@@ -48,10 +48,12 @@ def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
 
 
 def _mechanical(log, site: str):
-    spec, part = log.scenario.sites[site], log[site]
+    spec = log.scenario.sites[site]
+    part = log[site]
     theta = theta_of(spec.arm)
     kinetic = 0.5 * np.einsum("ki,kij,kj->k", part.qd, inertia(theta, part.q), part.qd)
-    q1, q12 = part.q[:, 0], part.q.sum(axis=1)
+    q1 = part.q[:, 0]
+    q12 = part.q.sum(axis=1)
     return kinetic + spec.arm.g_m_s2 * (theta[3] * np.sin(q1) + theta[4] * np.sin(q12))
 
 
@@ -67,7 +69,9 @@ def test_lossless_walls_return_at_most_their_energy() -> None:
 
 def test_a_damper_dissipates_by_the_formula() -> None:
     """int B (A w cos w t)^2 dt = B A^2 w^2 / 2 times the time, to second order of the period."""
-    A, w, B = 0.2, 2.0 * math.pi, 4.0
+    A = 0.2
+    w = 2.0 * math.pi
+    B = 4.0
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         qd = A * w * math.cos(w * t_s)
@@ -118,7 +122,10 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
 
     Arms that move against each other are given energy, arms that move together lose it.
     """
-    A, w, K, delay_s = 0.2, 2.0 * math.pi, 10.0, 0.05
+    A = 0.2
+    w = 2.0 * math.pi
+    K = 10.0
+    delay_s = 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         sign = distance if site == "s" else 1.0
@@ -140,9 +147,11 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
 def test_delay_energy_is_the_ports_excess(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
     log = make_run("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law}).log
-    metrics, largest = compute_log_metrics(log), 0.0
+    metrics = compute_log_metrics(log)
+    largest = 0.0
     for site in log.sites:
-        part, spec = log[site], log.scenario.sites[site]
+        part = log[site]
+        spec = log.scenario.sites[site]
         shares = log.scenario.dominance[site]
         e, ed = (
             getattr(part, name)

@@ -53,7 +53,8 @@ def test_an_unsettled_run_is_reported() -> None:
 
 def test_following_allows_for_delay_unlike_spread() -> None:
     """A slave that is exactly its master's past: q_m(t - T) - q_s is zero, and the spread is v T."""
-    speed, delay_s = 0.4, 0.05
+    speed = 0.4
+    delay_s = 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         past = t_s if site == "m" else max(0.0, t_s - delay_s)
@@ -69,7 +70,8 @@ def test_following_allows_for_delay_unlike_spread() -> None:
 
 def test_undelayed_error_includes_what_the_delay_costs() -> None:
     """A slave at q_m(t - T), with q_m = v t, has e = 0 and the undelayed error v T, as its master has."""
-    speed, delay_s = 0.4, 0.05
+    speed = 0.4
+    delay_s = 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         past = t_s if site == "m" else max(0.0, t_s - delay_s)

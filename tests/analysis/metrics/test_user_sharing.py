@@ -87,7 +87,7 @@ def test_the_smaller_of_opposed_torques_cancels() -> None:
 
 
 def test_three_users_cancel_except_the_remaining_torque() -> None:
-    """Of 3, -1 and 2 N m at joint 1 and 2, 1 and -3 at joint 2 the sums are 4 and 0: 1 and 3 N m cancel."""
+    """Torques of 3, -1 and 2 N m at joint 1, and 2, 1 and -3 N m at joint 2, sum to 4 and 0, so that 1 and 3 N m cancel."""
     text = TRIO.replace("[sites.s]", '[sites.m3]\nrole = "master"\n[sites.s]').replace(
         "RAMP", "0.5"
     )

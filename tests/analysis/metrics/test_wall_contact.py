@@ -35,10 +35,8 @@ def test_force_depth_and_hits_of_a_swing() -> None:
     force = []
     for t_s in log["s"].t_s.tolist():
         pose = swing_arm("s", t_s)
-        depth, inward = (
-            2.0 * math.cos(pose["q"][0]) - 1.9,
-            -2.0 * math.sin(pose["q"][0]) * pose["qd"][0],
-        )
+        depth = 2.0 * math.cos(pose["q"][0]) - 1.9
+        inward = -2.0 * math.sin(pose["q"][0]) * pose["qd"][0]
         force.append(max(0.0, 1000.0 * depth + 20.0 * inward) if depth > 0.0 else 0.0)
     mean = sum(force) / len(force)
     assert figures["force_mean_n"].value == pytest.approx(mean, rel=1e-9)
@@ -62,7 +60,7 @@ def test_contact_from_the_first_record_is_no_hit() -> None:
 
 
 def test_contact_that_began_in_gaps_is_no_hit() -> None:
-    """Its beginning is unknown; and missing records give no numbers."""
+    """A contact with an unknown beginning counts no hit, and missing records give no numbers."""
     whole = make_pair_log(swing_arm, more=WALL)
     torn = rewrite_log(
         whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140)
@@ -95,7 +93,8 @@ def test_contact_at_200_ms_hammers() -> None:
 def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
     log = make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log
-    spec, track = log.scenario.sites["s"], align_records(log)["s"]
+    spec = log.scenario.sites["s"]
+    track = align_records(log)["s"]
     end_effector = build_arm_rows(log.scenario, "s").place_end_effector(track.q, track.qd)
     force = wall_force(spec.environment[0].actor, track.nominal_s, end_effector)
     assert force[50 * 10] == pytest.approx(4.3, abs=0.05)

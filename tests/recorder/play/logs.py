@@ -1,4 +1,4 @@
-"""The content of a log, by an independent reader; and logs whose messages are placed by a test."""
+"""The content of a log, read by an independent reader, and logs of events at prescribed times."""
 
 from collections.abc import Iterable
 from pathlib import Path

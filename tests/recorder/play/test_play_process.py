@@ -221,7 +221,7 @@ def test_the_past_is_given_as_far_as_played(log_file: Path) -> None:
 
 
 def test_joining_recorders_learn_tick_0(log_file: Path) -> None:
-    """By the code of the recorder's own way into a session."""
+    """The recorder joins by its own code."""
     hall = Hall(log_file)
     bus = hall.network.join()
     info = answer_info(topics.RECORDER, RECORDER_BOOT)
@@ -291,8 +291,10 @@ def test_progress_is_shown_twice_a_second(tmp_path: Path) -> None:
 
 
 def test_existing_sessions_are_refused() -> None:
-    network, clock = LocalNetwork(), LookedAt()
-    visitor, playing = network.join(), network.join()
+    network = LocalNetwork()
+    clock = LookedAt()
+    visitor = network.join()
+    playing = network.join()
     playing.respond(
         topics.key("other", "m1", topics.INFO),
         lambda _: encode(answer_info("m1", RECORDER_BOOT)),

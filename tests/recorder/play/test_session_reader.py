@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.log.builders import write_log
 from tests.recorder.play.logs import encode_event, preload_paths, read_payloads, write_event_log
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import LogError, UsageError
@@ -63,9 +64,11 @@ def test_only_the_window_is_read(
     path = tmp_path_factory.getbasetemp() / "window.mcap"
     if not path.exists():
         write_event_log(path, [("m1", n, n, n) for n in range(300)])
-    start_ns, stop_ns = start_ms * 1_000_000, (start_ms + length_ms) * 1_000_000
+    start_ns = start_ms * 1_000_000
+    stop_ns = (start_ms + length_ms) * 1_000_000
     _, block = preload_paths(path, start_ns=start_ns, stop_ns=stop_ns)
-    first, last = max(0, start_ms), min(299, start_ms + length_ms)
+    first = max(0, start_ms)
+    last = min(299, start_ms + length_ms)
     assert block.numbers.tolist() == list(range(first, last + 1))
 
 
@@ -96,8 +99,7 @@ def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
 
 
 def test_torn_files_are_read_while_whole(short_log: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "torn.mcap"
-    path.write_bytes(short_log[: len(short_log) * 95 // 100])
+    path = write_log(tmp_path, short_log[: len(short_log) * 95 // 100], "torn.mcap")
     facts, block = preload_paths(path)
     assert len(block) > 100
     assert facts.torn == {path: "the file was not finished"}

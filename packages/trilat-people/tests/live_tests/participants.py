@@ -7,7 +7,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.live.browsers import launch, role_address
+from tests.live.browsers import launch_browser, role_address
 from tests.live.processes import Process, Stage
 from trilat_net.net.clock import SystemClock
 
@@ -155,7 +155,7 @@ def participants(
     running: Process, sites: Sequence[str] = ("m1", "m2")
 ) -> Iterator[list[Participant]]:
     with sync_playwright() as playwright:
-        browser = launch(playwright)
+        browser = launch_browser(playwright)
         try:
             found, problems = [join(browser, running, site) for site in sites], list[str]()
             for one in found:

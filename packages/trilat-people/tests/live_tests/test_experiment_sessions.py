@@ -12,7 +12,7 @@ import pytest
 from trilat_people.experiment.experiment_run import Experiment, open_experiment
 from trilat_people.experiment.trial_run import ExperimentTrial
 
-from tests.live.browsers import needs_browser, page_address, shows
+from tests.live.browsers import needs_browser, page_address, wait_until_page
 from tests.live.processes import Process, Stage, is_running
 from tests.net.waiting import until
 from trilat_net.execution.verification import verify
@@ -175,7 +175,9 @@ def test_a_killed_experiment_with_people_resumes_whole(stage: Stage) -> None:
         take_part(people, lambda: people[0].look().get("appeared"))
         people[0].page.mouse.up()
         people[0].page.reload()
-        shows(people[0].page, "trilat.frame?.stage.left_s > 0")  # it is in the trial again
+        wait_until_page(
+            people[0].page, "trilat.frame?.stage.left_s > 0"
+        )  # it is in the trial again
         take_part(people, lambda: settled(second, 1))
         left = second.children()
         second.signal(signal.SIGKILL)
@@ -233,7 +235,7 @@ def test_experimenters_may_interrupt_and_resume(stage: Stage) -> None:
         experimenter.on("dialog", lambda dialog: dialog.accept())
         experimenter.goto(page_address(running))
         take_part(people, lambda: settled(running, 1))
-        shows(experimenter, "trilat.hello.stage.condition === 'near'")
+        wait_until_page(experimenter, "trilat.hello.stage.condition === 'near'")
         experimenter.click("#end")
         assert running.code() == 0, running
     assert "1 of 2 trials" in running.text()

@@ -14,7 +14,7 @@ from trilat_people.live_page.page_server import PageServer
 
 from tests.analysis.builders import BUSY, FOUR
 from tests.experiments import APART, REACH, write_protocol
-from tests.live.browsers import needs_browser, shows
+from tests.live.browsers import needs_browser, wait_until_page
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
@@ -169,7 +169,7 @@ def test_view_of_waiting_session_has_no_empty_frame(address: str, browser: Brows
     for query in ("", "as=m1", "watch"):
         with watched_page(browser) as watched:
             watched.page.goto(with_query(address, query))
-            shows(watched.page, "window.trilat?.hello?.running === false")
+            wait_until_page(watched.page, "window.trilat?.hello?.running === false")
             watched.assert_whole(["hello", "hello.stage"])
 
 
@@ -269,7 +269,7 @@ def test_stage_between_trials_has_no_empty_frame(
             with watched_page(browser) as watched:
                 page = watched.page
                 page.goto(with_query(server.address, query))
-                shows(page, "Boolean(window.trilat?.hello?.stage)")
+                wait_until_page(page, "Boolean(window.trilat?.hello?.stage)")
                 watched.assert_whole(OF_STAGED_PAGES)
                 assert page.is_visible("#sheet") == (view == "participant")
                 if page.locator("#sheet button.main:enabled").count():
