@@ -282,10 +282,10 @@ def test_golden_fates(name: str) -> None:
 
 
 _PROGRAM = """
-from tests.core.philox_reference import table
+from tests.core.philox_reference import make_table
 from tests.core.builders import KINDS, compute_fates
 for kind, shape in ((0, 0.0), (1, 0.0), (2, 0.3), (2, 4.0)):
-    print(" ".join(number.hex() for number in table(300, kind, shape).tolist()))
+    print(" ".join(number.hex() for number in make_table(300, kind, shape).tolist()))
 for name in KINDS:
     print(name, compute_fates(name, 200).tolist())
 """
