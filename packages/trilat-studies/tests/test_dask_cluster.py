@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT, plan_quick_sweep
-from trial_tests.results import quick
+from study_builders import SHORT, make_quick_scenario, plan_quick_sweep
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 
@@ -155,12 +154,12 @@ def test_trials_margins_and_tuning_run_on_a_cluster(cluster: Cluster, tmp_path: 
         assert (tmp_path / here / file).read_bytes() == (tmp_path / there / file).read_bytes()
 
     seeds = [5, 2, 9]
-    here_report = trilat_net.check(quick(), seeds, jobs=1)
-    cluster_report = trilat_net.check(quick(), seeds, on=cluster.address)
+    here_report = trilat_net.check(make_quick_scenario(), seeds, jobs=1)
+    cluster_report = trilat_net.check(make_quick_scenario(), seeds, on=cluster.address)
     assert [result.outcomes for result in here_report.results] == [
         result.outcomes for result in cluster_report.results
     ]
-    assert len(trilat_net.trials(quick(), seeds)) == len(cluster_report.results)
+    assert len(trilat_net.trials(make_quick_scenario(), seeds)) == len(cluster_report.results)
 
 
 @pytest.mark.long
@@ -203,7 +202,7 @@ def test_a_worker_without_the_laws_file_is_refused(
     shutil.copy(ROOT / "tests" / "golden" / "spring_law.py", tmp_path / "lonely_law.py")
     monkeypatch.chdir(tmp_path)
     cluster.add_worker()
-    scenario = quick(**{"control.law": "lonely_law:Spring"})
+    scenario = make_quick_scenario(**{"control.law": "lonely_law:Spring"})
     with pytest.raises(
         UsageError, match=r"the worker tcp://\S+ lacks the control law lonely_law:Spring"
     ):

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tuning_tests.experiments import TRIO
+from study_builders import TRIO
 
 import trilat_net as tn
 from tests.cli.running import trilat

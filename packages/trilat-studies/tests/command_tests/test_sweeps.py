@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
+from study_builders import SHORT
 from trilat_studies.sweep_command import parse_seed_count
 
 from tests.cli.running import trilat

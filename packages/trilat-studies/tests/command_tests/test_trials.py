@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trial_tests.results import QUICK
+from study_builders import QUICK
 from trilat_studies.study_commands import parse_seeds
 
 from tests.cli.running import started, trilat

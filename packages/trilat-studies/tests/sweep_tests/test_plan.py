@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import SHORT, plan_quick_sweep
 from trilat_studies.sweep.sweep_plan import (
     SweepPlan,
     list_axes,
@@ -19,8 +20,6 @@ from trilat_studies.sweep.sweep_plan import (
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-
-from .quick import SHORT, plan_quick_sweep
 
 
 def refused(source: str, *overrides: str, **settings: object) -> str:

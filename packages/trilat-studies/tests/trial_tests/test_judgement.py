@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import CALM, make_run_metrics
 from trilat_studies.measure_run import (
     ExpectationResult,
     Range,
@@ -15,8 +16,6 @@ from trilat_studies.measure_run import (
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.expect import ExpectWindow
-
-from .results import CALM, figures
 
 READINGS: dict[str, float] = {
     "synchronised_by_s": 11.0,
@@ -41,7 +40,7 @@ TOLERANCES = {"synchronised_rad", "end_pose_within_rad"}
 
 def only(expect: Expect, **changes: Any) -> ExpectationResult:
     """Returns the single outcome, for the calm run with some facts replaced."""
-    outcomes = evaluate_expectations(expect, figures(**changes))
+    outcomes = evaluate_expectations(expect, make_run_metrics(**changes))
     assert len(outcomes) == 1
     return outcomes[0]
 
@@ -188,7 +187,7 @@ def test_a_window_names_units_and_all_sites() -> None:
         from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
     )
     outcomes = evaluate_expectations(
-        Expect(windows=(expect_window,)), figures(windows=(SPANS,))
+        Expect(windows=(expect_window,)), make_run_metrics(windows=(SPANS,))
     )
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
     assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import UNMET_LIMIT, make_quick_scenario
 from trilat_studies.run_commands import list_assignments
 from trilat_studies.trials import Trial, evaluate_live_log
 
@@ -17,8 +18,6 @@ import trilat_net
 from tests.log_editing import edited, recorded, without
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import apply_overrides, load_scenario
-
-from .results import TOO_MUCH, quick
 
 CONSTANT = {"link": {"model": "constant", "delay_ms": 60.0}}
 
@@ -32,7 +31,7 @@ def test_a_random_scenario_has_a_trial_per_seed(quick_file: Path) -> None:
 
 
 def test_without_chance_one_run_decides() -> None:
-    constant = quick(**CONSTANT)
+    constant = make_quick_scenario(**CONSTANT)
     assert [trial.scenario.seed for trial in trilat_net.trials(constant, range(4, 9))] == [4]
     assert len(trilat_net.trials(constant, range(4, 9), live=True)) == 5
 
@@ -40,7 +39,7 @@ def test_without_chance_one_run_decides() -> None:
 @pytest.mark.parametrize("seed", [-1, 2**63])
 def test_a_seed_out_of_range_is_refused(seed: int) -> None:
     with pytest.raises(ScenarioError, match="seed"):
-        trilat_net.trials(quick(), [seed])
+        trilat_net.trials(make_quick_scenario(), [seed])
 
 
 def test_a_scenario_without_expectations_is_refused(quick_file: Path) -> None:
@@ -52,10 +51,10 @@ def test_a_scenario_without_expectations_is_refused(quick_file: Path) -> None:
 
 def test_an_expectation_of_an_unreached_time_is_refused() -> None:
     with pytest.raises(ScenarioError, match=r"synchronised_by_s.*0\.5 s"):
-        trilat_net.trials(quick(), set={"expect.synchronised_by_s": 0.5})
+        trilat_net.trials(make_quick_scenario(), set={"expect.synchronised_by_s": 0.5})
     window = {"from_s": 0.4, "to_s": 0.6, "error_peak_rad": [0.0, 1.0]}
     with pytest.raises(ScenarioError, match=r"expect\.windows\[0\]\.to_s: .*0\.5 s, not 0\.6"):
-        trilat_net.trials(quick(), set={"expect.windows": [window]})
+        trilat_net.trials(make_quick_scenario(), set={"expect.windows": [window]})
 
 
 def test_a_passed_trial_returns_what_held(quick_file: Path) -> None:
@@ -69,7 +68,7 @@ def test_a_passed_trial_returns_what_held(quick_file: Path) -> None:
 
 
 def test_a_failed_trial_names_its_excess(quick_file: Path) -> None:
-    (trial,) = trilat_net.trials(quick_file, [7], TOO_MUCH)
+    (trial,) = trilat_net.trials(quick_file, [7], UNMET_LIMIT)
     with pytest.raises(AssertionError) as failed:
         trial.check()
     lines = [line.strip() for line in str(failed.value).splitlines()]
@@ -100,7 +99,7 @@ def test_the_command_line_has_the_same_overrides(overrides: dict[str, Any]) -> N
 
 
 def test_a_table_override_is_shown_by_key() -> None:
-    (trial,) = trilat_net.trials(quick(), set=CONSTANT)
+    (trial,) = trilat_net.trials(make_quick_scenario(), set=CONSTANT)
     assert shlex.split(trial.again)[-4:] == [
         "--set",
         'link.model="constant"',
@@ -110,7 +109,10 @@ def test_a_table_override_is_shown_by_key() -> None:
 
 
 def test_an_unsaved_scenario_is_named_by_file() -> None:
-    assert trilat_net.trials(quick())[0].again == "trilat test ./quick.toml --seeds 1"
+    assert (
+        trilat_net.trials(make_quick_scenario())[0].again
+        == "trilat test ./quick.toml --seeds 1"
+    )
 
 
 LIMITS = {"expect": {"peak_error_max_rad": 2.0, "no_gaps": True}}
