@@ -61,10 +61,9 @@ VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
 def test_values_by_key_equal_axes_as_texts(
     delays: list[float], counts: list[int], as_array: bool
 ) -> None:
-    given = [np.array(axes) if as_array else axes for axes in (delays, counts)]
     over = {
-        "link.delay_ms": given[0],
-        "control.d": given[1],
+        "link.delay_ms": np.array(delays) if as_array else delays,
+        "control.d": np.array(counts) if as_array else counts,
         "link.order": ["newest", "in_order"],
     }
     first, second, third = map(parse_axis, list_axes(over))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import UNMET_LIMIT, make_quick_scenario
 from trilat_studies.run_commands import list_assignments
-from trilat_studies.trials import Trial, evaluate_live_log
+from trilat_studies.trials import Trial, TrialResult, evaluate_live_log
 
 import trilat_net
 from tests.log_editing import edited, recorded, without
@@ -80,8 +80,8 @@ def test_a_failed_trial_names_its_excess(quick_file: Path) -> None:
     ]
 
 
-words = st.sampled_from(["it's", "a b", '"x"', "", "=", "é", "true", "a\nb\t"])
-values = st.one_of(st.integers(-5, 5), st.floats(-1e3, 1e3), st.booleans(), words)
+texts = st.sampled_from(["it's", "a b", '"x"', "", "=", "é", "true", "a\nb\t"])
+values = st.one_of(st.integers(-5, 5), st.floats(-1e3, 1e3), st.booleans(), texts)
 tables = st.dictionaries(
     st.sampled_from(["a", "b.c", "d.e-f"]),
     st.one_of(values, st.lists(values, max_size=3)),
@@ -120,13 +120,19 @@ LIMITS = {"expect": {"peak_error_max_rad": 2.0, "no_gaps": True}}
 
 @pytest.fixture
 def trial() -> Trial:
-    (trial_made,) = trilat_net.trials(
-        load_scenario("free", {"duration_s": 0.12, "link.delay_ms": 20.0, **LIMITS}), live=True
-    )
-    return trial_made
+    """A live trial of a short version of `free`."""
+    scenario = load_scenario("free", {"duration_s": 0.12, "link.delay_ms": 20.0, **LIMITS})
+    (live_trial,) = trilat_net.trials(scenario, live=True)
+    return live_trial
+
+
+def list_failed_keys(result: TrialResult) -> list[str]:
+    """Returns the keys of the expectations that do not hold."""
+    return [outcome.key for outcome in result.outcomes if not outcome.held]
 
 
 def write_log(folder: Path, data: bytes) -> Path:
+    """Writes the bytes of a log into a folder, and returns the file."""
     path = folder / "run.mcap"
     path.write_bytes(data)
     return path
@@ -150,30 +156,24 @@ def test_a_session_problem_fails_the_trial(trial: Trial, tmp_path: Path) -> None
     result = evaluate_live_log(
         trial, write_log(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
     )
-    assert [o.key for o in result.outcomes if not o.held] == ["session"]
+    assert list_failed_keys(result) == ["session"]
     assert "SIGKILL" in result.failures[0]
 
 
 def test_missing_records_fail_the_trial(trial: Trial, tmp_path: Path) -> None:
     log = write_log(tmp_path, edited(recorded("free"), record=without("s", {50})))
-    assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
-        "no_gaps",
-        "executed again",
-    ]
+    result = evaluate_live_log(trial, log, [], 1.0)
+    assert list_failed_keys(result) == ["no_gaps", "executed again"]
 
 
 def test_a_record_that_contradicts_its_inputs_fails(trial: Trial, tmp_path: Path) -> None:
-    def bent(record: dict) -> dict:  # type: ignore[type-arg]
-        return (
-            {**record, "tau": [0.0, 1.0]}
-            if (record["site"], record["tick"]) == ("s", 50)
-            else record
-        )
+    def change_torque(record: dict[str, Any]) -> dict[str, Any]:
+        if record["site"] == "s" and record["tick"] == 50:
+            return {**record, "tau": [0.0, 1.0]}
+        return record
 
-    log = write_log(tmp_path, edited(recorded("free"), record=bent))
-    assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
-        "executed again"
-    ]
+    log = write_log(tmp_path, edited(recorded("free"), record=change_torque))
+    assert list_failed_keys(evaluate_live_log(trial, log, [], 1.0)) == ["executed again"]
 
 
 @pytest.mark.parametrize("content", [None, b"no log", "empty"])
