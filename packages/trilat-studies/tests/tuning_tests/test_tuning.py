@@ -42,11 +42,6 @@ def test_the_number_of_processes_changes_no_result(
     ]
 
 
-def test_laws_use_their_budget_and_runs_end_once(tuning_result: TuningResult) -> None:
-    for law in tuning_result.found:
-        assert len(law.tried) == len(law.scores) == sum(law.outcomes.values()) == 6
-
-
 def test_candidates_differ_only_in_their_law(tuning_result: TuningResult) -> None:
     """All candidates have the same limits, starts, seed, duration and links."""
     settings_of_candidates = set()
