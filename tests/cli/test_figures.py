@@ -66,17 +66,3 @@ def test_figures_of_two_logs_are_written(folder: Path) -> None:
     overlaid = trilat(*together, "one", "positions", cwd=folder).succeeds().split()
     assert overlaid == ["one/overlay_positions.svg"]
     trilat(*together, "no", "phase", cwd=folder).refuses("'phase'", "tracking_errors")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "facts"),
-    [
-        (["contact"], ["no site has a wall"]),
-        (["phase", "--format", ","], ["--format is empty"]),
-        (["phase", "--out", "run.mcap"], ["run.mcap"]),
-    ],
-)
-def test_impossible_figures_are_refused(
-    folder: Path, arguments: list[str], facts: list[str]
-) -> None:
-    trilat("figure", "run.mcap", *arguments, cwd=folder).refuses(*facts)

@@ -58,39 +58,6 @@ def test_figures_are_reproducible_files(tmp_path: Path) -> None:
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
 
 
-REFUSED = {
-    "a pose with letters": (["free", "--pose", "up"], ["--pose must be angles in rad", "'up'"]),
-    "a range without a colon": (
-        ["free", "--over", "control.Kd=5"],
-        ["--over must have the form KEY=LOW:HIGH"],
-    ),
-    "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
-    "a figure in no folder": (
-        ["free", "--figure", "no/map.png"],
-        ["no/map.png", "does not exist"],
-    ),
-    "a measured link": (
-        ["free", "--set", "link.model=measured"],
-        ["links.", "is not known"],
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_exits_2_with_one_line(kind: str, tmp_path: Path) -> None:
-    arguments, facts = REFUSED[kind]
-    trilat("linear", *arguments, cwd=tmp_path).refuses(*facts)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_figure_is_kept(tmp_path: Path) -> None:
-    (tmp_path / "map.png").write_text("precious")
-    trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses(
-        "map.png", "exists", "--force"
-    )
-    assert (tmp_path / "map.png").read_text() == "precious"
-
-
 def test_an_identified_hand_holds_the_ports(tmp_path: Path) -> None:
     """The commands are those of docs/studies/measured-hands.md, with the sines of that page."""
     (sines,) = (

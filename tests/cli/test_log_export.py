@@ -91,12 +91,6 @@ def test_a_folder_of_logs_becomes_episodes(folder: Path) -> None:
     )
 
 
-def test_impossible_exports_are_refused_before_reading(folder: Path) -> None:
-    done = trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder)
-    done.refuses("--to", "xlsx", "csv, lerobot, mat, npz, parquet, ros2")
-    assert [path.name for path in folder.iterdir()] == ["run.mcap"]
-
-
 @pytest.mark.parametrize(
     ("form", "module", "name"),
     [

@@ -21,16 +21,6 @@ def test_a_simulation_has_views_at_the_asked_rate(
     assert least <= count <= most
 
 
-@pytest.mark.parametrize("views", ["0", "-1", "nan", "inf", "fast", ""])
-@pytest.mark.parametrize("command", [("sim", "two_sites"), ("record", "--session", "x")])
-def test_an_invalid_rate_is_refused(
-    tmp_path: Path, command: tuple[str, ...], views: str
-) -> None:
-    done = trilat(*command, "--views", views, cwd=tmp_path)
-    done.refuses("--views must be off, full, or a number of messages per second", repr(views))
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.long
 def test_views_can_be_kept(log_file: Path, tmp_path: Path) -> None:
     """Views are kept also if the log itself has none."""

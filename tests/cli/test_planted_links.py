@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
+from study_builders import SHORT
 
 from .running import shorten, trilat
 

@@ -42,18 +42,6 @@ def test_shown_text_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     assert f"sha256 {load_scenario(name).sha256[:16]}" in output
 
 
-@pytest.mark.parametrize(
-    ("setting", "option"), [("duration_s=5", ("--duration", "3")), ("seed=2", ("--seed", "9"))]
-)
-@pytest.mark.parametrize("command", [("scenario", "show"), ("sim",), ("demo",), ("live",)])
-def test_keys_are_not_set_twice(
-    command: tuple[str, ...], setting: str, option: tuple[str, str], tmp_path: Path
-) -> None:
-    """An option that would override --set is refused, and names the key."""
-    arguments = (*command, "two_sites", "--set", setting, *option)
-    trilat(*arguments, cwd=tmp_path).refuses(f"--set {setting}", " ".join(option), "same key")
-
-
 def test_set_durations_win_over_the_default() -> None:
     """A page runs an hour, unless --set or --duration says otherwise."""
     assert RunOptions().load("two_sites", 3600.0).duration_s == 3600.0
@@ -140,4 +128,3 @@ def test_show_prints_the_scenario_of_a_log(tmp_path: Path) -> None:
     assert ended.succeeds() == text
     changed = trilat("scenario", "show", "run.mcap", "--seed", "3", cwd=tmp_path)
     changed.refuses("printed as it is", "mine.toml")
-    trilat("scenario", "show", "none.mcap", cwd=tmp_path).refuses("none.mcap")

@@ -75,31 +75,6 @@ def test_every_synonym_leads_to_a_command() -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "facts"),
-    [
-        ("delay_ms=400", "delay_ms: unknown key; did you mean 'link.delay_ms'?"),
-        ("delay=400", "did you mean 'link.delay_ms'?"),
-        ("link.dely=400", "did you mean 'delay_ms'?"),
-        ("lnk.delay_ms=400", "did you mean 'link'?"),
-        ("contrl.Kd=5", "did you mean 'control'?"),
-        ("sites.m1.rte=500", "did you mean 'rate_hz'?"),
-        ("links.delay_ms=400", "did you mean 'link.delay_ms'?"),
-        ("Kd=5", "did you mean 'control.Kd'?"),
-        ("law=p_d", "did you mean 'control.law'?"),
-        ("m1.control.Kd=5", "did you mean 'sites.m1'?"),
-        ("control.kd=5", "did you mean 'Kd'?"),
-        ("control.D=1", "control.D: d belongs to law authority"),
-        ("control.K=5", "but control.law is adaptive, which has Lambda, Kp, Kd"),
-        ("link.half_width_ms=5", "belongs to model uniform, but link.model is constant"),
-    ],
-)
-def test_an_unknown_key_suggests_the_whole_path(
-    override: str, facts: str, tmp_path: Path
-) -> None:
-    trilat("scenario", "check", "paper", "--set", override, cwd=tmp_path).refuses(facts)
-
-
-@pytest.mark.parametrize(
     "setting",
     [
         "dominance.m1={m2=0.1,s=0.9}",
@@ -138,11 +113,6 @@ def test_whole_settings_stay_unchanged(arguments: list[str]) -> None:
     assert find_split_setting(arguments) == ""
 
 
-def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:
-    arguments = ["--set", "control.law=p_d", "--set", "control.D=1"]
-    trilat("scenario", "check", "paper", *arguments, cwd=tmp_path).refuses("did you mean 'd'?")
-
-
 def test_faint_similarity_suggests_nothing() -> None:
     assert suggest_nearest("foo", ["name", "seed"], ["control.follows"]) == ""
     assert find_nearest("x" * 81, ["x" * 81]) == ""
@@ -156,13 +126,6 @@ class Torques:
     def torque(self, now):
         return [sum_of_nothing for _ in now.q]
 """
-
-
-@pytest.mark.parametrize("written", ["torques.py", "torques"])
-def test_a_file_as_law_suggests_its_class(written: str, tmp_path: Path) -> None:
-    (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
-    arguments = ("sim", "two_sites", "--set", f"control.law={written}")
-    trilat(*arguments, cwd=tmp_path).refuses("write torques:Torques")
 
 
 def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:

@@ -65,31 +65,6 @@ def test_sizes_are_separated_from_linear_growth(folder: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("asked", "facts"),
-    [
-        (("--push", "m9.q1"), ("m9.q1", "m (2 joints, 5 estimates)")),
-        (("--push", "m.q3"), ("m.q3", "2 joints")),
-        (("--push", "m.q1=0"), ("m.q1=0", "1e-11 to 1")),
-        (("--push", "m.q1=nan"), ("m.q1=nan",)),
-        (("--push", "m.q1=a"), ("m.q1=a", "a number")),
-        (("--at", "4"), ("--at 4", "before 4 s")),
-        (("--at", "nan"), ("--at nan",)),
-        (("--delta", "1e-9"), ("two sizes", "1e-9:1e-3", "'1e-9'")),
-        (("--delta", "1e-3:1e-9"), ("two sizes",)),
-        (
-            ("--delta", "1e-9:1e-3", "--push", "m.q1", "--push", "m.q2"),
-            ("one push", "m.q1, m.q2"),
-        ),
-        (("-o", "twin.txt"), ("twin.txt", ".png")),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(
-    folder: Path, asked: tuple[str, ...], facts: tuple[str, ...]
-) -> None:
-    trilat("twin", "run.mcap", *asked, cwd=folder).refuses(*facts)
-
-
 def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / simulate_by_command(tmp_path, "two_sites", "seed=2", seconds="1")
     trilat("twin", "run.mcap", other, cwd=folder).refuses("not a part of the session")

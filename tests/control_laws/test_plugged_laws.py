@@ -8,10 +8,8 @@ import pytest
 from tests.control_laws.law_settings import LAWS
 from tests.core.guarded_runs import RATE_NM_S, find_largest_step, make_ordered_log
 from tests.execution.builders import make_trajectories, sample_records
-from tests.log.builders import make_log
 from trilat_net.core.plug.compiled_law import is_compiled
 from trilat_net.execution.verification import verify
-from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_scenario
 from trilat_net.scenario.laws import LAWS as ALL_LAWS
@@ -53,16 +51,6 @@ def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPat
         plain = make_trajectories(chosen)
         for name in names:
             assert (plain.stack(name) == ticks.stack(name)).all()
-
-
-@pytest.mark.parametrize("law", LONG)
-def test_logs_of_plugged_laws_can_be_reexecuted(law: str) -> None:
-    log = make_log(LAWS[law][0], make_law_overrides(law))
-    verdict = verify(log)
-    assert verdict.whole_run
-    assert verdict.identical == verdict.records
-    twins = compare_with_virtual(log)
-    assert twins.fed.identical == twins.plain.identical == verdict.records
 
 
 DIGITAL = ("wave", "tdpa", "tanks")

@@ -52,18 +52,12 @@ def strongly_connected(a: Array) -> bool:
 
 @given(a=draw_matrix())
 def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
-    """beta'Upsilon = 0 after Eq. (20), to 1e-12, entry by entry positive."""
+    """beta'Upsilon = 0 after Eq. (20), to 1e-12 of each entry, and every entry is positive."""
     assume(strongly_connected(a))
     beta = perron_vector(a)
     assert (beta > 0).all()
     assert beta.sum() == pytest.approx(1.0, abs=1e-14)
-    assert np.abs(beta @ (a - np.eye(len(a)))).max() <= 1e-12
-
-
-@given(a=draw_matrix(zeros=False))
-def test_beta_is_numpys_null_vector(a: Array) -> None:
-    left = np.linalg.svd((a - np.eye(len(a))).T)[2][-1]
-    assert perron_vector(a) == pytest.approx(left / left.sum(), abs=1e-9)
+    assert beta @ a == pytest.approx(beta, rel=1e-12, abs=0.0)
 
 
 @given(a=draw_matrix())
@@ -82,42 +76,20 @@ def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
         perron_vector(a)
 
 
-@given(shares=st.tuples(*[st.floats(0.01, 0.99)] * 3))
-def test_beta_of_three_sites_in_closed_form(shares: tuple[float, float, float]) -> None:
-    """beta ~ (1 - a23 a32, 1 - a13 a31, 1 - a12 a21)."""
-    a12, a21, a31 = shares
-    a13 = 1 - a12
-    a23 = 1 - a21
-    a32 = 1 - a31
-    closed = np.array([1 - a23 * a32, 1 - a13 * a31, 1 - a12 * a21])
-    beta = perron_vector(np.array([[0, a12, a13], [a21, 0, a23], [a31, a32, 0]]))
-    assert beta == pytest.approx(closed / closed.sum(), rel=1e-12)
-
-
-@given(share=st.floats(0.01, 0.99))
-def test_only_circulant_shares_have_ones_as_vector(share: float) -> None:
-    """The paper's beta = (1, 1, 1) fits one free parameter, not three."""
-    rest = 1 - share
-    circulant = np.array([[0, share, rest], [rest, 0, share], [share, rest, 0]])
-    assert perron_vector(circulant) == pytest.approx([1 / 3] * 3, rel=1e-12)
-    skewed = np.array([[0, share, rest], [0.5, 0, 0.5], [0.3, 0.7, 0]])
-    assert np.abs(np.ones(3) @ (skewed - np.eye(3))).max() > 1e-3
-
-
-@given(a=draw_matrix(), off=st.floats(-0.5, 0.5), index=st.integers(0, 1))
-def test_rows_sum_to_one_within_1e_9(a: Array, off: float, index: int) -> None:
+@given(a=draw_matrix(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))
+def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
     """Eq. (7)."""
-    row = a[index].copy()
+    row = a[own].copy()
     entry = int(np.argmax(row))
     row[entry] += off
     assume(0 <= row[entry] <= 1)
-    fault = find_row_problem(row, index)
+    fault = find_row_problem(row, own)
     assume(abs(abs(row.sum() - 1) - 1e-9) > 1e-15)
     assert (fault is not None) == (abs(row.sum() - 1.0) > 1e-9)
 
 
 @pytest.mark.parametrize(
-    ("row", "index", "phrase"),
+    ("row", "own", "phrase"),
     [
         ([0.2, 0.8, 0.0], 0, "does not follow itself"),
         ([0.0, 1.5, -0.5], 0, "between 0 and 1"),
@@ -126,7 +98,7 @@ def test_rows_sum_to_one_within_1e_9(a: Array, off: float, index: int) -> None:
         ([0.0, np.inf, 0.5], 0, "finite"),
     ],
 )
-def test_an_invalid_row_gives_the_reason(row: list[float], index: int, phrase: str) -> None:
-    fault = find_row_problem(np.array(row), index)
+def test_an_invalid_row_gives_the_reason(row: list[float], own: int, phrase: str) -> None:
+    fault = find_row_problem(np.array(row), own)
     assert fault is not None
     assert phrase in fault

@@ -78,31 +78,6 @@ def test_a_passed_limit_is_a_lasting_fault(
     assert len(log["s"]) == 6000
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 12))]
-)
-def test_torque_rates_stay_limited_in_any_event(seed: int) -> None:
-    """Peers 3 rad apart, cuts, stops, a fault by a limit, returns: in the end they follow each other."""
-    random = np.random.default_rng(seed)
-    cuts = np.sort(random.uniform(1.0, 6.0, 4)).round(3).reshape(2, 2).tolist()
-    text = TEXT.replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]").replace(
-        "[0.1, 0.4]", "[-0.1, 1.9]"
-    )
-    scenario = make_guarded_scenario(text=text, duration_s=14.0, outages_s=cuts)
-    orders: dict[str, dict[int, str]] = {"m": {}, "s": {}}
-    for site in orders:
-        for start in random.integers(500, 7000, 2).tolist():
-            orders[site] |= {start: "stop", start + int(random.integers(100, 900)): "enable"}
-        orders[site] |= {7900: "reset", 8000: "enable"}
-    log = make_ordered_log(scenario, orders)
-    for site in orders:
-        assert find_largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
-        assert log[site].mode[-1] == "run"
-    assert np.abs(log["m"].q[-1] - log["s"].q[-1]).max() <= 0.05
-    assert verify(log).identical == 28_000
-
-
 def test_rate_limits_keep_reference_jumps_out() -> None:
     """A peer 3 rad away that is used at once, under the default rule, with and without its limits."""
     text = TEXT.replace('action = "glide"', 'action = "use"').replace(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.core.builders import make_site_setup, step_site
@@ -86,54 +86,6 @@ def compute_followed(
 # The modes.
 
 
-@pytest.mark.parametrize(
-    ("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)]
-)
-def test_cuts_lead_to_hold_and_return(action: StaleAction, mode: Mode) -> None:
-    """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
-    outputs = run_cut_site(RULE._replace(action=action))
-    assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
-
-
-def test_the_rule_use_continues() -> None:
-    assert runs_of(run_cut_site(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
-
-
-def test_staleness_during_a_return_is_held() -> None:
-    ticks = [
-        TickInput(
-            k,
-            [
-                make_moving_arrival(0, k - 1),
-                *([make_moving_arrival(1, k - 1)] if k <= 50 or 90 < k <= 91 else []),
-            ]
-            if k
-            else [],
-        )
-        for k in range(200)
-    ]
-    outputs = step_site(make_stale_site(RULE._replace(return_ns=50 * MS)), ticks)
-    assert runs_of(outputs) == [
-        (Mode.RUN, 0),
-        (Mode.HOLD, 70),
-        (Mode.RETURN, 95),
-        (Mode.HOLD, 111),
-    ]
-    assert outputs[111].q_des == outputs[110].q_des
-    assert outputs[110].q_des != outputs[70].q_des
-
-
-def test_an_unheard_peer_has_the_runs_age() -> None:
-    outputs = step_site(make_stale_site(RULE), [TickInput(k) for k in range(40)])
-    assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
-
-
-def test_peers_without_share_may_be_stale() -> None:
-    ticks = [TickInput(k, [make_moving_arrival(0, k - 1)] if k else []) for k in range(100)]
-    assert runs_of(step_site(make_stale_site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
-    assert runs_of(step_site(make_stale_site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
-
-
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     """A diverged record holds no reference."""
@@ -156,6 +108,21 @@ arrivals = st.lists(
 ).map(lambda parts: [heard for a, b, n in parts for heard in [(a, b)] * n])
 
 
+BOTH = (True, True)
+ONE = (True, False)
+NONE = (False, False)
+CUT = [*[BOTH] * 51, *[ONE] * 40, *[BOTH] * 109]
+"""The second peer's samples from 50 to 90 are lost: the last one in use comes at tick 54."""
+CUT_AGAIN = [*[BOTH] * 51, *[ONE] * 40, BOTH, *[ONE] * 108]
+
+
+@example(CUT, StaleAction.HOLD, 20, 30, (0.5, 0.5))
+@example(CUT, StaleAction.BRAKE, 20, 30, (0.5, 0.5))
+@example(CUT, StaleAction.USE, 20, 30, (0.5, 0.5))
+@example(CUT_AGAIN, StaleAction.HOLD, 20, 50, (0.5, 0.5))
+@example([NONE] * 40, StaleAction.HOLD, 20, 30, (0.5, 0.5))
+@example([ONE] * 100, StaleAction.HOLD, 20, 30, (1.0, 0.0))
+@example([ONE] * 100, StaleAction.HOLD, 20, 30, (0.9, 0.1))
 @settings(max_examples=60)
 @given(
     heard=arrivals,
@@ -173,7 +140,7 @@ def test_modes_and_references_follow_the_law(
     return_ms: int,
     shares: tuple[float, float],
 ) -> None:
-    """The edges of `Mode` and the reference of each mode hold for any pattern of arrivals."""
+    """For any pattern of arrivals: the edges of `Mode`, and the reference of each mode."""
     stale_site = make_stale_site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
     mode = Mode.RUN
     since = 0
@@ -197,10 +164,11 @@ def test_modes_and_references_follow_the_law(
         q, qd = compute_followed(output, shares)
         if mode is Mode.RETURN:
             x = (k - since) / return_ms
-            share = 3 * x**2 - 2 * x**3
-            share_rate_per_s = 6 * x * (1 - x) / (return_ms / 1000)
-            qd = share * qd + share_rate_per_s * (q - held)
-            q = held + share * (q - held)
+            q, qd = (
+                held + (3 * x**2 - 2 * x**3) * (q - held),
+                (3 * x**2 - 2 * x**3) * qd
+                + (6 * x * (1 - x) / (return_ms / 1000)) * (q - held),
+            )
         elif mode is not Mode.RUN:
             q = held
             qd = np.zeros(2)
@@ -233,7 +201,7 @@ def test_returning_references_have_no_step(action: StaleAction) -> None:
 @pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
-    """A site resumes in any mode, because the records hold its memory."""
+    """In any mode, because the records hold the site's memory."""
     rule = RULE._replace(action=action)
     whole = run_cut_site(rule)
     stale_site = make_stale_site(rule)

@@ -8,14 +8,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.execution.builders import OTHER_PLATFORM, make_log_without
+from tests.execution.builders import OTHER_PLATFORM
 from tests.execution.deliveries import SITES, TICKS
 from tests.log.builders import Record, edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.execution.verification import verify
-from trilat_net.execution.virtual_comparison import compare_with_virtual
-from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 from trilat_net.log.view_rates import FULL_RATE_HZ
@@ -51,29 +49,6 @@ def test_peers_get_own_and_common_vectors() -> None:
         # the same for both joints
         assert all(np.ptp(difference, axis=1).max() < 1e-12 for difference in differences)
         assert np.abs(differences[0] - differences[1]).min() > 5e-3  # and other for each peer
-
-
-def test_messages_are_executed_again_like_virtual_time() -> None:
-    log = open_bytes(make_talking_bytes())
-    verdict = verify(log)
-    assert verdict.whole_run
-    assert verdict.identical == verdict.records == 3 * TICKS
-    twins = compare_with_virtual(log)
-    assert twins.fed.identical == twins.plain.identical == 3 * TICKS
-    again = rerun(log, ["m1", "s"])
-    assert again.identical
-    assert [effect.identical for effect in again.sites.values()] == [TICKS, TICKS]
-
-
-@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_behind_gaps_messages_continue_from_records(session: dict[str, str] | None) -> None:
-    """As many records are judged as without messages between laws, and all of them agree."""
-    verdict = verify(make_log_without({"s": range(50, 61)}, make_talking_bytes(), session))
-    assert verdict.gaps == [("s", 50, 60)]
-    assert verdict.agreed
-    data = make_log_bytes("paper", {**SHORT, "control.law": "tests.laws:Adaptive"})
-    silent = verify(make_log_without({"s": range(50, 61)}, data, session))
-    assert (verdict.identical, verdict.unjudged) == (silent.identical, silent.unjudged)
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])

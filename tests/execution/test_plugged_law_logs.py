@@ -1,9 +1,10 @@
-"""Logs of laws with messages to each peer, executed again: whole, from any record, and changed."""
+"""Logs of any law, built in or a user's, executed again: whole, from any record, and changed."""
 
 from typing import Any
 
 import pytest
 
+from tests.control_laws.law_settings import LAWS
 from tests.execution.builders import OTHER_PLATFORM, make_log_without
 from tests.execution.deliveries import TICKS
 from tests.log.builders import make_log_bytes, open_bytes
@@ -14,33 +15,56 @@ from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 
-LAWS = ("Line", "CompiledLine")
+LINES = ("tests.plugged_laws:Line", "tests.plugged_laws:CompiledLine")
+OWN = ("tests.laws:Adaptive", "tests.channel_law:Talking", *LINES)
+"""Laws of users: with memory, with messages to all and to each peer, plain and compiled."""
+
+EVERY_LAW = [
+    *OWN,
+    *(
+        name if name == "saturated_pd" else pytest.param(name, marks=pytest.mark.long)
+        for name in LAWS
+    ),
+]
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
-def make_plugged_bytes(law: str) -> bytes:
-    return make_log_bytes("paper", {**SHORT, "control.law": f"tests.plugged_laws:{law}"})
+def record_law(law: str) -> bytes:
+    scenario, settings = LAWS.get(law, ("paper", {}))
+    return make_log_bytes(scenario, {**SHORT, "control.law": law, **settings})
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_plugged_laws_verify_whole_and_behind_gaps(
-    law: str, session: dict[str, str] | None
-) -> None:
-    data = make_plugged_bytes(law)
-    verdict = verify(open_bytes(data))
+@pytest.mark.parametrize("law", EVERY_LAW)
+def test_logs_of_any_law_are_executed_again(law: str) -> None:
+    """Whole, beside virtual time, and as a rerun without changes, every record is identical."""
+    log = open_bytes(record_law(law))
+    records = len(log.sites) * TICKS
+    verdict = verify(log)
     assert verdict.whole_run
-    assert verdict.identical == verdict.records == 3 * TICKS
-    twins = compare_with_virtual(open_bytes(data))
-    assert twins.fed.identical == twins.plain.identical == 3 * TICKS
-    cut = verify(make_log_without({"s": range(50, 61)}, data, session))
-    assert cut.agreed
-    assert cut.identical > 3 * TICKS - 60
+    assert verdict.identical == verdict.records == records
+    twins = compare_with_virtual(log)
+    assert twins.fed.identical == twins.plain.identical == records
+    for again in (rerun(log, ["s"]), rerun(log, closed_loop=True)):
+        assert all(effect.identical == TICKS for effect in again.sites.values())
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
+@pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
+def test_any_law_resumes_behind_a_gap(law: str, session: dict[str, str] | None) -> None:
+    """As much can be judged as of the law of the paper, and all of it agrees."""
+    lost = {"s": range(50, 61)}
+    verdict = verify(make_log_without(lost, record_law(law), session))
+    assert verdict.gaps == [("s", 50, 60)]
+    assert verdict.agreed
+    scenario, _ = LAWS.get(law, ("paper", {}))
+    paper = verify(make_log_without(lost, make_log_bytes(scenario, SHORT), session))
+    assert (verdict.identical, verdict.unjudged) == (paper.identical, paper.unjudged)
+    assert verdict.identical > verdict.records - 60
+
+
+@pytest.mark.parametrize("law", LINES)
 def test_any_record_resumes_the_whole_run(law: str) -> None:
-    log = open_bytes(make_plugged_bytes(law))
+    log = open_bytes(record_law(law))
     samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
     ends = dict.fromkeys(log.sites, TICKS - 1)
     for name in log.sites:
@@ -60,8 +84,6 @@ def test_any_record_resumes_the_whole_run(law: str) -> None:
 
 
 def test_a_changed_gain_changes_only_its_effect() -> None:
-    log = open_bytes(make_plugged_bytes("CompiledLine"))
-    same = rerun(log, closed_loop=True)
-    assert all(effect.identical == effect.executed == TICKS for effect in same.sites.values())
+    log = open_bytes(record_law("tests.plugged_laws:CompiledLine"))
     changed = rerun(log, ["s"], {"sites.s.control.K": 25.0})
     assert 0 < changed.sites["s"].identical < changed.sites["s"].executed

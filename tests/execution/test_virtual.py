@@ -204,7 +204,7 @@ def test_an_overtaken_late_sample_is_harmless() -> None:
     assert twins.plain.first.field.startswith("q_des")
 
 
-@pytest.mark.parametrize("name", ["paper", "asymmetric", "two_sites"])
+@pytest.mark.parametrize("name", ["paper", "asymmetric", "two_sites", "six_joints"])
 def test_virtual_logs_equal_virtual_time(name: str) -> None:
     log = make_log(name, {"duration_s": 0.5})
     twins = compare_with_virtual(log)

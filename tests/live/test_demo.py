@@ -24,9 +24,9 @@ def start_demo(stage: Stage, duration: str = "3") -> Process:
     )
 
 
-def find_child(demo: Process, phrase: str) -> int:
+def find_child(demo: Process, words: str) -> int:
     return until(
-        lambda: next((pid for pid, line in demo.children().items() if phrase in line), 0), 30
+        lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30
     )
 
 
@@ -56,16 +56,24 @@ def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
 
 
 def test_ctrl_c_ends_everything_and_finishes_file(stage: Stage) -> None:
-    running = start_demo(stage)
+    """A demo bears the name of its scenario, so that `tn.hand` finds the session while it runs."""
+    running = stage.start(
+        "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
+    )
     log_file = wait_for_recording(stage)
     children = running.children()
+    with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
+        hand.move(*hand.pose)
+    running.prints("; late ")
     running.signal(signal.SIGINT)
     assert running.code() == 130
     assert all(is_gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete
-    assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
+    assert {event.member for event in log.events if event.kind == "end"} == {"m1", "m2", "s"}
     assert verify(log).passed
+    assert "session play; Ctrl-C ends it" in running.text()
+    assert re.search(r"; torque \d+\.\d\d N m; age .*; late ", running.text())
     assert "run.mcap holds the records so far" in running.text()
 
 
@@ -89,21 +97,6 @@ def test_signals_before_sessions_leave_no_log(number: int, when: str, stage: Sta
     assert not (stage.folder / "out" / "run.mcap").exists()
 
 
-def test_demos_bear_their_scenarios_name_and_errors(stage: Stage) -> None:
-    """`tn.hand("play", "m1")` finds the demo like sites that are started one by one."""
-    running = stage.start(
-        "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
-    )
-    wait_for_recording(stage)
-    with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
-        hand.move(*hand.pose)
-    running.prints("; late ")
-    running.signal(signal.SIGINT)
-    assert running.code() == 130
-    assert "session play; Ctrl-C ends it" in running.text()
-    assert re.search(r"; torque \d+\.\d\d N m; age .*; late ", running.text())
-
-
 @pytest.mark.long
 def test_ctrl_c_while_drawing_keeps_the_log(stage: Stage) -> None:
     running = start_demo(stage, duration="0.5")
@@ -115,8 +108,8 @@ def test_ctrl_c_while_drawing_keeps_the_log(stage: Stage) -> None:
     log = open_log(stage.folder / "out" / "run.mcap")
     assert log.complete
     assert verify(log).identical == 1000
-    last_line = next(line for line in running.text().splitlines() if "drawn later: " in line)
-    assert f"the log is kept: {log.source}" in last_line
-    later = shlex.split(last_line.partition("drawn later: trilat ")[2])
+    words = next(line for line in running.text().splitlines() if "drawn later: " in line)
+    assert f"the log is kept: {log.source}" in words
+    later = shlex.split(words.partition("drawn later: trilat ")[2])
     done = trilat(*later, cwd=stage.folder)
     assert (done.code, (stage.folder / "out" / "report.html").exists()) == (0, True), done

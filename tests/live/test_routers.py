@@ -11,7 +11,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.net.member_keys import create_keys
 from trilat_net.net.zenoh_config import OPERATOR, RECORDER, ROUTER
 
-from .processes import PAPER, Process, Session, Stage
+from .processes import Process, Session, Stage
 
 SITES = ("m", "s")
 
@@ -25,7 +25,7 @@ class Routed(Session):
         self._network = network
 
     def network(self, name: str) -> list[str]:  # noqa: ARG002 - all of them alike
-        """Returns the options that secure a member."""
+        """How a member is secured."""
         return [*self._network]
 
     def ways(self, name: str) -> list[str]:
@@ -47,25 +47,9 @@ class Keyed(Routed):
 
 
 @pytest.mark.long
-def test_sites_with_keys_that_meet_without_a_router(stage: Stage) -> None:
-    session = Session(stage, "paper", PAPER, "--duration", "3")
-    create_keys(stage.folder / "keys", [*PAPER, RECORDER], [], 1)
-    session.endpoints = [place.replace("tcp", "tls") for place in session.endpoints]
-    session.recorder_endpoint = session.recorder_endpoint.replace("tcp", "tls")
-    for name in (RECORDER, *PAPER):
-        keys = ("--keys", str(stage.folder / "keys" / name))
-        _ = (
-            session.recorder(*keys)
-            if name == RECORDER
-            else session.site(name, "--needs-recorder", *keys)
-        )
-    session.is_reproduced()
-
-
-@pytest.mark.long
 def test_sessions_run_over_mutual_tls(stage: Stage) -> None:
-    zenoh_file = Certificates(stage.folder).zenoh_file()
-    session = Routed(stage, "1", "tls", "--zenoh-config", str(zenoh_file))
+    own = Certificates(stage.folder).zenoh_file()
+    session = Routed(stage, "1", "tls", "--zenoh-config", str(own))
     router = session.router()
     session.all()
     session.is_reproduced()
@@ -116,12 +100,12 @@ def test_all_may_stop_but_only_operators_enable(stage: Stage) -> None:
     def keys(name: str) -> tuple[str, str]:
         return "--keys", str(stage.folder / "keys" / name)
 
-    def order(command: str, whose: str) -> tuple[int, str]:
+    def order(words: str, whose: str) -> tuple[int, str]:
         ways = connection_options(session.endpoints)
-        process = stage.start(
-            f"{command} by {whose}", *command.split(), "--session", "t", *ways, *keys(whose)
+        asked = stage.start(
+            f"{words} by {whose}", *words.split(), "--session", "t", *ways, *keys(whose)
         )
-        return process.code(), process.text()
+        return asked.code(), asked.text()
 
     session.recorder(*keys(RECORDER))
     for name in SITES:
@@ -163,8 +147,8 @@ class Joined(Keyed):
     def routers(self) -> None:
         _ = self.router("public")
         for name, place in self.local.items():
-            arguments = ("--listen", place, "--connect", self.endpoint, *self.network(ROUTER))
-            self.stage.start(f"router of {name}", "router", *arguments)
+            words = ("--listen", place, "--connect", self.endpoint, *self.network(ROUTER))
+            self.stage.start(f"router of {name}", "router", *words)
 
 
 @pytest.mark.long

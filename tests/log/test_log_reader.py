@@ -11,14 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tests.log.builders import (
-    edit_log_bytes,
-    make_log,
-    make_log_bytes,
-    open_bytes,
-    simulate_bytes,
-    write_log,
-)
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from tests.log.split_logs import make_foreign_bytes
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
@@ -26,7 +19,6 @@ from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
-from trilat_net.net.messages import VERSION
 from trilat_net.net.wire import encode_state
 from trilat_net.scenario import list_shipped, load_scenario
 
@@ -37,8 +29,11 @@ TICKS = 120
 def test_equal_virtual_runs_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):
-        data = simulate_bytes(load_scenario(name, {"duration_s": 0.3}), views_hz=100.0)
-        digests.add(hashlib.sha256(data).hexdigest())
+        stream = io.BytesIO()
+        virtual.write_virtual_log(
+            load_scenario(name, {"duration_s": 0.3}), stream, views_hz=100.0
+        )
+        digests.add(hashlib.sha256(stream.getvalue()).hexdigest())
     assert len(digests) == 1
 
 
@@ -70,7 +65,7 @@ def test_plain_readers_find_every_payload_byte() -> None:
         for site, arrivals, output in virtual.execute_virtual(scenario)
     }
     reader = make_reader(io.BytesIO(make_log_bytes("paper")), validate_crcs=True)
-    count = 0
+    found = 0
     for schema, channel, message in reader.iter_messages():
         assert schema is not None
         assert schema.id != 0
@@ -80,11 +75,11 @@ def test_plain_readers_find_every_payload_byte() -> None:
         root, session, member, kind = channel.topic.removeprefix("/").split("/")
         assert (root, session) == ("trilat", "paper")
         if kind == "state":
-            count += 1
+            found += 1
             assert message.data == sent[member, message.sequence]
             assert message.publish_time == message.sequence * 1_000_000
             assert channel.metadata == {"member": member, "rate_hz": "1000"}
-    assert count == len(sent) == 3 * TICKS
+    assert found == len(sent) == 3 * TICKS
 
 
 def required_and_typed(schema: dict, value: object) -> None:
@@ -183,7 +178,7 @@ def test_a_live_log_counts_from_its_epoch() -> None:
 
 
 def test_the_reader_gives_arrays_with_time() -> None:
-    log = make_log("paper")
+    log = open_bytes(make_log_bytes("paper"))
     assert log.sites == ("m1", "m2", "s")
     assert log.complete
     m1 = log["m1"]
@@ -225,17 +220,6 @@ def test_cut_files_open_as_far_as_whole() -> None:
     assert open_bytes(data).complete
 
 
-@pytest.mark.parametrize(
-    "data", [b"", b"no log at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + b"\0" * 99]
-)
-def test_files_other_than_mcap_are_refused(data: bytes, tmp_path: Path) -> None:
-    with pytest.raises(LogError):
-        open_bytes(data)
-    path = write_log(tmp_path, data, "no.mcap")
-    with pytest.raises(LogError, match=r"no\.mcap"):
-        open_log(path)
-
-
 def test_an_mcap_file_of_others_is_refused() -> None:
     with pytest.raises(LogError, match=r"not a log of trilat-net"):
         open_bytes(make_foreign_bytes())
@@ -256,7 +240,7 @@ def test_mcap_files_using_our_names_are_refused() -> None:
 
 def test_unreadable_events_are_omitted() -> None:
     """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
-    whole = make_log("paper")
+    whole = open_bytes(make_log_bytes("paper"))
     odd = open_bytes(
         edit_log_bytes(
             make_log_bytes("paper"),
@@ -280,21 +264,6 @@ def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
             open_log(path)
 
 
-@pytest.mark.parametrize("text", ["not toml [", "name = 'x'", "\udcff"])
-def test_logs_with_unreadable_scenarios_are_refused(text: str) -> None:
-    def scenario(_: str) -> str:
-        return text.replace("\udcff", "")
-
+def test_logs_with_empty_scenarios_are_refused() -> None:
     with pytest.raises(LogError, match="scenario"):
-        open_bytes(edit_log_bytes(make_log_bytes("paper"), scenario=scenario))
-
-
-@pytest.mark.parametrize(
-    "change", [{"v": VERSION + 1}, {"q": [0.0]}, {"used": 3}, {"tick": -1}]
-)
-def test_logs_with_invalid_records_are_refused(change: dict[str, object]) -> None:
-    data = edit_log_bytes(
-        make_log_bytes("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r
-    )
-    with pytest.raises(LogError, match="record of m1"):
-        _ = open_bytes(data)["m1"].states
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), scenario=lambda _: ""))

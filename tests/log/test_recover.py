@@ -444,10 +444,6 @@ def test_exit_codes_give_the_outcome(
     )
 
 
-def test_missing_files_are_bad_input(tmp_path: Path) -> None:
-    trilat("log", "recover", "none.mcap", cwd=tmp_path).refuses("none.mcap: cannot be read")
-
-
 @pytest.mark.parametrize("command", [["log", "recover"], ["verify"]])
 def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Path) -> None:
     write_log(tmp_path, make_chunked_bytes()[:-60], "run.mcap.active")

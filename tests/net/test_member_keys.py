@@ -313,50 +313,6 @@ def test_flipped_bits_end_connections_which_return(folder: Path) -> None:
     assert "true" in after
 
 
-def test_incomplete_keys_are_refused(folder: Path, tmp_path: Path) -> None:
-    keys = read_member_keys(folder / "m1")
-    assert (keys.member, keys.members) == ("m1", ALL)
-    with pytest.raises(UsageError, match="folder of one member"):
-        read_member_keys(folder)
-    with pytest.raises(UsageError, match="No such file"):
-        read_member_keys(tmp_path)
-    with pytest.raises(UsageError, match="name a new folder"):
-        create_keys(folder, SITES, [], 30)
-    with pytest.raises(UsageError, match=r"must not be authority; this name is refused: 'm\*'"):
-        create_keys(tmp_path / "k", ["m*"], [], 30)
-    create_keys(tmp_path / "old", SITES, [], 0)
-    with pytest.raises(UsageError, match="expired on"):
-        read_member_keys(tmp_path / "old" / "m1")
-
-
-@pytest.mark.parametrize(
-    ("take", "from_", "phrase"),
-    [
-        (CERTIFICATE, "s", "is for s, but"),
-        (PRIVATE_KEY, "m2", "the private key and the certificate do not match"),
-        ("authority.pem", "", "has not signed"),
-    ],
-)
-def test_keys_of_several_sets_do_not_mix(
-    take: str, from_: str, phrase: str, folder: Path, foreign: Path, tmp_path: Path
-) -> None:
-    for file in (folder / "m1").iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    (tmp_path / PRIVATE_KEY).chmod(0o600)
-    source = folder / from_ if from_ else foreign / "m1"
-    (tmp_path / take).write_bytes((source / take).read_bytes())
-    with pytest.raises(UsageError, match=phrase):
-        read_member_keys(tmp_path)
-
-
-def test_keys_readable_by_others_are_refused(folder: Path, tmp_path: Path) -> None:
-    for file in (folder / "m1").iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    (tmp_path / PRIVATE_KEY).chmod(0o644)
-    with pytest.raises(UsageError, match="chmod 600"):
-        read_member_keys(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("listen", "open_"),
     [

@@ -122,14 +122,6 @@ def test_recorders_do_not_learn_from_recorders() -> None:
     assert RECORDER not in session.members[RECORDER].joining.membership.others
 
 
-def test_sites_still_cannot_come_late() -> None:
-    session, _ = make_running_party()
-    session.kill("s")
-    session.start("s")
-    with pytest.raises(SessionError, match="is running"):
-        session.rounds(30)
-
-
 def test_restarted_sites_are_not_awaited() -> None:
     """A member met under another boot, while the old boot's token is absent, left before the
     newcomer arrived.

@@ -246,9 +246,13 @@ def test_split_leaders_cannot_split_a_session() -> None:
 
 
 @pytest.mark.parametrize("name", SITES)
-def test_joining_a_running_session_is_refused(name: str) -> None:
+@pytest.mark.parametrize("present", [True, False])
+def test_joining_a_running_session_is_refused(name: str, present: bool) -> None:
+    """Whether the member of that name is present, or has left its place."""
     session = make_party(*SITES)
     epoch = session.agreed()
+    if not present:
+        session.kill(name)
     late = session.member(name)
     reasons = polled_until_refused(late, *session.members.values(), clock=session.clock)
     assert len(reasons) == 1

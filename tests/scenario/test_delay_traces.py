@@ -65,36 +65,6 @@ def test_traces_keep_microseconds(rows: list[tuple[int, int]]) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("content", "phrase"),
-    [
-        ("", "has no points"),
-        ("t_s,delay_ms\n# nothing\n", "has no points"),
-        ("0,5\n1,nan\n", "point 2: the delay must be from 0 to 10000 ms or 'lost', but is nan"),
-        ("0,10000.1\n", "point 1: the delay"),
-        ("0,5\ninf,5\n", "point 2: the time must be finite"),
-        ("-1,5\n", "point 1: the time must be finite and not negative"),
-        ("0,5\n2,5\n1,5\n", "point 3: the time, 1 s, must be later"),
-        ("0,5\n1e-7,5\n", "point 2"),
-        ("0,5\n1,many\n", "line 2: must have the form t_s,delay_ms or t_s,lost"),
-        ("0,5\nt_s,delay_ms\n1,6\n", "line 2: must have the form"),
-        ("0,5\n1,6,7\n", "line 2: must have the form"),
-        ("O.0,41\n1,5\n", "line 1: must have the form"),  # a broken first line is no head
-    ],
-)
-def test_invalid_traces_are_refused_with_place(
-    tmp_path: Path, content: str, phrase: str
-) -> None:
-    (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
-    with pytest.raises(ScenarioError) as error:
-        load_scenario(
-            "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}}
-        )
-    assert error.value.path == "links.m1->s.file"
-    assert phrase in error.value.problem
-    assert "delays.csv" in error.value.problem
-
-
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "latin.csv").write_bytes(b"t_s,delay_ms # \xe4\n0,5\n")
     (tmp_path / "long.csv").write_text("0," + "5" * 200_000, encoding="utf-8")
@@ -112,28 +82,6 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
 def test_overlong_traces_are_refused() -> None:
     with pytest.raises(ValueError, match="has 200001 points, but at most 200000"):
         format_trace([(n / 1000, 5.0) for n in range(MAX_TRACE_POINTS + 1)])
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "0",
-        "0 5,1 5",
-        "0 5, x 5",
-        "0 5, 0 6",
-        "5 5",
-        "0 -2",
-        "0 10000001",
-        "0 5, 1 gone",
-        "0 5 6",
-        "0 5, ",
-    ],
-)
-def test_foreign_texts_are_refused(text: str) -> None:
-    with pytest.raises(ScenarioError) as error:
-        load_scenario("paper", {"link": {"model": "trace", "trace": text}})
-    assert error.value.path.endswith(".trace")
 
 
 # In a scenario.
@@ -180,29 +128,3 @@ def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"'
     )
     assert (loaded.links["m1->s"].at_end, loaded.links["m2->s"].at_end) == ("loop", "hold")
-
-
-@pytest.mark.parametrize(
-    ("link", "path", "phrase"),
-    [
-        ('[link]\nmodel = "trace"', "links.m2->m1.file", "is missing"),
-        (
-            '[link]\nmodel = "trace"\ntrace = "0 7"\nfile = "a.csv"',
-            "link.file",
-            "either trace or file",
-        ),
-        (
-            '[link]\nmodel = "trace"\ntrace = "0 7"\nof = "m1->s"',
-            "links.m2->m1.of",
-            "the key file, which must name the log",
-        ),
-        ('[link]\nmodel = "trace"\nfile = 5', "link.file", "expected text"),
-    ],
-)
-def test_a_traces_origin_is_named_once(
-    tmp_path: Path, link: str, path: str, phrase: str
-) -> None:
-    with pytest.raises(ScenarioError) as error:
-        make_trace_scenario(tmp_path, link)
-    assert error.value.path == path
-    assert phrase in error.value.problem

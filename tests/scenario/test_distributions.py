@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.distributions import Distribution
 from trilat_net.scenario.scenario_reader import reseed_scenario
@@ -140,30 +139,3 @@ def test_replaced_numbers_stay() -> None:
 def test_an_experiment_without_operators_stays_itself() -> None:
     alone = draw_scenario(1).without_hands()
     assert parse_scenario(alone.text) == alone
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "problem"),
-    [
-        (
-            "sites.m1.q0_rad",
-            {"normal": [0.1]},
-            "sites.m1.q0_rad: must be { normal = [mean, deviation] }",
-        ),
-        ("arm.m1_kg", {"normal": [1.0, -0.1]}, "free: arm.m1_kg: must be { normal"),
-        ("arm.m1_kg", {"uniform": [2.0, 1.0]}, "free: arm.m1_kg: must be { normal"),
-        (
-            "arm.m1_kg",
-            {"normal": [1.0, 0.1], "uniform": [0.0, 1.0]},
-            "free: arm.m1_kg: must be { normal",
-        ),
-        ("sites.m1.arm.m1_kg", {"uniform": [-2.0, -1.0]}, "was drawn with seed 1"),
-        ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn.sites.m1.q0_rad.0: must be a table"),
-    ],
-)
-def test_invalid_distributions_are_refused_at_their_key(
-    key: str, value: Any, problem: str
-) -> None:
-    with pytest.raises(ScenarioError) as refused:
-        load_scenario("free", {key: value})
-    assert problem in str(refused.value)

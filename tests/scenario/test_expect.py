@@ -35,32 +35,6 @@ def test_other_keys_always_expect_something(keys: dict[str, Any]) -> None:
     assert Expect(**keys).has_expectations
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "facts"),
-    [
-        ("stabel", True, ["expect.stabel", "did you mean 'stable'"]),
-        ("stable", 1, ["expect.stable", "expected true or false"]),
-        ("rms_error_max_rad", -0.1, ["expect.rms_error_max_rad"]),
-        ("synchronised_rad", 0.0, ["expect.synchronised_rad"]),
-        ("late_samples_max", 1.5, ["expect.late_samples_max"]),
-        ("end_pose_rad", {"x": [0.0, 0.0]}, ["expect.end_pose_rad.x", "m1, m2, s"]),
-        (
-            "end_pose_rad",
-            {"m1": [0.0, 0.0], "s": [0.0]},
-            ["expect.end_pose_rad.s: must be a list of length"],
-        ),
-        ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
-    ],
-)
-def test_impossible_expectations_are_refused_with_their_key(
-    key: str, value: Any, facts: list[str]
-) -> None:
-    with pytest.raises(ScenarioError) as error:
-        load_expect(**{"peak_error_max_rad": 2.0, key: value})
-    for fact in facts:
-        assert fact in str(error.value)
-
-
 def test_a_pair_of_limits_must_leave_room() -> None:
     assert (
         find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), {"m": 2}) is None
@@ -87,38 +61,6 @@ def test_a_window_is_part_of_the_scenarios_text() -> None:
     assert parse_scenario(scenario.text).expect == scenario.expect
     assert scenario.expect.windows[0].wall_mean_n == (7.0, 9.0)
     assert "[[expect.windows]]" in scenario.text
-
-
-@pytest.mark.parametrize(
-    ("changes", "facts"),
-    [
-        (
-            {"wall_meen_n": [0, 1]},
-            ["expect.windows[0].wall_meen_n", "did you mean 'wall_mean_n'"],
-        ),
-        ({"to_s": 1.0}, ["expect.windows[0].to_s", "from_s = 1"]),
-        ({"site": "m3"}, ["expect.windows[0].site", "m1, m2, s"]),
-        ({"site": ""}, ["expect.windows[0].site", "wall_mean_n belongs to a single site"]),
-        ({"wall_mean_n": [9, 7]}, ["expect.windows[0].wall_mean_n", "[9, 7]"]),
-        ({"wall_mean_n": 8}, ["expect.windows[0].wall_mean_n"]),
-    ],
-    ids=str,
-)
-def test_invalid_windows_are_refused_with_their_key(
-    changes: dict[str, Any], facts: list[str]
-) -> None:
-    with pytest.raises(ScenarioError) as error:
-        load_expect(windows=[{**WINDOW, **changes}])
-    for fact in facts:
-        assert fact in str(error.value)
-
-
-def test_an_empty_window_is_refused() -> None:
-    with pytest.raises(
-        ScenarioError,
-        match=r"expect.windows\[0\]: expects nothing; the possible keys are error_peak_rad",
-    ):
-        load_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 
 
 def test_template_names_every_key_with_valid_values() -> None:

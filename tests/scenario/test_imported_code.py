@@ -52,23 +52,6 @@ def test_a_named_law_is_imported_only_where_defined(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "fact"),
-    [
-        ("nowhere_at_all:Law", "the module nowhere_at_all, which"),
-        ("tests.laws.deeper:Law", "the module tests.laws.deeper, which"),
-        ("sys:Law", "the module sys, which"),
-        ("tests.laws", "must be one of"),
-        (".laws:Law", "must have the form package.module:Law"),
-    ],
-)
-def test_invalid_names_are_refused_while_reading(law: str, fact: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario("two_sites", {"sites.s.control.law": law})
-    assert caught.value.path == "sites.s.control.law"
-    assert fact in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("overrides", "fact"),
     [
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
@@ -156,11 +139,6 @@ def test_overrides_reach_the_arguments_of_laws(
     changed = load_scenario(RESOLVED, overrides)
     assert tuple(changed.sites[name].control.settings for name in ("m2", "s")) == settings
     assert changed.sites["s"].control.code == LAW
-
-
-def test_settings_stand_beside_the_name_of_the_law() -> None:
-    with pytest.raises(ScenarioError, match=r"next to the key law, as in control.gain = 5"):
-        load_scenario("paper", {"control.law": LAW, "control.settings.Kd": 2})
 
 
 def test_resolved_scenarios_use_no_other_file() -> None:

@@ -214,28 +214,6 @@ def test_unfinished_output_has_an_unknown_end(
     assert ("before its first sample" in probes.summary()) != begin_known
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (
-            IPUTILS + answer_lines(1, 9) + summary_lines(3, 2),
-            "counts 3 packets, but the lines contain sequence numbers up to 9",
-        ),
-        (IPUTILS + summary_lines(9, 9), "counts 9 answers, but the lines contain 0"),
-        (IPUTILS + answer_lines(1) + IPUTILS + answer_lines(1), "several runs of ping"),
-        ("a : [0], 64 bytes, 1.0 ms\nb : [0], 64 bytes, 1.0 ms", "lines of 2 hosts, a, b"),
-        (IPUTILS + summary_lines(10**9, 0), "at most 16777216 can be read"),
-        (
-            "Reply from 192.0.2.7: bytes=32 time=1ms TTL=53\nsomething else\n",
-            "line 2 reports neither",
-        ),
-    ],
-)
-def test_contradictory_output_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(ScenarioError, match=said):
-        import_text(tmp_path, text)
-
-
 @pytest.mark.parametrize("form", ["ping", "csv", "irtt", "link"])
 @pytest.mark.parametrize(
     ("ending", "inside"),

@@ -7,7 +7,6 @@ import pytest
 
 import trilat_net as tn
 from trilat_net.core.links.philox import link_key
-from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.sample_uses import PictureDelay, draw_used_samples
 
@@ -74,19 +73,3 @@ def test_pictures_never_influence_the_run() -> None:
     }
     assert delayed.shown("m1")["s"].tolist() == [max(-1, tick - 50) for tick in range(200)]
     assert delayed.shown("m2")["s"].tolist() == plain["m2"].used["s"].tolist()
-
-
-@pytest.mark.parametrize(
-    ("view", "path"),
-    [
-        ({"model": "measured"}, "sites.m1.view.model"),
-        ({"model": "gamma", "delay_ms": 20.0}, "sites.m1.view.deviation_ms"),
-        ({"delay": 20.0}, "sites.m1.view.delay"),
-        ({"model": "gamma", "delay_ms": 9000.0, "deviation_ms": 900.0}, "sites.m1.view.model"),
-        (20.0, "sites.m1.view"),
-    ],
-)
-def test_an_invalid_view_link_is_refused(view: Any, path: str) -> None:
-    with pytest.raises(ScenarioError) as refused:
-        load_scenario("paper", {"sites.m1.view": view})
-    assert refused.value.path == path

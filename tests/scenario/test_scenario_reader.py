@@ -1,4 +1,4 @@
-"""Scenarios: every loaded scenario runs, and mistakes are refused at their place."""
+"""Scenarios: every loaded scenario runs, and every key has its value in the run."""
 
 import subprocess
 import sys
@@ -21,16 +21,6 @@ from trilat_net.scenario import (
     read_template,
 )
 from trilat_net.scenario.scenario_reader import read_shipped
-
-TEXT = read_shipped("paper")
-
-
-def refused(overrides: Any, text: str = TEXT) -> ScenarioError:
-    with pytest.raises(ScenarioError) as error:
-        parse_scenario(text, "mine.toml", overrides)
-    assert str(error.value).startswith("mine.toml: ")
-    assert error.value.exit_code == 2
-    return error.value
 
 
 @pytest.mark.parametrize("name", list_shipped())
@@ -100,13 +90,8 @@ def test_an_override_reads_key_equals_value() -> None:
     }
 
 
-@pytest.mark.parametrize("text", ["control.Kd", "=5", "", " =5"])
-def test_an_override_without_key_or_value_is_refused(text: str) -> None:
-    assert "KEY=VALUE" in str(refused([text]))
-
-
 def test_kind_overrides_replace_other_kinds() -> None:
-    """The keys may have any order, and other overrides of the same table stay."""
+    """In any order of keys; other overrides of the same table stay."""
     for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
         links = load_scenario("paper", texts).links.values()
         assert {link.describe() for link in links} == {
@@ -125,7 +110,6 @@ def test_law_overrides_take_that_laws_gains() -> None:
     scenario = load_scenario("paper", ["control.law=p_d", "control.d=7"])
     gains = scenario.setup("m1").gains
     assert (gains.law, gains.K, gains.d) == (Law.KNOWN, (10.0, 10.0), (7.0, 7.0))
-    assert refused(["control.law=p_d", "control.Kp=2"]).path == "control.Kp"
     mixed = load_scenario("paper", {"sites.s.control": {"law": "p_d"}})
     assert [mixed.setup(name).gains.law for name in mixed.names] == [
         Law.ADAPTIVE,
@@ -149,14 +133,6 @@ def test_rules_for_stale_peers_are_read() -> None:
     assert scenario.setup("s").on_stale == StaleRule(
         StaleAction.BRAKE, 120_500_000, 1_000_000_000
     )
-    for value in (0, -1, "soon"):
-        assert "age_ms" in refused({"on_stale.age_ms": value}).path
-    assert refused({"on_stale.return_s": 0}).problem
-    assert "must be 'use' or 'hold' or 'brake'" in refused({"on_stale.action": "panic"}).problem
-
-
-def test_overrides_below_a_value_are_refused() -> None:
-    assert refused(["seed.x=1"]).path == "seed"
 
 
 def test_overrides_reach_list_entries_by_number() -> None:
@@ -175,44 +151,6 @@ def test_overrides_reach_list_entries_by_number() -> None:
     tables: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
     apply_overrides(tables, ["a.0.b.1=5", "a.1.c=6"])
     assert tables == {"a": [{"b": [1, 5]}, {"c": 6}]}
-
-
-@pytest.mark.parametrize(
-    ("key", "path", "problem"),
-    [
-        (
-            "sites.s.environment.1.stiffness_n_m",
-            "sites.s.environment.1",
-            "the list has 1 entry, counted from 0",
-        ),
-        (
-            "sites.s.environment.-1.stiffness_n_m",
-            "sites.s.environment.-1",
-            "the list has 1 entry, counted from 0",
-        ),
-        (
-            "sites.s.environment.wall.stiffness_n_m",
-            "sites.s.environment.wall",
-            "the list has 1 entry, counted from 0",
-        ),
-        ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "the list is empty"),
-        ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "the list has 2 entries, counted from 0"),
-        (
-            "sites.s.q0_rad.0.x",
-            "sites.s.q0_rad.0",
-            "is the value -0.6, not a table with a key x",
-        ),
-        (
-            "sites.s.environment.0.stiffnes_n_m",
-            "sites.s.environment[0].stiffnes_n_m",
-            "'stiffness_n_m'",
-        ),
-    ],
-)
-def test_entries_outside_a_list_are_refused(key: str, path: str, problem: str) -> None:
-    reason = refused([f"{key}=1"], read_shipped("contact"))
-    assert reason.path == path
-    assert problem in reason.problem
 
 
 def test_single_numbers_apply_to_all_joints() -> None:
@@ -279,161 +217,10 @@ def test_reducible_matrices_have_no_beta() -> None:
     assert np.allclose(load_scenario("asymmetric").beta, [0.426, 0.155, 0.419], atol=5e-4)
 
 
-# Bad input.
-
-
-@pytest.mark.parametrize(
-    ("key", "nearest"),
-    [
-        ("durations_s", "duration_s"),
-        ("control.kd", "Kd"),
-        ("link.delay", "delay_ms"),
-        ("sites.m1.q0", "q0_rad"),
-        ("sites.m1.controls", "control"),
-        ("dominance.m3", "m2"),
-        ("links.m1->ss", "m1->s"),
-    ],
-)
-def test_unknown_keys_name_the_nearest(key: str, nearest: str) -> None:
-    table = {"links.m1->ss": {"delay_ms": 1.0}}.get(key, 1.0)
-    error = refused({key: table})
-    assert error.path == key
-    assert "unknown key" in error.problem
-    assert f"did you mean '{nearest}'" in error.problem
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("link.delay_ms", -5.0),
-        ("link.delay_ms", "5 ms"),
-        ("control.Kd", -1.0),
-        ("control.Kd.1", -1.0),
-        ("control.Kd[1]", [1.0, -1.0]),
-        ("rate_hz", 0),
-        ("limits.qd_limit_rad_s", -1.0),
-        ("arm.g_m_s2", "x"),
-        ("sites.s.control.Kd", -1.0),
-        ("links.m1->s.delay_ms", -5.0),
-    ],
-)
-def test_errors_name_the_key_as_written(key: str, value: object) -> None:
-    """An error names a key of all sites or links as written, in a file and in a resolved scenario."""
-    for source in ("paper", load_scenario("paper")):
-        with pytest.raises(ScenarioError) as caught:
-            load_scenario(source, {key: value})
-        assert caught.value.path == key
-
-
-def test_errors_name_the_table_of_the_file() -> None:
-    """If a file sets a key for all links, the error has the path in the file."""
-    assert TEXT.count("delay_ms = 200.0") == 1
-    error = refused({}, TEXT.replace("delay_ms = 200.0", "delay_ms = -5.0"))
-    assert error.path == "link.delay_ms"
-
-
-@pytest.mark.parametrize("text", ["links.m1-", "links.m1-=5"])
-def test_names_cut_at_a_bracket_need_quotes(text: str) -> None:
-    """A shell takes > without quotes as the name of a file for the output."""
-    with pytest.raises(ScenarioError, match="in quotes"):
-        load_scenario("paper", [text])
-
-
-def test_odd_keys_are_refused_with_valid_ones() -> None:
-    assert "valid keys are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
-
-
-@pytest.mark.parametrize(
-    ("overrides", "path"),
-    [
-        ({"link.delay_ms": -1.0}, "delay_ms"),
-        ({"link.delay_ms": 10_001.0}, "delay_ms"),
-        ({"rate_hz": 0}, "rate_hz"),
-        ({"duration_s": 0.0}, "duration_s"),
-        ({"seed": -1}, "seed"),
-        ({"control.Kd": [1.0, 2.0, 3.0]}, "control.Kd"),
-        ({"sites.s.q0_rad": [0.0]}, "sites.s.q0_rad"),
-        ({"sites.s.control.Kp": [1.0, -1.0]}, "sites.s.control.Kp[1]"),
-        ({"control.Kp": True}, "control.Kp"),
-        ({"arm.m1_kg": 0.0}, "arm.m1_kg"),
-        ({"scheme": "third_order"}, "scheme"),
-        ({"control.law": "magic"}, "control.law"),
-        ({"sites.m1.role": "boss"}, "sites.m1.role"),
-        ({"name": "two words"}, "name"),
-        ({"title": 3}, "title"),
-        ({"sites.m1": 3}, "sites.m1"),
-        ({"sites": 3}, "sites"),
-        ({"links": 3}, "links"),
-        ({"dominance.m1": 3}, "dominance.m1"),
-        ({"dominance.m1.m2": "half"}, "dominance.m1.m2"),
-        ({"sites.m1.hands": 3}, "sites.m1.hands"),
-        ({"sites.m1.hands": [3]}, "sites.m1.hands[0]"),
-        ({"sites.recorder": {}}, "sites.recorder"),
-    ],
-)
-def test_invalid_values_are_refused_with_path(overrides: dict[str, Any], path: str) -> None:
-    error = refused(overrides)
-    assert path in error.path
-    assert error.problem
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("key", ["duration_s", "dominance.m1.m2", "sites.s.q0_rad"])
-def test_infinite_numbers_are_refused(key: str, value: float) -> None:
-    error = refused({key: value})
-    assert error.path == key
-    assert "finite" in error.problem
-    assert refused({"control.Gamma": [1, 1, value, 1, 1]}).path == "control.Gamma[2]"
-
-
-@pytest.mark.parametrize(
-    ("row", "phrase"),
-    [
-        ({"m2": 0.5, "s": 0.4}, "sum to 0.9"),
-        ({"m2": 0.5, "s": 0.5 + 1e-8}, "sum to 1"),
-        ({"m2": 1.5, "s": -0.5}, "between 0 and 1"),
-        ({"m1": 0.2, "m2": 0.4, "s": 0.4}, "does not follow itself"),
-        ({}, "sum to 0"),
-    ],
-)
-def test_rows_of_alpha_are_checked(row: dict[str, float], phrase: str) -> None:
-    """Eq. (7), to 1e-9."""
-    error = refused({"dominance.m1": row})
-    assert error.path == "dominance.m1"
-    assert phrase in error.problem
-
-
-@pytest.mark.parametrize(
-    ("text", "path"),
-    [
-        ('name = "a"\n[sites.a]\n', "dominance"),
-        ('name = "a"\n[dominance]\n', "sites"),
-        ("[sites.a]\n[dominance]\n", "name"),
-        ('name = "a"\n[sites.a]\n[dominance]\na = {}', "sites"),
-        ('name = "a"\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }', "dominance.b"),
-        (
-            'name = "a"\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }\nb = { a = 1 }',
-            "links.b->a.delay_ms",
-        ),
-    ],
-)
-def test_missing_keys_are_named(text: str, path: str) -> None:
-    assert refused((), text).path == path
-
-
 def test_two_sites_and_delays_suffice() -> None:
     text = 'name = "a"\n[link]\ndelay_ms = 3\n[sites.a]\n[sites.b]\n[dominance]\na = { b = 1 }\nb = { a = 1 }'
     scenario = parse_scenario(text)
     assert (scenario.duration_s, scenario.sites["a"].rate_hz) == (20.0, 1000)
-
-
-def test_singular_arm_inertias_are_refused() -> None:
-    """Property 1 does not hold for a massless first link with a point mass at the tip of the second."""
-    assert refused({"arm.lc1_m": 0.0, "arm.I1_kg_m2": 0.0}).path.endswith("arm")
-
-
-def test_other_text_than_toml_is_refused() -> None:
-    assert "is not TOML" in str(refused((), "name = "))
 
 
 def test_files_are_read_by_path(tmp_path: Path) -> None:
@@ -458,22 +245,11 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
         assert str(path) in str(error.value)
 
 
-def test_unknown_scenarios_name_the_nearest() -> None:
-    with pytest.raises(ScenarioError, match="did you mean 'paper'") as error:
-        load_scenario("papre")
-    assert "./mine.toml" in str(error.value)
-
-
-def test_a_stale_rule_below_the_delay_is_refused() -> None:
-    rule = {"on_stale.action": "hold", "on_stale.age_ms": 350.0}
-    assert (
-        load_scenario("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action
-        == "hold"
-    )
-    for link in ({"link.delay_ms": 350.0}, {"link.playout_ms": 400.0}):
-        with pytest.raises(ScenarioError, match=r"sites\.m1\.on_stale\.age_ms.*never follow"):
-            load_scenario("paper", {**rule, **link})
-    load_scenario("paper", {"on_stale.age_ms": 1.0})  # nothing follows from it
+def test_a_stale_rule_above_the_delay_is_accepted() -> None:
+    """Without an action, the age may lie below the delay, because nothing follows from the age."""
+    changes = {"on_stale.action": "hold", "on_stale.age_ms": 350.0, "link.delay_ms": 349.0}
+    assert load_scenario("paper", changes).sites["s"].on_stale.action == "hold"
+    load_scenario("paper", {"on_stale.age_ms": 1.0})
 
 
 FIRST_READERS = """

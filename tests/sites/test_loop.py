@@ -13,7 +13,7 @@ from tests.net.waiting import sleep_for_ns
 from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
-from trilat_net.errors import SessionError
+from trilat_net.errors import RunFailed, SessionError
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net import topics
@@ -161,11 +161,59 @@ def test_diverged_records_end_runs_beyond_limits() -> None:
     assert 0 < len(alone.states) < 2000
 
 
+TIMELINE = [
+    {"at_s": 0.1, "link": "m1->s", "to": {"delay_ms": 50.0, "loss": 0.1}},
+    {"at_s": 0.2, "dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 0.2},
+    {
+        "at_s": 0.3,
+        "link": "s->m1",
+        "to": {"model": "gamma", "delay_ms": 40.0, "deviation_ms": 4.0, "playout_ms": 30.0},
+    },
+    {
+        "at_s": 0.4,
+        "link": "m2->m1",
+        "to": {"model": "ar1", "delay_ms": 40.0, "deviation_ms": 2.0, "correlation": 0.99},
+    },
+    {"at_s": 0.5, "dominance": "m1", "to": {"m2": 0.2, "s": 0.8}, "ramp_s": 0.1},
+    {"at_s": 0.54, "dominance": "m1", "to": {"m2": 1.0}},
+    {
+        "at_s": 0.6,
+        "link": "m1->s",
+        "to": {"loss": 0.2, "loss_burst": 50.0, "loss_bad": 0.99},
+    },
+    {
+        "at_s": 0.7,
+        "link": "s->m2",
+        "to": {"model": "sine", "delay_ms": 60.0, "amplitude_ms": 20.0, "period_s": 0.1},
+    },
+    {"at_s": 0.8, "link": "m1->m2", "to": {"duplicate": 0.5, "order": "in_order"}},
+    {
+        "at_s": 0.9,
+        "link": "m1->s",
+        "to": {"model": "constant", "delay_ms": 40.0, "loss": 1.0},
+    },
+]
+"""At the end the slave hears no more of m1, and holds."""
+
+
+def test_ten_timed_changes_have_live_bits(tmp_path: Path) -> None:
+    rule = {"on_stale.action": "hold", "on_stale.age_ms": 100.0}
+    changes = {"link.delay_ms": 40.0, "timeline": TIMELINE, **rule}
+    scenario = load_scenario("paper", {"duration_s": 1.2, **changes})
+    log = Session.whole(scenario, tmp_path).run()
+    assert len(log.scenario.timeline) == 10
+    assert pack_log(log) == execute_packed(scenario)
+    assert verify(log).passed
+    assert set(log["s"].mode) == {"run", "hold"}
+
+
 SCENARIOS = {
     "paper": {"duration_s": 1.2},
     "asymmetric": {"duration_s": 1.2},
     "two_sites": {"duration_s": 1.0, "sites.m.rate_hz": 333, "sites.s.rate_hz": 500},
     "paper_rods": {"duration_s": 1.0, "scheme": "digital", "link.delay_ms": 0},
+    "six_joints": {"duration_s": 0.3},
+    "unlike_arms": {"duration_s": 0.3},
 }
 
 
@@ -180,6 +228,26 @@ def test_live_loops_equal_virtual_time_bitwise(name: str, tmp_path: Path) -> Non
     ]
     assert pack_log(log) == execute_packed(scenario)
     assert verify(log).passed
+
+
+def test_a_site_beyond_limits_ends_its_session(tmp_path: Path) -> None:
+    limit = {"sites.m2.limits.qd_limit_rad_s": 0.3, "duration_s": 10.0}
+    session = Session.whole(load_scenario("paper", limit), tmp_path, ends={})
+    log = session.run()
+    assert session.ends is not None
+    for name in log.sites:
+        failed = session.ends[name]
+        assert isinstance(failed, RunFailed)
+        assert failed.exit_code == 1
+        assert "m2 diverged at t = " in str(failed)
+    assert log.complete
+    assert verify(log).passed
+    assert {event.member for event in log.events if event.kind == "diverged"} == {"m2"}
+    assert {name: log[name].mode[-1] for name in log.sites} == {
+        "m1": "run",
+        "m2": "diverged",
+        "s": "run",
+    }
 
 
 def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:

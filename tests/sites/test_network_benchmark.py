@@ -123,23 +123,6 @@ def test_measured_links_add_their_play_out() -> None:
     assert judge_network(needs, make_row(needs, 41.3))["playout_ms"] == 83
 
 
-@pytest.mark.parametrize(
-    ("arguments", "fact"),
-    [
-        (["--figure", "a.png"], "--figure: can be used only with --benchmark"),
-        (["--benchmark", "free", "--count", "9"], "--count: cannot be used with --benchmark"),
-        (["--answer", "tcp/127.0.0.1:1", "--json"], "--json: cannot be used with --answer"),
-        (["--answer", "tls/127.0.0.1:1"], "needs keys"),
-        (["--answer", "tcp/0.0.0.0:1"], "--insecure"),
-        (["--benchmark", "nothing"], "nothing"),
-        (["--benchmark", "free", "--figure", "a.gif"], "a.gif"),
-        (["--benchmark", "free", "--seconds", "0"], "--seconds"),
-    ],
-)
-def test_meaningless_settings_are_refused(arguments: list[str], fact: str, tmp_path) -> None:
-    trilat("ping", *arguments, cwd=tmp_path).refuses(fact)
-
-
 def check_result(result: Result, transports: list[str]) -> None:
     facts = result.to_dict()
     assert [transport["transport"] for transport in facts["transports"]] == transports

@@ -3,7 +3,7 @@
 import io
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from rich.console import Console
@@ -18,6 +18,7 @@ from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
 from trilat_net.execution.verification import verify
+from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
@@ -68,23 +69,48 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
 GLIDES = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 20.0}
 
 
-def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
+class StoppedArm(NamedTuple):
+    """A session of two arms, of which s is stopped, reset in vain, and enabled with m.
+
+    Attributes:
+        session: The session.
+        log: Its log.
+        answers: For each order, whether it was accepted, and the text of the answer.
+        alarms: Alarms in a terminal, as they change.
+        screen: What the terminal printed of them.
+        frames: Frames of a page.
+        changes: Sentences about orders on a page, without their time.
+    """
+
+    session: Session
+    log: Log
+    answers: list[tuple[bool, str]]
+    alarms: list[tuple[str, LifeAlarm]]
+    screen: str
+    frames: list[dict[str, Any]]
+    changes: list[str]
+
+
+@pytest.fixture(scope="module")
+def stopped_arm(tmp_path_factory: pytest.TempPathFactory) -> StoppedArm:
     session = Session.whole(
-        load_scenario("two_sites", {"duration_s": 4.0, **GLIDES}), tmp_path, ends={}
+        load_scenario("two_sites", {"duration_s": 4.0, **GLIDES}),
+        tmp_path_factory.mktemp("stopped"),
+        ends={},
     )
-    said: list[tuple[bool, str]] = []
+    answers: list[tuple[bool, str]] = []
+    alarms: list[tuple[str, LifeAlarm]] = []
+    frames: list[dict[str, Any]] = []
+    changes: list[str] = []
+    screen = io.StringIO()
 
     def order(bus: Bus, clock: RelayClock) -> None:
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
             sleep_for_ns(clock, 1_200_000_000)
-            said.extend(
+            answers.extend(
                 (answer.accepted, answer.text)
                 for answer in reach_session(bus, clock).send_order(sites, name)
             )
-
-    raised: list[tuple[str, LifeAlarm]] = []
-    frames: list[dict[str, Any]] = []
-    screen = io.StringIO()
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
@@ -93,61 +119,79 @@ def test_one_arm_stops_and_continues_alone(tmp_path: Path) -> None:
         while not watch.view.ended:
             watch.update()
             frames.extend([frame] if (frame := pages.make_frame()) else [])
-            if watch.alarms and watch.alarms != raised[-1:]:
-                raised.extend(watch.alarms)
+            if watch.alarms and watch.alarms != alarms[-1:]:
+                alarms.extend(watch.alarms)
                 console.print(*frame_alarms(watch.alarms))
             sleep_for_ns(clock, 50_000_000)
-        shown = [render_event(event) for event in watch.view.events.since(0, 400)]
-        answers = [
+        events = [render_event(event) for event in watch.view.events.since(0, 400)]
+        changes.extend(
             re.sub(r"[\d.]+ s$", "", event["text"])
-            for event in shown
+            for event in events
             if event["kind"] == "change"
-        ]
-        assert answers == [
-            "s was stopped by the operator at ",
-            "s was enabled by the operator at ",
-        ]
+        )
 
     session.stranger(order)
     session.stranger(look)
     log = session.run()
-    assert session.ends == {"m": 0, "s": 0}
+    return StoppedArm(session, log, answers, alarms, screen.getvalue(), frames, changes)
+
+
+def test_one_arm_stops_and_continues_alone(stopped_arm: StoppedArm) -> None:
+    log = stopped_arm.log
+    assert stopped_arm.session.ends == {"m": 0, "s": 0}
+    stopped, enabled = (int(stopped_arm.answers[n][1].rpartition(" ")[2]) for n in (0, 3))
+    assert set(log["s"].mode[stopped:enabled]) == {"stopped"}
+    assert log["s"].mode[enabled] == "return"
+    assert "stopped" not in set(log["m"].mode)
+    assert verify(log).identical == 8000
+
+
+def test_orders_that_fit_no_mode_are_explained(stopped_arm: StoppedArm) -> None:
+    answers = stopped_arm.answers
+    assert [accepted for accepted, _ in answers] == [True, False, False, True]
+    assert answers[1][1] == "s is in mode stopped; reset is possible only in mode fault"
+    assert answers[2][1].startswith("m is in ")
+
+
+def test_a_stop_is_an_alarm_everywhere(stopped_arm: StoppedArm) -> None:
+    """In a terminal, on a page until the arm is enabled, and at the site, which knows no names
+    of people.
+    """
     stop = LifeAlarm(
         "STOPPED", "ordered by the operator", f"trilat enable --session {SESSION} s", "enable"
     )
-    assert ("s", stop) in raised
+    assert ("s", stop) in stopped_arm.alarms
+    assert "s STOPPED" in stopped_arm.screen
+    assert stop.advice in stopped_arm.screen
     on_page = {
         "word": "STOPPED",
         "reason": "ordered by the operator",
         "advice": "",
         "order": "enable",
     }
-    assert on_page in [frame["sites"]["s"]["alarm"] for frame in frames]
-    assert frames[-1]["sites"]["s"]["alarm"] is None
-    assert "s STOPPED" in screen.getvalue()
-    assert stop.advice in screen.getvalue()
-    at_site = stop._replace(reason="it was ordered to stop")  # a site knows no names of people
-    assert any(f"s: *** {at_site}" in line for line in session.said)
-    assert [accepted for accepted, _ in said] == [True, False, False, True]
-    assert said[1][1] == "s is in mode stopped; reset is possible only in mode fault"
-    assert said[2][1].startswith("m is in ")
-    tick = int(said[0][1].rpartition(" ")[2])
-    back = int(said[3][1].rpartition(" ")[2])
-    assert set(log["s"].mode[tick:back]) == {"stopped"}
-    assert log["s"].mode[back] == "return"
-    assert "stopped" not in set(log["m"].mode)
-    assert any(event.text.endswith("s: it was ordered to stop") for event in log.events)
-    assert verify(log).identical == 8000
+    assert on_page in [frame["sites"]["s"]["alarm"] for frame in stopped_arm.frames]
+    assert stopped_arm.frames[-1]["sites"]["s"]["alarm"] is None
+    at_site = stop._replace(reason="it was ordered to stop")
+    assert any(f"s: *** {at_site}" in line for line in stopped_arm.session.said)
+
+
+def test_orders_are_events_with_their_orderer(stopped_arm: StoppedArm) -> None:
+    assert stopped_arm.changes == [
+        "s was stopped by the operator at ",
+        "s was enabled by the operator at ",
+    ]
+    texts = [event.text for event in stopped_arm.log.events]
+    assert any(text.endswith("s: it was ordered to stop") for text in texts)
 
 
 def test_sites_too_far_apart_report_once(tmp_path: Path) -> None:
-    """The start poses are 0.4 rad apart."""
+    """Their start poses are 0.4 rad apart."""
     rule = {**GLIDES, "on_stale.align_limit_rad": 0.05, "duration_s": 3.2}
     log = Session.whole(load_scenario("two_sites", rule), tmp_path).run()
-    events = [event for event in log.events if event.kind == "waiting" and event.member == "s"]
-    assert [event.t_ns // 1_000_000_000 for event in events] == [1, 2, 3]
-    assert events[0].text.startswith("s waits for its peers from t = 1.000 s: ")
-    assert events[0].text.endswith("its peers are farther away than align_limit_rad")
+    told = [event for event in log.events if event.kind == "waiting" and event.member == "s"]
+    assert [event.t_ns // 1_000_000_000 for event in told] == [1, 2, 3]
+    assert told[0].text.startswith("s waits for its peers from t = 1.000 s: ")
+    assert told[0].text.endswith("its peers are farther away than align_limit_rad")
     assert set(log["s"].mode) == {"waiting"}
 
 
@@ -158,9 +202,9 @@ def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
     def order(bus: Bus, clock: RelayClock) -> None:
         sleep_for_ns(clock, 1_200_000_000)
         said.extend(
-            answer.text
-            for answer in reach_session(bus, clock).send_order(["s"], "stop")
-            if not answer.accepted
+            one.text
+            for one in reach_session(bus, clock).send_order(["s"], "stop")
+            if not one.accepted
         )
 
     session.stranger(order)

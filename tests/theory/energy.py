@@ -37,14 +37,12 @@ class Balance:
 
     V: Array
     taken: Array
-    supplied: Array
+    given: Array
 
     @property
     def residual(self) -> float:
         """Largest error of the balance, as a share of the largest V."""
-        return float(
-            np.abs(self.V - self.V[0] + self.taken - self.supplied).max() / self.V.max()
-        )
+        return float(np.abs(self.V - self.V[0] + self.taken - self.given).max() / self.V.max())
 
 
 def left_null_vector(scenario) -> Array:
@@ -63,7 +61,7 @@ def compute_balance(run: Trajectories, beta: Array) -> Balance:
     h = 1.0 / rate_hz
     V = 0.0
     taken = 0.0
-    supplied = 0.0
+    given = 0.0
     for weight, name in zip(beta, names, strict=True):
         site = run.sites[name]
         spec = scenario.sites[name]
@@ -87,8 +85,8 @@ def compute_balance(run: Trajectories, beta: Array) -> Balance:
             loss += 0.5 * share * (Kd * (site.qd - delayed_speeds) ** 2).sum(1)
         V = V + weight * 0.5 * v
         taken = taken + weight * integrate(loss, h)
-        supplied = supplied + weight * integrate((r * -site.tau_x).sum(1), h)
-    return Balance(np.asarray(V), np.asarray(taken), np.asarray(supplied))
+        given = given + weight * integrate((r * -site.tau_x).sum(1), h)
+    return Balance(np.asarray(V), np.asarray(taken), np.asarray(given))
 
 
 def compute_shipped_balance(
@@ -99,13 +97,3 @@ def compute_shipped_balance(
         name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
     )
     return compute_balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))
-
-
-def measure_order(name: str, scheme: str, rate_hz: int) -> float:
-    """Returns the order of the balance's error from half of a rate to that rate."""
-    return float(
-        np.log2(
-            compute_shipped_balance(name, scheme, rate_hz // 2).residual
-            / compute_shipped_balance(name, scheme, rate_hz).residual
-        )
-    )

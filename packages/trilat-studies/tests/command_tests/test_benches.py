@@ -5,8 +5,6 @@ import json
 import shlex
 from pathlib import Path
 
-import pytest
-
 from tests.cli.running import trilat
 from tests.json_outline import is_documented
 
@@ -57,19 +55,3 @@ def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
     short = lines[1].replace("duration_s=20", "duration_s=0.1")
     trilat(*shlex.split(short)[1:], cwd=tmp_path).succeeds()
     assert (tmp_path / "contact-p_d-rtt68-loss10-2.mcap").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "facts"),
-    [
-        (("--study", "ful"), ["no study 'ful'", "did you mean 'full'"]),
-        (("--law", "adaptiv"), ["no law 'adaptiv'"]),
-        (("--cell", "free/p_d/rtt9"), ["no cell 'free/p_d/rtt9'"]),
-        (("--tune", "--law", "p_dd"), ["--law: p_dd is not a law of the study full"]),
-        (("--jobs", "2", "--on", "tcp://127.0.0.1:1"), ["--jobs sets the number of processes"]),
-    ],
-)
-def test_impossible_requests_are_refused_in_a_line(
-    arguments: tuple[str, ...], facts: list[str], tmp_path: Path
-) -> None:
-    trilat("bench", *arguments, cwd=tmp_path).refuses(*facts)

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
+from study_builders import SHORT
 from trilat_studies.sweep_command import parse_seed_count
 
 from tests.cli.running import trilat
@@ -59,18 +59,11 @@ def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
 
 def test_a_finished_sweep_is_not_computed_again(folder: Path) -> None:
     before = (folder / "done" / "results.csv").read_bytes()
-    for how in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
-        text = trilat("sweep", *how, cwd=folder).succeeds()
+    for arguments in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
+        text = trilat("sweep", *arguments, cwd=folder).succeeds()
         assert "12 runs are done already" in text
         assert "nothing was left to run" in text
     assert (folder / "done" / "results.csv").read_bytes() == before
-
-
-def test_a_folder_is_no_scenario(folder: Path) -> None:
-    (folder / "free").mkdir(exist_ok=True)
-    trilat("sweep", "free", "--over", "control.Kx=1,2", cwd=folder).refuses(
-        "free: control.Kx", "did you mean"
-    )
 
 
 def test_seeds_are_a_number_or_a_list() -> None:
@@ -78,30 +71,6 @@ def test_seeds_are_a_number_or_a_list() -> None:
     assert parse_seed_count("10") == 10
     assert parse_seed_count("1..3,8") == [1, 2, 3, 8]
     assert parse_seed_count("7..7") == parse_seed_count("7,") == [7]
-
-
-BAD = {
-    "no key of that name": (
-        ["--over", "link.dely_ms=0:1:1"],
-        ["link.dely_ms", "did you mean 'delay_ms'?"],
-    ),
-    "another sweep's folder": (
-        ["--over", "control.Kd=1,2", "-o", "done"],
-        ["done", "a sweep with other axes", "results cannot be mixed"],
-    ),
-    "somebody else's folder": (["--over", "control.Kd=1,2", "-o", "."], ["is not empty"]),
-    "nothing to sweep": ([], ["--over"]),
-    "no seeds": (["--over", "control.Kd=1,2", "--seeds", "5..1"], ["1..20"]),
-    "a cell of a scenario": (["--cell", "3"], ["trio.toml", "no results of a sweep"]),
-}
-
-
-@pytest.mark.parametrize("kind", BAD)
-def test_bad_input_is_one_line_without_files(kind: str, folder: Path) -> None:
-    before = sorted(folder.rglob("*"))
-    arguments, facts = BAD[kind]
-    trilat("sweep", "trio.toml", *arguments, cwd=folder).refuses(*facts)
-    assert sorted(folder.rglob("*")) == before
 
 
 def test_enormous_sweeps_are_refused_with_count_and_time(folder: Path) -> None:
@@ -164,35 +133,3 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
     assert (folder / "edges" / "margin.md").read_text().startswith("# ")
     command = facts["command"].split()
     assert command[:3] == ["trilat", "sweep", "trio.toml"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (("done", "--over", "control.Kd=1,2"), "--over is already set by the sweep"),
-        (("--resume", "done", "--seeds", "3"), "--seeds is already set by the sweep"),
-        (("trio.toml", "--resume", "done"), "--resume continues the sweep that is stored"),
-        (("done", "--cell", "12"), "numbered from 0 to 11"),
-        (("--cell", "1"), "--cell needs the results"),
-        (("--resume", "none"), "this folder contains no sweep"),
-        (("none.csv",), "no results of a sweep"),
-        (("--over", "control.Kd=1,2"), "name a scenario"),
-        (("done", "--map", "--cell", "1"), "--map and --cell cannot be combined"),
-        (("done", "--width", "7"), "--width sets the width of a map"),
-        (
-            ("done", "--map", "--width", "5"),
-            "the width of a figure must be 3.5 or 7 inches, not 5",
-        ),
-        (("done", "--margin", "control.Kd=1:4"), "--margin starts a new search in a scenario"),
-        (
-            ("trio.toml", *OVER, "--tolerance", "0.1"),
-            "--tolerance sets the tolerance of a stability limit",
-        ),
-        (("done", "--confirm", "2"), "there is no --confirm any more"),
-        (("trio.toml", *OVER, "--margin", "control.Kd=1:4"), "control.Kd: is swept twice"),
-    ],
-)
-def test_impossible_requests_are_refused_in_a_sentence(
-    folder: Path, arguments: tuple[str, ...], problem: str
-) -> None:
-    trilat("sweep", *arguments, cwd=folder).refuses(problem)

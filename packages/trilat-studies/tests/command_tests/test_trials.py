@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trial_tests.results import QUICK
+from study_builders import QUICK
 from trilat_studies.study_commands import parse_seeds
 
 from tests.cli.running import start_command, trilat
 from tests.net.waiting import until
-from trilat_net.errors import UsageError
 from trilat_net.scenario import list_shipped, load_scenario
 
 TOO_MUCH = ("--set", "expect.mean_age_max_ms=1.0")
@@ -71,23 +70,6 @@ def test_junit_is_written_for_any_outcome(folder: Path) -> None:
         assert (root.get("tests"), root.get("failures")) == ("2", failures)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("./missing.toml", "missing.toml"),
-        ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
-        ("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "the sites are m, s"),
-        ("./quick.toml", "--set", "expect.peak_error_min_rad=3.0", "peak_error_max_rad"),
-        ("./quick.toml", "--seeds", "5..1", "1..20 or 1,5,9"),
-        ("./quick.toml", "--junit", "no/folder.xml", "no/folder.xml"),
-        ("./mute.toml", "[expect]"),
-    ],
-)
-def test_bad_input_exits_2_before_any_run(arguments: tuple[str, ...], folder: Path) -> None:
-    (folder / "mute.toml").write_text(QUICK.partition("[expect]")[0])
-    trilat("test", *arguments[:-1], cwd=folder).refuses(arguments[-1])
-
-
 def test_default_is_every_shipped_scenario_with_expectations() -> None:
     """Without a name the command runs each shipped scenario that states expectations."""
     from trilat_studies.study_commands import _list_trials
@@ -107,14 +89,6 @@ def test_default_is_every_shipped_scenario_with_expectations() -> None:
 def test_seeds_are_read_as_they_are_written(first: int, count: int, others: list[int]) -> None:
     text = ",".join([f"{first}..{first + count}", *map(str, others)])
     assert parse_seeds(text) == [*range(first, first + count + 1), *others]
-
-
-@pytest.mark.parametrize(
-    "text", ["", "a", "1..", "..3", "3..1", "1,,2", "-1", "1.5", "1..9" + "9" * 30, "0..999999"]
-)
-def test_other_texts_name_no_seeds(text: str) -> None:
-    with pytest.raises(UsageError, match="seeds"):
-        parse_seeds(text)
 
 
 @pytest.mark.long

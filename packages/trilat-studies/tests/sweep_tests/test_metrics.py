@@ -8,7 +8,6 @@ import pytest
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
 
 import trilat_net
-from tests.cli.running import trilat
 from trilat_net.errors import UsageError
 from trilat_net.log.log_reader import Log
 
@@ -77,14 +76,3 @@ def test_seeds_give_a_metric_its_mean_and_interval(tmp_path: Path) -> None:
     spreads_rad = rows[rows["cell"] == 1]["spread_rms_rad"]
     assert places["spread_rms_rad_mean"][1] == pytest.approx(spreads_rad.mean(), rel=1e-12)
     assert places["spread_rms_rad_half"][1] > 0.0
-
-
-def test_unknown_metrics_are_refused_with_the_nearest(tmp_path: Path) -> None:
-    """A misspelt metric and a metric of a search are refused with what is possible."""
-    misspelt = ("--over", "link.delay_ms=20,200", "--metric", "settle")
-    done = trilat("sweep", "two_sites", *misspelt, cwd=tmp_path)
-    done.refuses("--metric", "settle", "settle_s", "docs/reference/metrics.md")
-
-    of_search = ("--margin", "control.d=0.1:3", "--metric", "settle_s")
-    done = trilat("sweep", "two_sites", *of_search, cwd=tmp_path)
-    done.refuses("--metric applies only to a sweep")
