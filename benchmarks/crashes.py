@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from tests.live.killing import SITES, killed
+from tests.live.killing import SITES, kill_recorder
 from tests.live.processes import Session, Stage
 from tests.live.small_disks import NoSmallDisk, small_disk
 from trilat_net.execution.verification import verify
@@ -29,7 +29,7 @@ def _kills() -> list[str]:
         with tempfile.TemporaryDirectory() as folder:
             stage = Stage(Path(folder))
             try:
-                done = killed(stage, random.uniform(0.2, 3.0))
+                done = kill_recorder(stage, random.uniform(0.2, 3.0))
             finally:
                 stage.clear()
             lost_ms.append(done.lost_ms)

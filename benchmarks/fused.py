@@ -11,7 +11,7 @@ import numpy as np
 from trilat_studies.gym_environment import make_env
 from trilat_studies.sweep.sweep_cell import classify_cell
 
-from tests.theory.delay_equations import equations
+from tests.theory.delay_equations import make_equations
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
@@ -32,7 +32,7 @@ def run() -> list[str]:
     lines, whole, fused_s = _both_drivers(scenario, 40)
     for tolerance in (1e-5, 1e-11):
         problem = dataclasses.replace(
-            equations(scenario), tolerance=tolerance, starts=[], pieces=[]
+            make_equations(scenario), tolerance=tolerance, starts=[], pieces=[]
         )
         begun = time.perf_counter()
         states = problem.solve(real_s).at(np.array([real_s - 1e-3]))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import trilat_net
-from tests.live.processes import HOLDER, PAPER, Session, Stage, connections
+from tests.live.processes import HOLDER, PAPER, Session, Stage, connection_options
 from tests.sites.devices import HaplyService
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
@@ -87,7 +87,7 @@ def _lead(session: Session) -> str:
             "--device",
             f"haply_inverse3={service.address}",
         )
-        program = session.stage.start("device", *words, *connections(session.endpoints))
+        program = session.stage.start("device", *words, *connection_options(session.endpoints))
         program.prints("takes hold")
         service.pressed, begun, begun_s = {"a"}, len(service.asked), time.monotonic()
         time.sleep(DEVICE_S)

@@ -23,7 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 import trilat_net
-from tests.live.browsers import launch
+from tests.live.browsers import launch_browser
 from trilat_net.net.arm_client import Hand
 
 from .stopwatch import cpu_s
@@ -160,7 +160,7 @@ def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
         live_session(Path(name) / "run") as (address, _),
         sync_playwright() as playwright,
     ):
-        browser = launch(playwright)
+        browser = launch_browser(playwright)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.goto(address)
         while not page.evaluate(_READY):

@@ -7,7 +7,7 @@ from contextlib import closing
 import numpy as np
 import zenoh
 
-from tests.live.processes import connections
+from tests.live.processes import connection_options
 from trilat_net import open_log
 from trilat_net.net.connection import find_free_endpoints
 
@@ -38,7 +38,7 @@ def measure(*, bridged: bool) -> tuple[float, float, float]:
             session.stage.start("router", "router", "--listen", router)
             words = ("--session", "t", "--ros", router, "--rate", str(RATE_HZ))
             bridge = session.stage.start(
-                "ros2", "ros2", *words, *connections(session.endpoints)
+                "ros2", "ros2", *words, *connection_options(session.endpoints)
             )
             bridge.prints("is in the graph of ROS 2")
             heard_hz, busy_percent = listen(router, bridge.pid)

@@ -21,7 +21,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 import trilat_net
 from tests.cli.running import PLAIN
-from tests.live.browsers import launch
+from tests.live.browsers import launch_browser
 from tests.live.page_client import page_client, with_query
 from tests.live.processes import PAPER, Session, Stage
 from tests.net.waiting import until
@@ -100,7 +100,7 @@ def _describe_presses() -> list[str]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "run"
         with live_session(folder, *RATE) as (address, _), sync_playwright() as playwright:
-            browser = launch(playwright, gl=False)
+            browser = launch_browser(playwright, gl=False)
             for way in WAYS:
                 presses[way] = _press_often(browser, address, way, apart_ms)
             browser.close()

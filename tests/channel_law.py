@@ -6,29 +6,31 @@ from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Talking:
-    """P+d whose spring pulls towards the messages of peers; it tells all peers its energy, and
-    each peer a target.
+    """P+d whose spring pulls towards the targets that peers send.
 
-    `told` is cumulative, so that a wrong number, once used, stays in every later record.
+    The law sends its energy to all peers, and a target to each peer. `energy_sums` accumulate, so
+    that a wrong number, once used, stays in every later record.
     """
 
     sends: ClassVar = {
         "target": {"unit": "rad", "length": "joints", "per_peer": True},
         "energy": {"unit": "J", "length": 1},
     }
-    remembers = ("told",)
+    remembers = ("energy_sums",)
 
     def __init__(self, facts: LawContext, K: float = 20.0, d: float = 8.0) -> None:
-        self.K, self.d = K, d
-        self.told = [0.0] * len(facts.peers)
+        self.K = K
+        self.d = d
+        self.energy_sums = [0.0] * len(facts.peers)
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
             now.tau[i] = now.gravity[i] - self.d * now.qd[i]
         energy = 0.0
         for j in range(len(now.peers)):
-            peer, heard = now.peers[j], now.received[j]
-            self.told[j] += now.h_s * heard.energy[0]
+            peer = now.peers[j]
+            heard = now.received[j]
+            self.energy_sums[j] += now.h_s * heard.energy[0]
             for i in range(now.joints):
                 pull = (
                     peer.alpha * self.K * (heard.target[i] - now.q[i])
@@ -37,5 +39,5 @@ class Talking:
                 )
                 now.tau[i] += pull
                 energy += 0.5 * peer.alpha * self.K * (heard.target[i] - now.q[i]) ** 2
-                now.sent[j].target[i] = now.q[i] + 0.01 * (j + 1) + 1e-3 * self.told[j]
+                now.sent[j].target[i] = now.q[i] + 0.01 * (j + 1) + 1e-3 * self.energy_sums[j]
         now.to_all.energy[0] = energy

@@ -26,7 +26,7 @@ DATA = {
     ".yaml",
     ".yml",
 }
-"""Endings of files without Python of which every word counts as defined."""
+"""Endings of other files whose words all count as defined."""
 
 _QUOTED = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 _NAME = re.compile(r"\.{0,2}[A-Za-z_]\w*(?:\.\w+)*(?:\.\.\.)?(?:\(\))?")

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import trilat_net
 from sites.site_parts import warm_up
-from tests.chains import six_joints
-from tests.task_arms import planar_task
+from tests.scenario.builders import planar_task_text, six_joint_text
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.errors import count_nouns
 from trilat_net.execution.fused import FusedRun
@@ -30,8 +29,8 @@ SHIPPED = ("paper", "six_joints", "seven_joints", "unlike_arms")
 
 
 def read_part(name: str) -> Scenario:
-    """The scenario of a part, of a moment."""
-    texts = {"six joints": six_joints, "task space": planar_task}
+    """Returns a moment of the scenario of a part."""
+    texts = {"six joints": six_joint_text, "task space": planar_task_text}
     if name in texts:
         return parse_scenario(texts[name](0.05))
     return load_scenario(name, {"duration_s": 0.05})
@@ -54,7 +53,7 @@ def compile_part(part: str) -> str:
 
 
 def compile_parts(parts: Sequence[str], cores: int) -> None:
-    """Compiles parts beside each other, and says how far it is."""
+    """Compiles parts in parallel, and prints the progress."""
     parts_text = count_nouns(len(parts), "part")
     cores_text = count_nouns(cores, "processor")
     print(
@@ -63,12 +62,12 @@ def compile_parts(parts: Sequence[str], cores: int) -> None:
     )
     with Interrupt() as interrupt, interrupt.raising(), worker_pool(cores) as pool:
         running = [pool.submit(compile_part, part) for part in parts]
-        for done, one in enumerate(as_completed(running), 1):
-            print(f"compiled {done} of {len(parts)}: {one.result()}", flush=True)
+        for done, future in enumerate(as_completed(running), 1):
+            print(f"compiled {done} of {len(parts)}: {future.result()}", flush=True)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Compiles what is named."""
+    """Compiles the named parts."""
     if arguments[:1] != ["--into"]:
         parts = arguments or OF_TESTS
         compile_parts(parts, min(count_cores(), len(parts)))

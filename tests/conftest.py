@@ -12,7 +12,7 @@ from .push_set import read_long_tests
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """On a push a property is tried with ten examples, else with a hundred."""
+    """Sets the number of examples of a property: ten on a push, else a hundred."""
     if _on_a_push(config):
         settings.load_profile("push")
 
@@ -22,19 +22,21 @@ def _on_a_push(config: pytest.Config) -> bool:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Marks tests that are dear; on a push, a property has ten examples at most."""
+    """Marks expensive tests as long, and limits properties to ten examples on a push."""
     dear = (
         frozenset() if config.pluginmanager.hasplugin("tests.push_set") else read_long_tests()
     )
     for item in items:
         if item.nodeid in dear and not item.get_closest_marker("push"):
             item.add_marker(pytest.mark.long)
-        own = getattr(
+        test_settings = getattr(
             getattr(item, "function", None), "_hypothesis_internal_use_settings", None
         )
         # a test's own number precedes
-        if own is not None and own.max_examples > 10 and _on_a_push(config):
-            item.function._hypothesis_internal_use_settings = settings(own, max_examples=10)
+        if test_settings is not None and test_settings.max_examples > 10 and _on_a_push(config):
+            item.function._hypothesis_internal_use_settings = settings(
+                test_settings, max_examples=10
+            )
 
 
 @pytest.fixture(autouse=True)

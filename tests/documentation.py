@@ -25,7 +25,7 @@ _CODE = re.compile(r"(?:from|import) \w+")
 
 
 class Block(NamedTuple):
-    """A block of a page: "python", "toml", "sh" for commands, or "" for what is only shown."""
+    """A block of a page in "python", "toml", "sh" for commands, or "" for text that is only shown."""
 
     page: str
     language: str
@@ -33,7 +33,7 @@ class Block(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its page and its first line."""
+        """The page and the first line of the block."""
         return f"{self.page}: {self.text.splitlines()[0].strip()}"
 
 
@@ -71,7 +71,7 @@ def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
             continue
         parts = re.split(r"  {2,}(?=[a-z])", line.removeprefix("$ "))[0].split(" && ")
         commands.extend(
-            (words, []) for part in parts if (words := shlex.split(part, comments=True))
+            (arguments, []) for part in parts if (arguments := shlex.split(part, comments=True))
         )
     yield from commands
 
@@ -119,7 +119,7 @@ ELSEWHERE = {
     "docs/studies/sweep.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
     "docs/studies/sweep.md: $ dask scheduler": "packages/trilat-studies/tests/test_dask_cluster.py",
 }
-"""Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
+"""First lines of blocks that need machines, a robot, a session or minutes, with the tests that cover them."""
 
 NOT_RUN = {
     "docs/maps/README.md: trilat sweep contact": "1 640 runs: minutes; it draws a map of the page",
@@ -134,7 +134,7 @@ NOT_RUN = {
     "docs/studies/train-policies.md: from stable_baselines3": "needs Stable-Baselines3; done by hand",
     "docs/sessions/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
 }
-"""Beginnings of blocks of which only the words are checked, with the reason."""
+"""First lines of blocks of which only the words are checked, with the reason."""
 
 
 def find_exception(block: Block) -> str:

@@ -1,4 +1,4 @@
-"""The view of a program in its own process on a folder that contains a planted file."""
+"""A program in its own process, started in a folder that contains a planted file."""
 
 import json
 import subprocess
@@ -9,8 +9,8 @@ from typing import Any
 import trilat_net
 
 
-def look(program: str, folder: Path) -> Any:
-    """The JSON that a program prints in its last line."""
+def run_in_folder(program: str, folder: Path) -> Any:
+    """Returns the JSON in the last line that a program prints."""
     command = [sys.executable, "-c", program, str(folder)]
     out = subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
     assert out.returncode == 0, out.stderr
@@ -18,8 +18,9 @@ def look(program: str, folder: Path) -> Any:
 
 
 def put_beside(folder: Path, room: str, file: str, text: str) -> None:
-    """Puts a file beside those of a room of the package, in a copy made of links below `folder`."""
-    at, of = folder / "trilat_net", Path(trilat_net.__file__).parent
+    """Adds a file to a subpackage, in a copy of the package that consists of links below `folder`."""
+    at = folder / "trilat_net"
+    of = Path(trilat_net.__file__).parent
     for below in (*Path(room).parts, ""):
         if at.is_symlink():  # of a file put beside others before
             at.unlink()
@@ -27,5 +28,6 @@ def put_beside(folder: Path, room: str, file: str, text: str) -> None:
         for source in of.iterdir():
             if source.name not in (below, "__pycache__") and not (at / source.name).exists():
                 (at / source.name).symlink_to(source)
-        at, of = at / below, of / below
+        at = at / below
+        of = of / below
     (at / file).write_text(text)

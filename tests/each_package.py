@@ -14,53 +14,50 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from .distributions import (
-    CORE,
-    PACKAGES,
-    ROOT,
-    bare_environment,
-    build,
-    install,
-    make_sources,
-    names_of,
-    run,
+from tests.distributions import (
+    build_distributions,
+    install_wheel,
+    list_requirement_names,
+    run_outside,
 )
 
+from .distributions import CORE, PACKAGES, ROOT, bare_environment, make_sources
+
 TEST_LIBRARIES = {"hypothesis", "playwright", "pytest", "pytest-timeout", "pytest-xdist"}
-"""What the tests of every package need beside the program, of the dependency group `dev`."""
+"""The packages of the dependency group `dev` that the tests of every package need."""
 FOUND = """
 from importlib.util import find_spec
 print(*(name for name in {names} if find_spec(name) is not None))
 print(find_spec("trilat_net").origin)
 """
 SOURCES = {"packages", "recorder", "sites", "trilat_net"}
-"""Folders at the top that the tests do not see."""
+"""Top-level folders that are hidden from the tests."""
 
 
 def make_environment(name: str, sources: Path, folder: Path) -> Path:
-    """Makes an environment with the core, one package and the libraries of tests; returns its folder."""
+    """Creates an environment with the core, one package and the libraries of tests, and returns its folder."""
     clean = folder / "clean"
-    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=folder)
+    run_outside(sys.executable, "-m", "venv", "--without-pip", clean, cwd=folder)
     for distribution in (CORE, name):
         built = folder / distribution
         built.mkdir()
         stated = tomllib.loads(
             (sources / distribution / "pyproject.toml").read_text(encoding="utf-8")
         )
-        libraries = names_of(stated["project"]["dependencies"]) - {CORE}
-        install(clean, build(sources / distribution, built)[1], libraries)
+        libraries = list_requirement_names(stated["project"]["dependencies"]) - {CORE}
+        install_wheel(clean, build_distributions(sources / distribution, built)[1], libraries)
     of_tests = stated.get("dependency-groups", {}).get("test", [])
-    install(clean, None, TEST_LIBRARIES | names_of(of_tests))
+    install_wheel(clean, None, TEST_LIBRARIES | list_requirement_names(of_tests))
     return clean
 
 
 def make_tree(name: str, folder: Path) -> Path:
-    """Makes a folder that looks like this clone to the tests of one package, without any source."""
+    """Creates a folder that looks like this clone to the tests of one package, but contains no sources."""
     tree = folder / "tree"
     tests = tree / "packages" / name / "tests"
     tests.parent.mkdir(parents=True)
     tests.symlink_to(ROOT / "packages" / name / "tests")
-    listed = run("git", "ls-tree", "--name-only", "HEAD", cwd=ROOT).split()
+    listed = run_outside("git", "ls-tree", "--name-only", "HEAD", cwd=ROOT).split()
     for top in set(listed) - SOURCES:
         (tree / top).symlink_to(ROOT / top)
     return tree
@@ -68,14 +65,16 @@ def make_tree(name: str, folder: Path) -> Path:
 
 def run_tests(name: str, sources: Path) -> int:
     """Runs the quick tests of a package; returns the exit code of pytest."""
-    with tempfile.TemporaryDirectory() as made:
-        folder = Path(made)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
         clean = make_environment(name, sources, folder)
         tree = make_tree(name, folder)
         modules = [package.replace("-", "_") for package in PACKAGES]
         code = FOUND.format(names=modules)
-        found, origin = run(clean / "bin" / "python", "-c", code, cwd=tree).splitlines()
-        assert found == name.replace("-", "_"), found
+        imported, origin = run_outside(
+            clean / "bin" / "python", "-c", code, cwd=tree
+        ).splitlines()
+        assert imported == name.replace("-", "_"), imported
         assert Path(origin).is_relative_to(clean), origin
         tests = f"packages/{name}/tests"
         settings = [
@@ -86,9 +85,11 @@ def run_tests(name: str, sources: Path) -> int:
             "-p",
             "tests.conftest",
         ]
-        words = ["-q", "-n", "auto", *settings, "-m", "not live and not long", tests]
+        options = ["-q", "-n", "auto", *settings, "-m", "not live and not long", tests]
         return subprocess.run(
-            [clean / "bin" / "python", "-m", "pytest", *words], cwd=tree, env=bare_environment()
+            [clean / "bin" / "python", "-m", "pytest", *options],
+            cwd=tree,
+            env=bare_environment(),
         ).returncode
 
 

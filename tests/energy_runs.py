@@ -1,12 +1,12 @@
-"""Runs in the compiled loop with the numbers of every tick by name, what laws send included."""
+"""Compiled runs with the numbers of every tick by name, including the messages of laws."""
 
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from tests.unit_arm import CLAMP, H50, hand, unit_scenario
-from tests.virtual_runs import sampled
+from tests.execution.builders import sample_records
+from tests.unit_arm import CLAMP, H50, make_spring_hand, make_unit_scenario
 from trilat_net.scenario import Scenario
 
 CONSTANT = {"model": "constant", "delay_ms": 200.0}
@@ -21,38 +21,45 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
-def pair(control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any) -> Scenario:
-    """A master with the hand H50 that leads only, and a slave with K and B, of laws that have them."""
+def make_energy_pair(
+    control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any
+) -> Scenario:
+    """Returns a master that leads only, with the hand H50, and a slave with K and B if the law has them."""
     follows, leads = (
         ({}, {}) if control["law"].lower().endswith("tanks") else (FOLLOWER, LEADER)
     )
     slave = {"hands": [CLAMP] if clamped else [], "control": {**control, **follows}}
     sites = {"m": {"hands": [H50], "control": {**control, **leads}}, "s": slave}
-    return unit_scenario(sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more})
+    return make_unit_scenario(
+        sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more}
+    )
 
 
-def run_contact(
+def sample_contact_run(
     delay_ms: float, duration_s: float = 20.0, loss: float = 0.0, **more: Any
 ) -> Any:
-    """A master that leads only, and a slave that 700 N m/rad and 3 N m s/rad hold; every tick."""
+    """Returns every tick of a master that leads only, and of a slave held by 700 N m/rad and 3 N m s/rad."""
     law = {"law": "tdpa", **more}
     clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
     sites = {
-        "m": {"hands": [hand(0.3, 40.0, 6.0)], "control": {**law, "K": 0.0, "B": 0.0}},
+        "m": {
+            "hands": [make_spring_hand(0.3, 40.0, 6.0)],
+            "control": {**law, "K": 0.0, "B": 0.0},
+        },
         "s": {"hands": [clamp], "control": {**law, "K": 80.0, "B": 8.0}},
     }
     link = {**CONSTANT, "delay_ms": delay_ms, "loss": loss}
-    return ticked(unit_scenario(sites, law, duration_s=duration_s, link=link))
+    return sample_every_tick(make_unit_scenario(sites, law, duration_s=duration_s, link=link))
 
 
-def ticked(scenario: Scenario, every: int = 1) -> dict[str, Any]:
+def sample_every_tick(scenario: Scenario, every: int = 1) -> dict[str, Any]:
     """Returns per site arrays with a row for every so many ticks, up to the last.
 
     They are q, qd, tau, ..., and what it sends: `to_all.H` of shape (rows, length), `sent[j].u` to peer j.
     """
     rate_hz = next(iter(scenario.sites.values())).rate_hz
     ticks = np.arange(every, round(scenario.duration_s * rate_hz) + 1, every)
-    rows = sampled(scenario, ticks / rate_hz)
+    rows = sample_records(scenario, ticks / rate_hz)
     return {
         name: _name_columns(scenario, name, site)
         for name, site in zip(scenario.names, rows, strict=True)
@@ -63,21 +70,21 @@ def _name_columns(scenario: Scenario, name: str, rows: Any) -> Any:
     columns = scenario.layout(name).columns()
     ch = rows[:, columns.pop("ch")]
     run = SimpleNamespace(
-        **{key: rows[:, one] for key, one in columns.items()}, to_all=SimpleNamespace()
+        **{key: rows[:, column] for key, column in columns.items()}, to_all=SimpleNamespace()
     )
     run.sent = [SimpleNamespace() for _ in scenario.peers(name)]
     vectors = scenario.channel(name).vectors
-    places = [(run.to_all, one) for one in vectors if not one.per_peer]
-    places += [(to, one) for to in run.sent for one in vectors if one.per_peer]
+    places = [(run.to_all, vector) for vector in vectors if not vector.per_peer]
+    places += [(to, vector) for to in run.sent for vector in vectors if vector.per_peer]
     first = 0
-    for to, one in places:
-        setattr(to, one.name, ch[:, first : first + one.length])
-        first += one.length
+    for to, vector in places:
+        setattr(to, vector.name, ch[:, first : first + vector.length])
+        first += vector.length
     return run
 
 
-def least_energy(run: dict[str, Any]) -> float:
-    """The least energy, J, that any end of a line or coupling, or any tank, has observed."""
+def find_least_energy(run: dict[str, Any]) -> float:
+    """Returns the least energy that any end of a line or coupling, or any tank, has observed, in J."""
     energies = [run[site].to_all.H for site in run if hasattr(run[site].to_all, "H")]
     energies += [
         getattr(to, name)
@@ -98,10 +105,8 @@ def draw_energy_run(law: str, seed: int) -> Scenario:
     rng = np.random.default_rng(seed)
     names = ["m1", "m2", "s"] if rng.random() < 0.65 else ["m1", "s"]
     K = round(float(np.exp(rng.uniform(np.log(20.0), np.log(300.0)))), 1)
-    B, T = (
-        round(K * float(rng.uniform(0.03, 0.15)), 2),
-        round(float(rng.uniform(20.0, 250.0)), 1),
-    )
+    B = round(K * float(rng.uniform(0.03, 0.15)), 2)
+    T = round(float(rng.uniform(20.0, 250.0)), 1)
     b = round(float(rng.uniform(2.0, 20.0)), 2)
     keys: dict[str, dict[str, Any]] = {
         "tdpa": {"K": K, "B": B},
@@ -124,7 +129,7 @@ def draw_energy_run(law: str, seed: int) -> Scenario:
     for name, to in zip(names[:-1], (0.3, -0.3), strict=False):
         k = round(float(rng.uniform(20.0, 100.0)), 1)
         sites = {
-            name: {"hands": [hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]},
+            name: {"hands": [make_spring_hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]},
             **sites,
         }
     sites = {name: sites[name] for name in names}
@@ -141,11 +146,12 @@ def draw_energy_run(law: str, seed: int) -> Scenario:
             {**change, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for change in changes
         ]
         more["dominance"] = {name: _draw_shares(rng, name) for name in names}
-    control, link = {"law": law, **keys[law]}, links[rng.integers(4)]
-    return unit_scenario(sites, control, duration_s=8.0, link=link, seed=seed, **more)
+    control = {"law": law, **keys[law]}
+    link = links[rng.integers(4)]
+    return make_unit_scenario(sites, control, duration_s=8.0, link=link, seed=seed, **more)
 
 
 def _draw_shares(rng: np.random.Generator, name: str) -> dict[str, float]:
-    first, second = (one for one in ("m1", "m2", "s") if one != name)
+    first, second = (peer for peer in ("m1", "m2", "s") if peer != name)
     share = round(float(rng.uniform(0.05, 0.95)), 3)
     return {first: share, second: round(1.0 - share, 3)}

@@ -15,6 +15,9 @@ from pathlib import Path
 
 import atheris  # type: ignore[import-not-found]
 
+from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.log.hostility import mangle_log
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # what Numba compiles cannot be instrumented
@@ -23,13 +26,12 @@ import trilat_net.core.step.site_step  # noqa: F401
 with atheris.instrument_imports(
     include=["trilat_net.log", "trilat_net.execution", "trilat_net.app.play", "mcap"]
 ):
-    from tests.log.hostility import mangled, read_by_all
-    from tests.log_editing import edited, recorded
+    from tests.log.hostility import read_by_all
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
 LOGS = (
-    edited(recorded("paper", SHORT), chunk_bytes=4096),
-    recorded("jitter", {"duration_s": 0.04}),
+    edit_log_bytes(make_log_bytes("paper", SHORT), chunk_bytes=4096),
+    make_log_bytes("jitter", {"duration_s": 0.04}),
 )
 MEMORY_MB = 512
 
@@ -49,14 +51,14 @@ class Choices:
         return self.randrange(0, 1 << 20) / (1 << 20)
 
 
-def changed(data: bytes) -> None:
+def fuzz_changed_log(data: bytes) -> None:
     """Runs once: a log, changed by the fuzzer's bytes, is read by all readers."""
     choices = Choices(data)
     log = LOGS[choices.randrange(0, len(LOGS))]
-    read(mangled(log, choices))
+    fuzz_bytes(mangle_log(log, choices))
 
 
-def read(data: bytes) -> None:
+def fuzz_bytes(data: bytes) -> None:
     """Runs once: the bytes are read by all readers."""
     PATH.write_bytes(data)
     read_by_all(PATH)
@@ -76,7 +78,7 @@ def main() -> None:
         arguments.append(str(FOLDER / "seeds"))
     limits = [f"-rss_limit_mb={MEMORY_MB}", "-timeout=120"]
     long = [] if as_bytes else ["-len_control=0", "-max_len=300"]
-    atheris.Setup([*arguments, *limits, *long], read if as_bytes else changed)
+    atheris.Setup([*arguments, *limits, *long], fuzz_bytes if as_bytes else fuzz_changed_log)
     atheris.Fuzz()
 
 

@@ -26,29 +26,29 @@ def is_documented(command: str, value: Any) -> bool:
     """True if the table has every key of a result, as it is, or with more below it."""
     keys = read_keys(command)
     return all(
-        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in keys)
-        for path in gather([value])
+        any(f"{key}.".startswith((f"{path}.", f"{path}[")) for key in keys)
+        for path in gather_types([value])
     )
 
 
-def outline(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+def iterate_outline(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
     """Yields the path of every key that holds no further ones, and its type."""
     if isinstance(value, dict) and value:
         for key, below in value.items():
-            texts = path == ".session" and all(isinstance(one, str) for one in value.values())
+            texts = path == ".session" and all(isinstance(item, str) for item in value.values())
             named = texts or bool(_NAMED.search(path))
-            yield from outline(below, f"{path}.{'*' if named else key}")
+            yield from iterate_outline(below, f"{path}.{'*' if named else key}")
     elif isinstance(value, list | tuple) and value:
         for below in value:
-            yield from outline(below, f"{path}[]")
+            yield from iterate_outline(below, f"{path}[]")
     else:
         yield path, _KINDS.get(type(value), "table" if isinstance(value, dict) else "list")
 
 
-def gather(values: list[Any]) -> dict[str, str]:
+def gather_types(values: list[Any]) -> dict[str, str]:
     """Returns the types of all keys of several samples."""
     kinds: dict[str, set[str]] = {}
-    for one in values:
-        for path, kind in outline(one):
+    for sample in values:
+        for path, kind in iterate_outline(sample):
             kinds.setdefault(path.removeprefix("."), set()).add(kind)
     return {path: " or ".join(sorted(kinds[path])) for path in sorted(kinds)}

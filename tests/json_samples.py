@@ -14,7 +14,7 @@ from tests.experiments import (
     write_hurried_pair,
     write_protocol,
 )
-from tests.json_outline import TABLE, gather
+from tests.json_outline import TABLE, gather_types
 from tests.sites.visits import ping_publishers, ping_sites
 from trilat_net.results import Result
 
@@ -87,7 +87,7 @@ HAND = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": 
 
 
 def _analyse_hurried_pair(folder: Path) -> Result:
-    """The analysis of a pair that ran into the time limit, and left questions without an answer."""
+    """Returns the analysis of a pair that ran into the time limit, and left questions without an answer."""
     hurried = folder / "hurried"
     hurried.mkdir()
     experiment = tn.run_experiment(write_hurried_pair(hurried), hurried / "out", jobs=1)
@@ -99,7 +99,7 @@ def _analyse_hurried_pair(folder: Path) -> Result:
 
 
 def _analyse_hurried_users(folder: Path) -> Result:
-    """The analysis of users of whom some ran into the time limit in one of two conditions."""
+    """Returns the analysis of users of whom some ran into the time limit in one of two conditions."""
     hurried = folder / "users"
     hurried.mkdir()
     file = write_protocol(hurried, task=REACH.replace("timeout_s = 6.0", "timeout_s = 2.6"))
@@ -141,11 +141,14 @@ def build_table() -> str:
     with tempfile.TemporaryDirectory() as folder:
         others = {**OTHERS, **OF_PEOPLE}
         samples |= {
-            name: [one.to_dict() for one in find(Path(folder))] for name, find in others.items()
+            name: [result.to_dict() for result in find(Path(folder))]
+            for name, find in others.items()
         }
     lines = ["command,key,type"]
-    for name, found in samples.items():
-        lines += [f"trilat {name},{path},{kind}" for path, kind in gather(found).items()]
+    for name, results in samples.items():
+        lines += [
+            f"trilat {name},{path},{kind}" for path, kind in gather_types(results).items()
+        ]
     return "\n".join([*lines, ""])
 
 

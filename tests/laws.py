@@ -24,7 +24,8 @@ class Adaptive:
     def torque(self, now: LawInput) -> Sequence[float]:
         q, qd, q_des, qd_des = map(np.array, (now.q, now.qd, now.q_des, now.qd_des))
         e, ed, r = control.control_errors(q, qd, q_des, qd_des, self._Lambda)
-        v, a = -self._Lambda * e, -self._Lambda * ed
+        v = -self._Lambda * e
+        a = -self._Lambda * ed
         Y = regressor(self._facts.g_m_s2, q, qd, v, a)
         Yr = np.array(control.regressor_transpose_times(Y, r))
         if now.k:
@@ -38,7 +39,8 @@ class Adaptive:
         return [*self._Yr, *self.theta_hat]
 
     def recall(self, memory: Sequence[float]) -> None:
-        self._Yr, self.theta_hat = np.array(memory[:5]), np.array(memory[5:])
+        self._Yr = np.array(memory[:5])
+        self.theta_hat = np.array(memory[5:])
 
 
 class Failing(Adaptive):
@@ -46,7 +48,8 @@ class Failing(Adaptive):
 
     def __init__(self, facts: LawContext, how: str = "nan", at: int = 3) -> None:
         super().__init__(facts)
-        self._how, self._at = how, at
+        self._how = how
+        self._at = at
 
     def torque(self, now: LawInput) -> Sequence[float]:
         wrong = self._how if now.k == self._at else ""
@@ -69,7 +72,8 @@ class Forgetful(Adaptive):
         return [*self._Yr]
 
     def recall(self, memory: Sequence[float]) -> None:
-        self._Yr, self.theta_hat = np.array(memory), np.zeros(5)
+        self._Yr = np.array(memory)
+        self.theta_hat = np.zeros(5)
 
 
 class Pair(Adaptive):
@@ -90,7 +94,3 @@ class Knowing(Adaptive):
 
 class NoLaw:
     """A class that lacks the methods of a law."""
-
-
-def no_class(_facts: LawContext) -> NoLaw:
-    return NoLaw()

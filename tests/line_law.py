@@ -23,7 +23,9 @@ class Line:
     schemes: ClassVar = ("digital",)
 
     def __init__(self, facts: LawContext, b: float = 10.0, boost: float = 1.0) -> None:  # noqa: ARG002
-        self.b, self.c, self.boost = b, (2.0 * b) ** 0.5, boost
+        self.b = b
+        self.c = (2.0 * b) ** 0.5
+        self.boost = boost
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -34,7 +36,7 @@ class Line:
                 now.sent[j].u[i] = self.boost * (self.c * now.qd[i] - v)
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """The energy of a wave is half its square; a line takes nothing and stores nothing at its ends."""
+        """Returns half the square of each wave, because the ends of a line neither dissipate nor store energy."""
 
         def half_squares(waves: list[np.ndarray]) -> list[np.ndarray]:
             return [np.cumsum(0.5 * seen.h_s * (wave**2).sum(axis=1)) for wave in waves]

@@ -18,7 +18,9 @@ def build_table() -> str:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["label", "key", "unit", "of"])
-    rows = [(one.name, one.key, one.unit, one.of) for one in quantities()]
+    rows = [
+        (quantity.name, quantity.key, quantity.unit, quantity.of) for quantity in quantities()
+    ]
     writer.writerows(sorted(rows))
     return stream.getvalue()
 

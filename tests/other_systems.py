@@ -81,7 +81,9 @@ def read_typeshed() -> tuple[dict[str, list[str]], list[str]]:
     spec = find_spec("mypy")
     assert spec is not None
     assert spec.origin is not None
-    stubs, lacks, refused = Path(spec.origin).parent / "typeshed" / "stdlib", {}, []
+    stubs = Path(spec.origin).parent / "typeshed" / "stdlib"
+    lacks = {}
+    refused = []
     for file in stubs.rglob("*.pyi"):
         body = ast.parse(file.read_text(encoding="utf-8")).body
         linux_names, *other_names = (

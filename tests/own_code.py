@@ -15,16 +15,16 @@ class Circle:
     """Moves the end effector along a circle, which starts slowly."""
 
     def __init__(self, facts: HandContext, radius_m: float = 0.1, turn_s: float = 1.5) -> None:
-        self.radius_m, self.turn_s, self.facts = radius_m, turn_s, facts
+        self.radius_m = radius_m
+        self.turn_s = turn_s
+        self.facts = facts
         self.start: Any = None
 
     def act(self, now: HandView) -> Sequence[float] | None:
         if self.start is None:
             self.start = now.pose
-        angle, size = (
-            2.0 * math.pi * now.t_s / self.turn_s,
-            self.radius_m * min(1.0, now.t_s / self.turn_s),
-        )
+        angle = 2.0 * math.pi * now.t_s / self.turn_s
+        size = self.radius_m * min(1.0, now.t_s / self.turn_s)
         moved: Sequence[float] = self.start + size * np.array(
             [math.cos(angle) - 1.0, math.sin(angle)]
         )
@@ -41,7 +41,7 @@ class Follower:
     def act(self, now: HandView) -> Sequence[float] | None:
         self.seen.append(now)
         way = sum(
-            (one.alpha * (one.q - now.q) * math.exp(-one.age_s) for one in now.peers),
+            (peer.alpha * (peer.q - now.q) * math.exp(-peer.age_s) for peer in now.peers),
             np.zeros(2),
         )
         goal: Sequence[float] = now.pose + 0.3 * way + 0.01 * now.grip * (now.target - now.pose)
@@ -53,7 +53,8 @@ class Failing(Circle):
 
     def __init__(self, facts: HandContext, how: str = "raise", at_s: float = 0.3) -> None:
         super().__init__(facts)
-        self.how, self.at_s = how, at_s
+        self.how = how
+        self.at_s = at_s
 
     def act(self, now: HandView) -> Any:
         if now.t_s < self.at_s:
@@ -85,7 +86,9 @@ class Carousel(Arm):
 
     def __init__(self, facts: PlantContext, how: str = "") -> None:
         super().__init__(facts)
-        self.count, self.how, self.t_s = len(facts.bodies_m), how, 0.0
+        self.count = len(facts.bodies_m)
+        self.how = how
+        self.t_s = 0.0
 
     def step(self, tau: Any, h_s: float) -> Sequence[Any]:
         self.t_s += h_s
@@ -107,7 +110,8 @@ class Torn(Arm):
 
     def __init__(self, facts: PlantContext, how: str = "raise") -> None:
         super().__init__(facts)
-        self.how, self.steps = how, 0
+        self.how = how
+        self.steps = 0
 
     def step(self, tau: Any, h_s: float) -> Any:
         self.steps += 1
@@ -125,8 +129,10 @@ class Torn(Arm):
         }[self.how]
 
 
-MOTOR_S, PARTS = 0.005, 5
-"""A motor's torque follows what is asked so fast, so that no acceleration steps; steps in a tick."""
+MOTOR_S = 0.005
+"""Time constant with which a motor's torque follows the law's torque, so that no acceleration jumps."""
+PARTS = 5
+"""The number of integration steps in a tick."""
 
 
 class HeldArm:
@@ -141,17 +147,26 @@ class HeldArm:
         unrest_n: float = 0.3,
     ) -> None:
         arm = facts.scenario.arms[facts.site]
-        self.theta, self.lengths = arm.theta.tolist(), arm.lengths_m
+        self.theta = arm.theta.tolist()
+        self.lengths = arm.lengths_m
         self.M, self.B, self.K = (np.reshape(matrix, (2, 2)) for matrix in (M, B, K))
-        self.q, self.qd = np.array(facts.q0_rad), np.zeros(2)
+        self.q = np.array(facts.q0_rad)
+        self.qd = np.zeros(2)
         self.at = self.look()[0]
-        self.unrest_n, self.own, self.tau = unrest_n, np.zeros(2), np.zeros(2)
+        self.unrest_n = unrest_n
+        self.own = np.zeros(2)
+        self.tau = np.zeros(2)
         self.random = np.random.default_rng(facts.seed)
 
     def look(self) -> tuple[Any, Any, Any]:
         """Returns the position of the end effector, its Jacobian, and the Jacobian's derivative."""
-        (l1, l2), (q1, q12), (w1, w12) = self.lengths, np.cumsum(self.q), np.cumsum(self.qd)
-        s1, c1, s2, c2 = l1 * np.sin(q1), l1 * np.cos(q1), l2 * np.sin(q12), l2 * np.cos(q12)
+        l1, l2 = self.lengths
+        q1, q12 = np.cumsum(self.q)
+        w1, w12 = np.cumsum(self.qd)
+        s1 = l1 * np.sin(q1)
+        c1 = l1 * np.cos(q1)
+        s2 = l2 * np.sin(q12)
+        c2 = l2 * np.cos(q12)
         J = np.array([[-s1 - s2, -s2], [c1 + c2, c2]])
         Jd = np.array([[-c1 * w1 - c2 * w12, -c2 * w12], [-s1 * w1 - s2 * w12, -s2 * w12]])
         return np.array([c1 + c2, s1 + s2]), J, Jd
@@ -159,7 +174,8 @@ class HeldArm:
     def move(self) -> tuple[Any, Any]:
         """Returns the acceleration, and the hand's torque ON the arm, in the present state."""
         at, J, Jd = self.look()
-        bend, swing = self.theta[1] * math.cos(self.q[1]), -self.theta[1] * math.sin(self.q[1])
+        bend = self.theta[1] * math.cos(self.q[1])
+        swing = -self.theta[1] * math.sin(self.q[1])
         inner = self.theta[2] + bend
         inertia = np.array([[self.theta[0] + 2.0 * bend, inner], [inner, self.theta[2]]])
         w1, w2 = self.qd
@@ -175,7 +191,8 @@ class HeldArm:
 
     def step(self, tau: Any, h_s: float) -> Sequence[Any]:
         part_s = h_s / PARTS
-        keep, follow = math.exp(-part_s / 0.1), math.exp(-part_s / MOTOR_S)
+        keep = math.exp(-part_s / 0.1)
+        follow = math.exp(-part_s / MOTOR_S)
         for _ in range(PARTS):
             self.qd = self.qd + part_s * self.move()[0]
             self.q = self.q + part_s * self.qd

@@ -13,7 +13,9 @@ class PD:
     def __init__(
         self, _facts: LawContext, K: float = 10.0, d: float = 3.0, gravity: float = 1.0
     ) -> None:
-        self.K, self.d, self.gravity = K, d, gravity
+        self.K = K
+        self.d = d
+        self.gravity = gravity
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -75,7 +77,10 @@ class Forces:
         own: float = 0.5,
         alone: bool = False,
     ) -> None:
-        self.K, self.B, self.own, self.alone = K, B, own, alone
+        self.K = K
+        self.B = B
+        self.own = own
+        self.alone = alone
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):

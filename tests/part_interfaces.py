@@ -46,7 +46,8 @@ def list_crossing_imports() -> list[CrossingImport]:
     for path in house.files():
         side = house.find_border(house.dotted(path))
         for *module, name in house.written_imports(path):
-            base, below = ".".join(module), ".".join((*module, name))
+            base = ".".join(module)
+            below = ".".join((*module, name))
             package = house.find_package(base) or house.find_package(below)
             if package not in (None, below) and house.find_border(package) != side:
                 imports.append(CrossingImport(path, package, base, name))

@@ -19,7 +19,8 @@ class Line:
     needs_model = True
 
     def __init__(self, facts: LawContext, K: float = 20.0, fail_at: int = -1) -> None:
-        self.K, self.fail_at = K, fail_at
+        self.K = K
+        self.fail_at = fail_at
         self.integral = [[0.0] * facts.joints for _ in facts.peers]
         self.count = 0
         self.signs = tuple(1 if i % 2 else -1 for i in range(facts.joints))
@@ -78,7 +79,9 @@ class Refused:
     remembers = ()
 
     def __init__(self, _facts: LawContext) -> None:
-        self.name, self.work, self.limits = "x", [0.0, 0.0], {"low": 0.0}
+        self.name = "x"
+        self.work = [0.0, 0.0]
+        self.limits = {"low": 0.0}
 
     def double(self, x: float) -> float:
         return 2.0 * x
@@ -149,7 +152,8 @@ class Arithmetic:
     """P+d without memory, of whole vectors."""
 
     def __init__(self, _facts: LawContext) -> None:
-        self.K, self.d = 20.0, 5.0
+        self.K = 20.0
+        self.d = 5.0
 
     def torque(self, now: LawInput) -> Any:
         pulls = [peer.alpha * (now.q - peer.q) for peer in now.peers]

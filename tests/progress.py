@@ -31,18 +31,22 @@ class Progress:
     """
 
     def __init__(self, config: pytest.Config, name: str) -> None:
-        self._config, self._name = config, name
-        self._total, self._done, self._failed = 0, 0, 0
+        self._config = config
+        self._name = name
+        self._total = 0
+        self._done = 0
+        self._failed = 0
         self._began_s = self._printed_s = time.monotonic()
         self._expected_s: float | None = (
             config.cache.get(_KEY + name, None) if config.cache else None
         )
 
     def begin(self, total: int) -> None:
-        """Says how many tests there are, and how long they took before."""
+        """Prints the number of tests, and the duration of the previous run."""
         if self._total:
             return  # of another worker: all have the same tests
-        self._total, self._began_s = total, time.monotonic()
+        self._total = total
+        self._began_s = time.monotonic()
         known = (
             "" if self._expected_s is None else f", about {format_duration(self._expected_s)}"
         )
@@ -69,7 +73,7 @@ class Progress:
         )
 
     def end(self) -> None:
-        """Says how long the run took, and keeps that."""
+        """Prints the duration of the run, and stores it."""
         spent_s = time.monotonic() - self._began_s
         self._print(f"{self._done} tests in {format_duration(spent_s)}")
         if self._config.cache and self._done == self._total:
@@ -116,7 +120,7 @@ class _Hooks:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_report_teststatus(self, report: Any) -> tuple[str, str, str] | None:
-        """Lets what passed print no letter."""
+        """Prints no letter for a test that passed."""
         if (
             report.passed
             and getattr(report, "when", "") == "call"

@@ -21,12 +21,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LONG_TESTS = Path(__file__).with_name("long_tests.txt")
 DEAR_S = 0.1
-"""Processor time of a test, children included, that makes it dear."""
+"""Processor time, including child processes, from which a test is expensive."""
 COSTLY = ("core", "execution", "log", "golden", "analysis", "certificate")
 COSTLY_DEAR_S = 0.3
-"""The same where an error costs most: bits, logs and verdicts."""
+"""The same limit for tests of bits, logs and verdicts, where an error costs most."""
 MOST_S = 2.5
-"""The cheapest test of a file stays, however dear it is, if it takes no more than this."""
+"""The cheapest test of a file stays in the push set if it takes no more than this time."""
 _TIMES = "TRILAT_TEST_TIMES"
 
 

@@ -27,13 +27,13 @@ FIRST = [
     "trilat sim two_sites --duration 20 -o sim.mcap",
     "trilat keys pair lab",
 ]
-"""Makes what several chains need."""
+"""Commands that write the files which several chains need."""
 
 SHORTEN = (
     r"sed -i -E '/^\[conditions\.(delay_100|jitter_300)\]/,/^$/d; "
     r"s/^(participants) = .*/\1 = 2/; s/^(trials) = .*/\1 = 1/; s/^(practice) = .*/\1 = 0/' reaching.toml"
 )
-"""Makes an experiment of twelve participants one of two, with a trial in each of two conditions."""
+"""A program that shortens an experiment to two participants, with a trial in each of two conditions."""
 
 CHAINS = [
     [
@@ -99,7 +99,7 @@ CHAINS = [
         "trilat experiment analyse reaching",
     ],
 ]
-"""Needs no network; each chain in a folder of its own, in which the files of `FIRST` lie."""
+"""Chains of commands without a network; each runs in its own folder, which has the files of `FIRST`."""
 
 
 class LiveSession(NamedTuple):
@@ -133,20 +133,20 @@ ALONE = [
     "trilat demo two_sites --duration 1",
     "trilat replay sim.mcap --rate max",
 ]
-"""Uses the network of this machine, one after another, after the live session."""
+"""Commands that use the network of this machine, in this order, after the live session."""
 AGAINST = {
     "trilat ping --benchmark p_d_margin --connect tcp/127.0.0.1:7447 --seconds 2": (
         "trilat ping --answer tcp/0.0.0.0:7447 --insecure"
     )
 }
-"""What needs another machine, here this one, and what runs on that machine until Ctrl-C."""
+"""Commands that need another machine, here this one, each with the command that runs there until Ctrl-C."""
 INTERRUPTED = {"trilat router": "listening at"}
-"""What goes on until Ctrl-C, and what it prints once it works."""
+"""Commands that run until Ctrl-C, each with the text that it prints once it works."""
 ENDED_BY_CTRL_C = (0, 130)
 
 
 def list_all() -> list[str]:
-    """Every command of this table."""
+    """Returns every command of this module."""
     chained = [command for chain in CHAINS for command in chain]
     made_against = [*AGAINST, *AGAINST.values()]
     return [
@@ -162,7 +162,7 @@ def list_all() -> list[str]:
 
 
 def read_listed_commands() -> set[str]:
-    """The commands that the lists of docs/commands.md name, as in "log info", and whole groups, as in "keys"."""
+    """Returns the commands and groups that the lists of docs/commands.md name, as in "log info" and "keys"."""
     text = (ROOT / "docs/commands.md").read_text(encoding="utf-8")
     named: set[str] = set()
     for row in re.findall(r"^- (`trilat .*?`): ", text, re.MULTILINE):
@@ -173,9 +173,9 @@ def read_listed_commands() -> set[str]:
             ]
             group = parts[0][:-1] if len(parts) > 1 else []
             named |= {
-                " ".join([*group, *words] if n else words)
-                for n, words in enumerate(parts)
-                if words
+                " ".join([*group, *arguments] if n else arguments)
+                for n, arguments in enumerate(parts)
+                if arguments
             }
     return {name.split(" '")[0] for name in named}
 
@@ -225,7 +225,9 @@ def list_unlike_commands() -> list[str]:
         command
         for _, commands in read_wishes()
         for command in commands
-        if not any(f"{one} ".startswith(f"{_drop_log_names(command)} ") for one in run)
+        if not any(
+            f"{executed} ".startswith(f"{_drop_log_names(command)} ") for executed in run
+        )
     ]
 
 

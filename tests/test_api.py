@@ -41,7 +41,7 @@ def test_completions_are_the_existing_names() -> None:
     ],
 )
 def test_a_missing_package_shows_in_the_call(package: str) -> None:
-    """In an interpreter of its own, since earlier imports would stay."""
+    """The call runs in a separate interpreter, since earlier imports would stay."""
     script = f"""
 import sys
 sys.modules[{package!r}] = None
@@ -192,20 +192,20 @@ def test_results_print_as_their_command_does(
         "certify": ["--all"],
         "metrics": ["--all"],
     }.get(command, [])
-    found = RESULTS[command](file)
+    result = RESULTS[command](file)
     printed = trilat(*command.split(), file, *more, cwd=Path.cwd())
-    assert found.summary().split() == (printed.out + printed.err).split()
+    assert result.summary().split() == (printed.out + printed.err).split()
     as_json = json.loads(trilat(*command.split(), file, *more, "--json", cwd=Path.cwd()).out)
     assert {**as_json, "file": None} == {
-        **json.loads(json.dumps(found.to_dict())),
+        **json.loads(json.dumps(result.to_dict())),
         "file": None,
     }
-    assert "\n" not in repr(found)
-    assert repr(found).startswith(f"<{type(found).__name__} ")
-    assert _Texts(found._repr_html_()).words == found.summary().split()
-    assert is_documented(command, found.to_dict())
-    frame = found.to_frame()
-    assert len(frame) == len(found.to_rows()) > 0
+    assert "\n" not in repr(result)
+    assert repr(result).startswith(f"<{type(result).__name__} ")
+    assert _Texts(result._repr_html_()).words == result.summary().split()
+    assert is_documented(command, result.to_dict())
+    frame = result.to_frame()
+    assert len(frame) == len(result.to_rows()) > 0
 
 
 def test_saved_simulations_equal_the_commands_files(tmp_path: Path) -> None:
@@ -334,8 +334,8 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("what", WRONG)
 def test_python_errors_have_one_type_with_arguments(what: str, file: Path) -> None:
-    call, told = WRONG[what]
-    with pytest.raises(TrilatError, match=told) as caught:
+    call, phrase = WRONG[what]
+    with pytest.raises(TrilatError, match=phrase) as caught:
         call(file)
     assert "--" not in str(caught.value)
 
@@ -358,8 +358,8 @@ def test_numbers_of_numpy_are_numbers() -> None:
         "seed": np.int64(3),
     }
     same = {"control.Kd": 5.0, "control.Kp": 2.0, "seed": 3, "duration_s": 0.5}
-    given = tn.load_scenario("two_sites", keys, duration_s=np.float32(0.5))
-    assert given == tn.load_scenario("two_sites", same)
+    scenario = tn.load_scenario("two_sites", keys, duration_s=np.float32(0.5))
+    assert scenario == tn.load_scenario("two_sites", same)
 
 
 def test_a_law_is_given_as_its_class() -> None:

@@ -348,29 +348,29 @@ STATED: list[tuple[str, str, float, float]] = [
 """Page, words, the number in them, and the program's own."""
 
 
-def flat(text: str) -> str:
+def join_lines(text: str) -> str:
     return " ".join(text.split())
 
 
 @pytest.mark.parametrize(
-    ("page", "phrase", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
+    ("page", "phrase", "number", "limit"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
 )
 def test_limits_on_pages_are_the_programs(
-    page: str, phrase: str, number: float, own: float
+    page: str, phrase: str, number: float, limit: float
 ) -> None:
-    assert phrase in flat(find_page(page).read_text(encoding="utf-8"))
-    assert number == pytest.approx(own, rel=1e-12)
+    assert phrase in join_lines(find_page(page).read_text(encoding="utf-8"))
+    assert number == pytest.approx(limit, rel=1e-12)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_sections_with_numbers_have_their_source(page: Path) -> None:
     """A command, a test, or a row above that compares a limit with the program's."""
-    limits = [words for name, words, *_ in STATED if name == page.name]
+    limits = [phrase for name, phrase, *_ in STATED if name == page.name]
     lacking = [
         section.partition("\n")[0]
         for section in re.split(r"(?m)^(?=#{1,3} )", page.read_text(encoding="utf-8"))
         if NUMBER.search(section) and not EVIDENCE.search(section)
-        if not any(words in flat(section) for words in limits)
+        if not any(phrase in join_lines(section) for phrase in limits)
     ]
     assert not lacking
 
@@ -394,7 +394,7 @@ def test_tests_named_on_pages_exist(page: Path) -> None:
     assert len(names) > 15 or page.name != "errata-proof.md"
     for name, rest in names:
         known = name in files or any(
-            one.startswith(name) if rest else one == name for one in functions
+            function.startswith(name) if rest else function == name for function in functions
         )
         assert known, name
 
@@ -403,8 +403,8 @@ def test_operators_environments_and_laws_stand_in_tables() -> None:
     pages = ("docs/reference/laws.md", "docs/reference/operators.md")
     text = "".join((ROOT / page).read_text(encoding="utf-8") for page in pages)
     kinds = [
-        str(one.__struct_config__.tag)
-        for one in get_args(operators.Operator | operators.Environment)
+        str(kind.__struct_config__.tag)
+        for kind in get_args(operators.Operator | operators.Environment)
     ]
     assert [
         kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text

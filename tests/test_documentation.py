@@ -24,7 +24,7 @@ import tomli_w
 from latex2mathml.converter import convert
 
 import trilat_net as tn
-from tests.cli.running import parses, trilat
+from tests.cli.running import assert_parses, trilat
 from tests.documentation import (
     ELSEWHERE,
     NOT_RUN,
@@ -37,7 +37,7 @@ from tests.documentation import (
 )
 from tests.golden.surface import all_options
 from tests.live.processes import BEGUN, Process
-from tests.scenario.round_trips import irtt
+from tests.scenario.round_trips import write_irtt_file
 
 BLOCKS = [block for page in PAGES for block in find_blocks(page)]
 SCENARIOS = resources.files("trilat_net") / "scenarios"
@@ -82,9 +82,9 @@ def test_no_formula_breaks_its_table(page: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_parse_as_written(page: str) -> None:
     for block in find_blocks(page):
-        for words, _ in read_commands(block.text) if block.language == "sh" else ():
-            if words[0] == "trilat":
-                parses(words)
+        for arguments, _ in read_commands(block.text) if block.language == "sh" else ():
+            if arguments[0] == "trilat":
+                assert_parses(arguments)
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -124,11 +124,11 @@ SCENARIO_OF = {
 """By page the scenario into which its settings are put."""
 
 
-def merge(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
+def merge_tables(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
     both = dict(base)
     for key, value in more.items():
         nested = isinstance(value, dict) and isinstance(both.get(key), dict)
-        both[key] = merge(both[key], value) if nested else value
+        both[key] = merge_tables(both[key], value) if nested else value
     return both
 
 
@@ -172,7 +172,7 @@ def test_settings_make_a_scenario(
     )
     stated = tomllib.loads(text)
     (tmp_path / "arm6.urdf").write_text((SCENARIOS / "arm6.urdf").read_text(encoding="utf-8"))
-    (tmp_path / "whole.toml").write_text(tomli_w.dumps(merge(base, stated)))
+    (tmp_path / "whole.toml").write_text(tomli_w.dumps(merge_tables(base, stated)))
     scenario = tn.load_scenario(tmp_path / "whole.toml")
     for key in ("arm", "on_stale"):
         if key in stated:
@@ -251,7 +251,7 @@ OF_RUNS = {
 """Pages whose blocks are about run.mcap, and its scenario."""
 
 
-def prepare(page: str, folder: Path) -> None:
+def write_assumed_files(page: str, folder: Path) -> None:
     """Makes the files that a page assumes."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
@@ -263,7 +263,7 @@ def prepare(page: str, folder: Path) -> None:
         (code, *_) = find_blocks(page)
         (folder / "my_policy.py").write_text(code.text)
     if page == "docs/extend/delay-traces.md":
-        irtt(folder, zipped=True)
+        write_irtt_file(folder, zipped=True)
     if page == "docs/extend/arms.md":
         (name_block,) = (block for block in find_blocks(page) if block.text.startswith("name"))
         (folder / "mine.toml").write_text(write_own_arm(folder, name_block.text))
@@ -273,7 +273,7 @@ def prepare(page: str, folder: Path) -> None:
     "page", list_pages(COMMAND_PAGES - {"docs/tutorials/lab.md"}, PUSHED_COMMAND_PAGES)
 )
 def test_page_commands_print_their_shown_output(page: str, tmp_path: Path) -> None:
-    prepare(page, tmp_path)
+    write_assumed_files(page, tmp_path)
     for block in find_blocks(page):
         if block.language != "sh" or find_exception(block):
             continue
@@ -297,7 +297,7 @@ def test_documented_hands_take_and_release_arms(tmp_path: Path) -> None:
     try:
         sites[0].prints(BEGUN)
         names: dict[str, Any] = {"__name__": "page"}
-        run_python("docs/sessions/live-hands.md", tmp_path, names)
+        run_page_python("docs/sessions/live-hands.md", tmp_path, names)
         assert len(names["hand"].pose) == 2
     finally:
         for site in sites:
@@ -335,7 +335,7 @@ AT_HAND = {
 """What a page takes for granted in its code."""
 
 
-def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> str:
+def run_page_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> str:
     """Runs the code of a page in a folder, in one namespace; returns its output."""
     space: dict[str, Any] = {"__name__": "page"} if names is None else names
     stream = StringIO()
@@ -414,9 +414,9 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 
 @pytest.mark.parametrize("page", list_pages(PYTHON_PAGES - OF_THEIR_OWN, PUSHED_PYTHON_PAGES))
 def test_page_code_finds_its_stated_results(page: str, tmp_path: Path) -> None:
-    prepare(page, tmp_path)
+    write_assumed_files(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
-    output = run_python(page, tmp_path, names)
+    output = run_page_python(page, tmp_path, names)
     if page in CHECKS:
         CHECKS[page](output, names)
     else:
@@ -478,7 +478,7 @@ def test_code_about_sweeps_reads_their_results(tmp_path: Path) -> None:
     ]
     trilat("sweep", "p_d_margin", *over, cwd=tmp_path).succeeds()
     names: dict[str, Any] = {"__name__": "page"}
-    run_python("docs/reference/sweep-results.md", tmp_path, names)
+    run_page_python("docs/reference/sweep-results.md", tmp_path, names)
     assert len(names["results"].rows) == names["plan"].cells == 135
     assert names["least"].keys() <= {0.0, 100.0}
 

@@ -28,10 +28,10 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installs]:
     """Makes the entry points of this process those of a test; without any, no package is installed."""
 
     def install(group: str = "", **values: str) -> None:
-        found = [EntryPoint(name.replace("_", "-"), values[name], group) for name in values]
+        entries = [EntryPoint(name.replace("_", "-"), values[name], group) for name in values]
 
         def list_entries(group: str) -> list[EntryPoint]:
-            return [entry for entry in found if entry.group == group]
+            return [entry for entry in entries if entry.group == group]
 
         monkeypatch.setattr(entry_points, "entry_points", list_entries)
         find_entries.cache_clear()
@@ -41,7 +41,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installs]:
     find_entries.cache_clear()
 
 
-def stated(package: str) -> dict[str, dict[str, str]]:
+def read_entry_points(package: str) -> dict[str, dict[str, str]]:
     text = (ROOT / "packages" / package / "pyproject.toml").read_text(encoding="utf-8")
     entries: dict[str, dict[str, str]] = tomllib.loads(text)["project"]["entry-points"]
     return entries
@@ -49,11 +49,13 @@ def stated(package: str) -> dict[str, dict[str, str]]:
 
 @pytest.mark.parametrize("package", PACKAGE_COMMANDS)
 def test_packages_register_their_documented_names(package: str) -> None:
-    assert set(stated(package)[COMMANDS]) == set(PACKAGE_COMMANDS[package])
-    functions = stated(package).get(FUNCTIONS, {})
+    assert set(read_entry_points(package)[COMMANDS]) == set(PACKAGE_COMMANDS[package])
+    functions = read_entry_points(package).get(FUNCTIONS, {})
     assert set(functions) == set(PACKAGE_FUNCTIONS.get(package, "").split())
-    assert set(stated(package).get(HOOKS, {})) == set(PACKAGE_HOOKS.get(package, "").split())
-    for group, values in stated(package).items():
+    assert set(read_entry_points(package).get(HOOKS, {})) == set(
+        PACKAGE_HOOKS.get(package, "").split()
+    )
+    for group, values in read_entry_points(package).items():
         assert {name: find_entries(group)[name].value for name in values} == values
 
 
@@ -90,7 +92,8 @@ def test_other_packages_add_names_without_replacing_any(
     other = ModuleType("other_package")
     other.greeting = "hello"  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "other_package", other)
-    before, simulate = dir(tn), tn.simulate
+    before = dir(tn)
+    simulate = tn.simulate
     value = "other_package:greeting"
     installed(FUNCTIONS, greeting=value, simulate=value, sweep=value)
     assert tn.greeting == "hello"

@@ -18,11 +18,11 @@ import pytest
 from trilat_ros2.ros2_bridge import refuse_other_robots
 
 import trilat_net
-from tests.log_editing import recorded
-from tests.net.waiting import until
+from tests.log.builders import make_log_bytes, write_log
+from tests.net.waiting import sleep_for_ns, until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reached
+from tests.sites.sessions import SESSION, Session, reach_session
 from trilat_net.app.running_session import open_hand
 from trilat_net.log.ros2.topic_names import TopicTable
 from trilat_net.net.arm_client import SwitchClient
@@ -48,7 +48,7 @@ def test_a_look_into_a_log(
 ) -> None:
     if not polars:
         monkeypatch.setitem(sys.modules, "polars", None)
-    (tmp_path / "run.mcap").write_bytes(recorded("paper"))
+    write_log(tmp_path, make_log_bytes("paper"))
     monkeypatch.setattr(sys, "argv", [str(LOOK), "run.mcap"] if polars else [str(LOOK)])
     runpy.run_path(str(LOOK), run_name="__main__")
     plt.close("all")
@@ -81,7 +81,10 @@ class PinnedArm:
     """Stands in for a hand of a session whose arm stays still: a spring of 300 N/m at one place."""
 
     def __init__(self, rounds: float = math.inf) -> None:
-        self.target, self.moves, self.released, self.rounds = (1.0, 0.5), 0, 0, rounds
+        self.target = (1.0, 0.5)
+        self.moves = 0
+        self.released = 0
+        self.rounds = rounds
         self.pose = self.target
 
     @property
@@ -94,7 +97,8 @@ class PinnedArm:
         return tuple(300.0 * (a - b) for a, b in zip(self.target, self.pose, strict=True))
 
     def move(self, *target: float) -> None:
-        self.target, self.moves = target, self.moves + 1
+        self.target = target
+        self.moves = self.moves + 1
 
     def release(self) -> None:
         self.released += 1
@@ -123,14 +127,14 @@ def test_a_device_rests_where_hand_and_user_balance(
 
 def device_of(name: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Any:
     """Returns the device with which an example leads m1 of `play`."""
-    led: dict[str, Any] = {}
-    session = SimpleNamespace(lead=lambda site, device: led.update({site: device}))
+    devices: dict[str, Any] = {}
+    session = SimpleNamespace(lead=lambda site, device: devices.update({site: device}))
     monkeypatch.setattr(
         trilat_net, "session", lambda name, connect: {("play", None): session}[name, connect]
     )
     monkeypatch.setattr(sys, "argv", [name, "play", "m1", *options])
     runpy.run_path(str(LOOK.with_name(name)), run_name="__main__")
-    return led["m1"]
+    return devices["m1"]
 
 
 def test_force_of_the_haply_example_is_smooth(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,7 +222,8 @@ def test_sticks_move_targets_and_buttons_let_go(monkeypatch: pytest.MonkeyPatch)
     the target there.
     """
     codes = SimpleNamespace(EV_ABS=3, EV_KEY=1, ABS_X=0, ABS_Y=1, BTN_SOUTH=304)
-    at_rest, rounds = SimpleNamespace(min=0, max=255), itertools.count()
+    at_rest = SimpleNamespace(min=0, max=255)
+    rounds = itertools.count()
     script = {0: (3, 0, 255), 60: (3, 0, 128), 80: (1, 304, 1)}
 
     def read_one() -> SimpleNamespace | None:
@@ -288,9 +293,9 @@ def test_programs_hand_over_without_a_step(
 
     def act(bus: Bus, clock: RelayClock) -> None:
         def wait_s(time_s: float) -> None:
-            clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+            sleep_for_ns(clock, round(time_s * 1e9))
 
-        running = reached(bus, clock)
+        running = reach_session(bus, clock)
         wait_s(1.0)
         with (
             open_hand(bus, clock, SESSION, "m2", scenario) as program,
@@ -317,10 +322,10 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
 
     def act(bus: Bus, clock: RelayClock) -> None:
         def wait_s(time_s: float) -> None:
-            clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+            sleep_for_ns(clock, round(time_s * 1e9))
 
         with (
-            reached(bus, clock) as running,
+            reach_session(bus, clock) as running,
             open_hand(bus, clock, SESSION, "m1", scenario) as hand,
             open_hand(bus, clock, SESSION, "m2", scenario) as follower,
         ):
@@ -356,10 +361,8 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
 def test_people_take_over_from_failing_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a ramp the slave reaches its goal, with smaller steps of the reference than by a jump."""
     monkeypatch.syspath_prepend(LOOK.parent)
-    takeover, weights = (
-        runpy.run_path(str(LOOK.with_name("takeover.py"))),
-        np.array([0.95, -0.3, 0.3, 0.5]),
-    )
+    takeover = runpy.run_path(str(LOOK.with_name("takeover.py")))
+    weights = np.array([0.95, -0.3, 0.3, 0.5])
     left, abrupt, blended = (
         takeover["run"](weights, 3, ramp_s) for ramp_s in takeover["WAYS"].values()
     )

@@ -34,35 +34,39 @@ from trilat_net.presentation.export import EXPORT_MANIFEST
 from trilat_net.work.study_folder import extend_file
 
 
-def everything(folder: Path) -> dict[str, str]:
+def read_folder(folder: Path) -> dict[str, str]:
     return {
         str(path.relative_to(folder)): path.read_text() if path.is_file() else ""
         for path in sorted(folder.rglob("*"))
     }
 
 
-def make(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
-    with stage_output(path, force=force, manifest=EXPORT_MANIFEST if folder else None) as made:
-        (made / EXPORT_MANIFEST if folder else made).write_text(text)
+def write_output(path: Path, text: str, *, folder: bool, force: bool = False) -> None:
+    with stage_output(
+        path, force=force, manifest=EXPORT_MANIFEST if folder else None
+    ) as staged:
+        (staged / EXPORT_MANIFEST if folder else staged).write_text(text)
 
 
 @pytest.mark.parametrize("folder", [False, True])
 def test_only_the_finished_output_remains(folder: bool, tmp_path: Path) -> None:
-    make(tmp_path / "out", "1", folder=folder)
+    write_output(tmp_path / "out", "1", folder=folder)
     expected_files = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
-    assert everything(tmp_path) == expected_files
+    assert read_folder(tmp_path) == expected_files
     with pytest.raises(
         UsageError, match="exists; choose another name, or replace it with force=True"
     ):
-        make(tmp_path / "out", "2", folder=folder)
-    assert everything(tmp_path) == expected_files
-    make(tmp_path / "out", "3", folder=folder, force=True)
-    assert everything(tmp_path) == {name: text and "3" for name, text in expected_files.items()}
+        write_output(tmp_path / "out", "2", folder=folder)
+    assert read_folder(tmp_path) == expected_files
+    write_output(tmp_path / "out", "3", folder=folder, force=True)
+    assert read_folder(tmp_path) == {
+        name: text and "3" for name, text in expected_files.items()
+    }
 
 
 def break_off(path: Path, error: BaseException, *, folder: bool) -> None:
-    with stage_output(path, force=True, manifest=EXPORT_MANIFEST if folder else None) as made:
-        (made / "half" if folder else made).write_text("half")
+    with stage_output(path, force=True, manifest=EXPORT_MANIFEST if folder else None) as staged:
+        (staged / "half" if folder else staged).write_text("half")
         raise error
 
 
@@ -73,11 +77,11 @@ def test_failures_keep_the_former_files(
     folder: bool, before: bool, error: BaseException, tmp_path: Path
 ) -> None:
     if before:
-        make(tmp_path / "out", "1", folder=folder)
-    former_files = everything(tmp_path)
+        write_output(tmp_path / "out", "1", folder=folder)
+    former_files = read_folder(tmp_path)
     with pytest.raises(type(error)):
         break_off(tmp_path / "out", error, folder=folder)
-    assert everything(tmp_path) == former_files
+    assert read_folder(tmp_path) == former_files
 
 
 def test_full_disks_have_an_exit_code(tmp_path: Path) -> None:
@@ -86,31 +90,31 @@ def test_full_disks_have_an_exit_code(tmp_path: Path) -> None:
             tmp_path / "out", OSError(errno.ENOSPC, "No space left on device"), folder=False
         )
     assert raised.value.exit_code == 5
-    assert everything(tmp_path) == {}
+    assert read_folder(tmp_path) == {}
 
 
 def test_foreign_folders_are_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years")
     with pytest.raises(UsageError, match="is not an exported folder"):
-        make(tmp_path / "mine", "1", folder=True, force=True)
+        write_output(tmp_path / "mine", "1", folder=True, force=True)
     with pytest.raises(UsageError, match="is not a file;"):
-        make(tmp_path / "mine", "1", folder=False, force=True)
+        write_output(tmp_path / "mine", "1", folder=False, force=True)
     (tmp_path / "notes").write_text("notes")
     with pytest.raises(UsageError, match="is not an exported folder"):
         refuse_existing(tmp_path / "notes", force=True, manifest=EXPORT_MANIFEST)
-    assert everything(tmp_path)["mine/thesis.tex"] == "years"
+    assert read_folder(tmp_path)["mine/thesis.tex"] == "years"
 
 
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
-    make(tmp_path / "out", "1", folder=True)
-    assert everything(tmp_path)[f"out/{EXPORT_MANIFEST}"] == "1"
+    write_output(tmp_path / "out", "1", folder=True)
+    assert read_folder(tmp_path)[f"out/{EXPORT_MANIFEST}"] == "1"
 
 
 def test_unwritable_places_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"out: cannot be written: No such file"):
-        make(tmp_path / "none" / "out", "1", folder=False)
+        write_output(tmp_path / "none" / "out", "1", folder=False)
 
 
 def test_files_are_written_whole_or_kept(
@@ -128,7 +132,7 @@ def test_files_are_written_whole_or_kept(
     with pytest.raises(LogRefused, match="No space left on device; make room") as raised:
         write_whole(path, "3", remedy="make room")
     assert raised.value.exit_code == 5
-    assert everything(tmp_path) == {"report.json": "1"}
+    assert read_folder(tmp_path) == {"report.json": "1"}
 
 
 def test_open_files_stay_as_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,8 +146,8 @@ def test_open_files_stay_as_on_windows(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(UsageError, match=r"report.json: cannot be written: Permission denied"):
         write_whole(tmp_path / "report.json", "2")
     with pytest.raises(UsageError, match=r"report.json: cannot be written: Permission denied"):
-        make(tmp_path / "report.json", "3", folder=False, force=True)
-    assert everything(tmp_path) == {"report.json": "1"}
+        write_output(tmp_path / "report.json", "3", folder=False, force=True)
+    assert read_folder(tmp_path) == {"report.json": "1"}
 
 
 def test_unsynced_folders_are_left_as_on_windows(
@@ -184,8 +188,8 @@ def test_every_written_text_states_its_line_ends() -> None:
         lambda path: create_file(path),
         lambda path: extend_file(path),
         lambda path: make_subfolder(path),
-        lambda path: make(path, "1", folder=False, force=True),
-        lambda path: make(path, "1", folder=True, force=True),
+        lambda path: write_output(path, "1", folder=False, force=True),
+        lambda path: write_output(path, "1", folder=True, force=True),
         lambda path: LogFile(path, force=True),
     ],
     ids=["whole", "create", "extend", "subfolder", "staged", "staged folder", "log"],
@@ -202,7 +206,7 @@ def test_no_output_is_written_through_a_link(
         write(tmp_path / "linked")
     assert (tmp_path / "linked").is_symlink()
     assert (
-        everything(tmp_path) == {"linked": "years", "real": "years"}
+        read_folder(tmp_path) == {"linked": "years", "real": "years"}
         if exists
         else {"linked": ""}
     )

@@ -22,14 +22,12 @@ PLUG_INS = {
 }
 """Names that an interface asks of several modules: the entry point of a program, the stages of an arm."""
 IMPORTED_BY_USERS = {
-    *(
-        "compiled_law",
-        "gym_environment",
-        "movement_measures",
-        "own_hand",
-        "statistics",
-        "trials",
-    ),
+    "compiled_law",
+    "gym_environment",
+    "movement_measures",
+    "own_hand",
+    "statistics",
+    "trials",
     "user_law",
 }
 """Modules that have a second, former place, from which files of users import."""
@@ -105,20 +103,20 @@ def test_a_module_name_is_used_once() -> None:
 @pytest.mark.push
 def test_readers_walk_straight_from_certify_to_judgement() -> None:
     """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
-    found = reading_walk.walk_to_judgement()
+    walk = reading_walk.walk_to_judgement()
     # Of these, `stability_decision` has a third: it weighs the end, the twins and the proofs,
     # and decides by the roots first, so that commands may save the twins.
-    assert len(found.stays) <= 80
-    assert len(found.returns) <= 28
+    assert len(walk.stays) <= 80
+    assert len(walk.returns) <= 28
 
 
 @pytest.mark.push
 def test_readers_walk_straight_from_file_to_scenario() -> None:
     """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
-    found = reading_walk.walk_to_scenario()
-    assert len(found.stays) <= 15
-    assert len(found.returns) <= 5
-    assert len(found.climbs) <= 2
+    walk = reading_walk.walk_to_scenario()
+    assert len(walk.stays) <= 15
+    assert len(walk.returns) <= 5
+    assert len(walk.climbs) <= 2
 
 
 @pytest.mark.push
@@ -140,17 +138,19 @@ def test_no_test_imports_another() -> None:
         for top in ("tests", "packages", "benchmarks")
         for path in (house.ROOT / top).rglob("*.py")
     ]
-    told = {
+    test_names = {
         path: re.findall(r"\btest_(?!.*\) -> None:)", path.read_text(encoding="utf-8"))
         for path in files
     }
-    found = [
+    imported_names = [
         (path.name, *name)
         for path in files
-        if told[path]
+        if test_names[path]
         for name in house.imported_names(path)
     ]
-    assert not [name for name in found if any(part.startswith("test_") for part in name[1:])]
+    assert not [
+        name for name in imported_names if any(part.startswith("test_") for part in name[1:])
+    ]
 
 
 @pytest.mark.push
@@ -169,9 +169,9 @@ def test_every_import_between_rooms_has_its_reason() -> None:
     with IMPORTS.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert all(row["what for"] for row in rows)
-    told = {(row["package"], row["imports"]) for row in rows}
-    assert told == house.room_imports()
-    assert len(told) <= 113  # two of them are what packages of others may use
+    stated = {(row["package"], row["imports"]) for row in rows}
+    assert stated == house.room_imports()
+    assert len(stated) <= 113  # two of them are what packages of others may use
 
 
 @pytest.mark.push
@@ -221,8 +221,8 @@ def test_parts_use_no_more_names_of_each_other() -> None:
 @pytest.mark.push
 def test_no_string_names_a_layer_above() -> None:
     """Import contracts do not see such a name; code uses `hooks` instead."""
-    found = {str(path): house.names_from_above(path) for path in house.files()}
-    assert {path: names for path, names in found.items() if names} == {}
+    names_by_file = {str(path): house.names_from_above(path) for path in house.files()}
+    assert {path: names for path, names in names_by_file.items() if names} == {}
 
 
 def test_every_hook_that_is_looked_up_is_registered() -> None:

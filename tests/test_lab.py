@@ -49,7 +49,7 @@ def test_no_command_reveals_results_before_predictions() -> None:
     which contains them.
     """
     named = {tuple(command[1:3]) for command in COMMANDS}
-    assert not {words for words in named if words[0] == "test"}
+    assert not {command for command in named if command[0] == "test"}
     assert not {("scenario", "show"), ("scenario", "list")} & named
 
 
@@ -114,7 +114,7 @@ def test_no_command_needs_a_unix_shell() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("group", [1, 5, 14, 15])
 def test_predictions_lie_within_10_percent_of_edges(group: int) -> None:
-    """With the commands under "check yourself": about the rest of a run with d = 5."""
+    """The commands are those under "check yourself", about the rest of a run with d = 5."""
     _, K, T_ms, a, _, *margins = read_groups()[group - 1]
     checks = [arguments for arguments in COMMANDS if arguments[1] == "linear"]
     assert len(checks) == 3

@@ -89,7 +89,7 @@ def test_gallery_pictures_have_their_commands() -> None:
     ],
 )
 def test_commands_of_gallery_make_its_pictures(entry: Any, tmp_path: Path) -> None:
-    """To the byte: the same version of the program draws the same picture."""
+    """The same version of the program draws the same picture, byte for byte."""
     picture = GALLERY.make_picture(entry, tmp_path)
     assert picture.read_bytes() == (GALLERY.PICTURES / entry.path).read_bytes()
 

@@ -34,14 +34,16 @@ def test_free_motion_differs_by_the_periods_order() -> None:
     """The torque of a tick acts from that tick on, the program's is extrapolated to the middle:
     of first order in h.
     """
-    coarse, fine = apart_rad("paper", 500), apart_rad("paper", 1000)
+    coarse = apart_rad("paper", 500)
+    fine = apart_rad("paper", 1000)
     assert 0.0 < fine < 0.004
     assert 1.8 < coarse / fine < 2.2
 
 
 @pytest.mark.long
 def test_urdf_arms_are_the_same_arm() -> None:
-    coarse, fine = apart_rad("unlike_arms", 500), apart_rad("unlike_arms", 1000)
+    coarse = apart_rad("unlike_arms", 500)
+    fine = apart_rad("unlike_arms", 1000)
     assert 0.0 < fine < 0.02
     assert 1.5 < coarse / fine < 2.5
 

@@ -8,7 +8,7 @@ tenths of its last printed digit.
 import csv
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,14 @@ from trilat_studies.tuning.search_space import (
 )
 
 import trilat_net
-from tests.analysis.ages_in_use import in_order, newest_wins
-from tests.analysis.certificate import runs
+from tests.analysis.ages_in_use import compute_ordered_moments, newest_wins
+from tests.analysis.builders import make_run
 from tests.cli.running import trilat
+from tests.execution.builders import run_fused, sample_records
+from tests.scenario.builders import make_overrides
 from tests.theory import delay_equations, energy
-from tests.theory.figures_of_runs import measured, value
+from tests.theory.figures_of_runs import find_value, measure_run
 from tests.theory.loops import RODS
-from tests.virtual_runs import sampled
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
 from trilat_net.analysis.theory import (
     analyse_linear_loop,
@@ -60,7 +61,7 @@ SHEET = {
     "link.delay_ms": 20,
     "control.d": 0.25,
     "dominance": SHARES,
-    **{f"sites.m2.arm.{key}": one for key, one in (("m1_kg", 0.5), ("m2_kg", 0.5))},
+    **{f"sites.m2.arm.{key}": mass_kg for key, mass_kg in (("m1_kg", 0.5), ("m2_kg", 0.5))},
     **{f"sites.m2.arm.I{n}_kg_m2": 0.0416667 for n in (1, 2)},
     **{f"sites.s.arm.m{n}_kg": 0.667 for n in (1, 2)},
     **{f"sites.s.arm.I{n}_kg_m2": 0.0555833 for n in (1, 2)},
@@ -73,14 +74,12 @@ Make = Callable[[], Numbers | str]
 Changes = dict[str, Any]
 
 
-def keys(changes: Changes) -> Changes:
-    return {key.replace("__", "."): one for key, one in changes.items()}
-
-
 # -- the linear loop
 
 
-def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[float, float]:
+def find_continuous_root(
+    name: str, changes: Changes, pose: Pose | None = None
+) -> tuple[float, float]:
     analysis = analyse_linear_loop(
         load_scenario(name, changes), pose=pose, roots=1
     ).continuous.rightmost
@@ -88,7 +87,7 @@ def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[f
     return analysis.s.real, abs(analysis.s.imag)
 
 
-def root(
+def find_root(
     name: str, changes: Changes | None = None, pose: Pose | None = None
 ) -> tuple[float, float]:
     """Returns the rightmost root that decides, the upper one of a pair."""
@@ -99,7 +98,7 @@ def root(
     return analysis.s.real, abs(analysis.s.imag)
 
 
-def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
+def find_margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
     """Returns the largest common delay, ms, and the frequency there, rad/s."""
     high = (
         analyse_linear_loop(load_scenario(name, changes or {}), roots=1)
@@ -110,7 +109,7 @@ def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
     return 1e3 * high.delay_s, high.omega_rad_s
 
 
-def edge(
+def find_edge(
     name: str, key: str, low: float, high: float, changes: Changes, pose: Pose | None = None
 ) -> float:
     scenario = load_scenario(name, changes)
@@ -122,7 +121,7 @@ def edge(
 
 def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
     line = share * 10.0 * delay_ms / 1e3
-    return edge(name, "control.d", 0.05 * line, 1.2 * line, {"link.delay_ms": delay_ms})
+    return find_edge(name, "control.d", 0.05 * line, 1.2 * line, {"link.delay_ms": delay_ms})
 
 
 def common_motion() -> tuple[float, float, float]:
@@ -136,39 +135,42 @@ def common_motion() -> tuple[float, float, float]:
 # -- ports
 
 
-def ports(name: str, **changes: Any) -> PortAnalysis:
-    scenario = load_scenario(name, keys(changes))
+def analyse_shipped_ports(name: str, **changes: Any) -> PortAnalysis:
+    scenario = load_scenario(name, make_overrides(**changes))
     return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
 
 def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
     return next(
-        one for one in port_analysis.transparency if (one.operator_site, one.joint) == ("m", 1)
+        transparency
+        for transparency in port_analysis.transparency
+        if (transparency.operator_site, transparency.joint) == ("m", 1)
     )
 
 
-def learning(delay_ms: float) -> Numbers:
-    analysed = ports("two_sites", link__delay_ms=delay_ms)
+def list_learning_numbers(delay_ms: float) -> Numbers:
+    analysed = analyse_shipped_ports("two_sites", link__delay_ms=delay_ms)
     assert analysed.proof is not None
     assert analysed.proof.passive
-    (band,), least = analysed.velocity.minima.below, analysed.velocity.minima
+    minima = analysed.velocity.minima
+    (band,) = minima.below
     return (
         *band[:2],
-        least.least,
-        least.least_hz,
+        minima.least,
+        minima.least_hz,
         *find_felt_impedance(analysed).interpolate_magnitudes(1.0),
         find_felt_impedance(analysed).ratio_db,
     )
 
 
-def known(delay_ms: float) -> float:
-    analysed = ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
+def find_known_ratio_db(delay_ms: float) -> float:
+    analysed = analyse_shipped_ports("two_sites", link__delay_ms=delay_ms, **KNOWN)
     assert analysed.velocity.passive
     return float(find_felt_impedance(analysed).ratio_db)
 
 
-def lacking() -> Numbers:
-    velocity = ports("p_d_margin_two", control__d=1.96).velocity
+def list_lacking_numbers() -> Numbers:
+    velocity = analyse_shipped_ports("p_d_margin_two", control__d=1.96).velocity
     (band,) = velocity.minima.below
     return (
         *band[:2],
@@ -178,13 +180,15 @@ def lacking() -> Numbers:
     )
 
 
-def reflecting(delay_ms: float, d: float) -> PortAnalysis:
+def analyse_reflection(delay_ms: float, d: float) -> PortAnalysis:
     open_ends = {"sites__m__hands": [], "sites__s__environment": []}
-    return ports("contact", **open_ends, link__delay_ms=delay_ms, sites__m__control__d=d)
+    return analyse_shipped_ports(
+        "contact", **open_ends, link__delay_ms=delay_ms, sites__m__control__d=d
+    )
 
 
 def stable_with_any(delay_ms: float, d: float) -> Numbers:
-    network = reflecting(delay_ms, d)
+    network = analyse_reflection(delay_ms, d)
     assert not network.absolute.below
     return [find_felt_impedance(network).ratio_db]
 
@@ -192,16 +196,14 @@ def stable_with_any(delay_ms: float, d: float) -> Numbers:
 # -- runs
 
 
-def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
-    scenario = load_scenario(name, keys(changes))
-    fused_run = FusedRun(scenario)
-    fused_run.advance_to(duration_s or scenario.duration_s)
-    return fused_run
+def run_shipped(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
+    scenario = load_scenario(name, make_overrides(**changes))
+    return run_fused(scenario, duration_s)
 
 
 def rms_of_free(delay_ms: float) -> float:
     """Returns the RMS of e over 20 s, of all joints and sites together, rad."""
-    records = sampled(
+    records = sample_records(
         load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02)
     )
     return float(np.sqrt(((records[..., :2] - records[..., 4:6]) ** 2).mean()))
@@ -211,49 +213,54 @@ def measure_windows(
     name: str, quantity: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
     """Returns quantities of windows of a run, window by window."""
-    values = measured(name, keys(changes), *windows)
-    return [value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
+    values = measure_run(name, make_overrides(**changes), *windows)
+    return [find_value(values, key, n) for n in range(len(windows)) for key in quantity.split()]
 
 
-def age(**changes: Any) -> float:
+def measure_age(**changes: Any) -> float:
     """Returns the mean age of the samples in use in `jitter`, ms."""
     return float(
-        np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()])
+        np.mean(
+            [
+                ages.mean_ms
+                for ages in measure_run("jitter", make_overrides(**changes)).ages.values()
+            ]
+        )
     )
 
 
-def anchored(delay_s: float, duration_s: float) -> Numbers:
+def list_anchored_angles(delay_s: float, duration_s: float) -> Numbers:
     """Returns the final angle of the first joint in `paper`: predicted, and of a run."""
     predicted = math.asin(-2.0 / (G * (1.0 + delay_s)))
-    return predicted, fused("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
+    return predicted, run_shipped("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
 
 
-def pi() -> Any:
+def compute_pi() -> Any:
     alpha = np.array([[SHARES[i].get(j, 0.0) for j in SHARES] for i in SHARES])
     values, vectors = np.linalg.eig(alpha.T)
     vector = vectors[:, values.real.argmax()].real
     return vector / vector.sum()
 
 
-def lyapunov(ones: bool = False, **changes: Any) -> EnergyBalance:
+def compute_lyapunov_balance(ones: bool = False, **changes: Any) -> EnergyBalance:
     return compute_energy_balance(
-        runs.run("lyapunov", keys(changes)).energies, paper_weights=ones
+        make_run("lyapunov", make_overrides(**changes)).energies, paper_weights=ones
     )
 
 
-def rise(V: Any) -> Numbers:
+def list_rises(V: Any) -> Numbers:
     return (V - np.minimum.accumulate(V)).max(), V[0]
 
 
 def energy_of_healing() -> Numbers:
     """Returns the energy that the links give to the slave of `outage` as they heal, J."""
-    balance = runs.run("outage").balance
+    balance = make_run("outage").balance
     healed = slice(*np.searchsorted(balance.t_s, (6.19, 6.21)))
     return (float(np.ptp(balance.work[f"{peer}->s"][healed])) for peer in ("m1", "m2"))
 
 
 @cache
-def certified(folder: Path) -> str:
+def certify_paper(folder: Path) -> str:
     trilat("sim", "paper", "-o", "run.mcap", cwd=folder)
     return trilat("certify", "run.mcap", cwd=folder).out
 
@@ -263,12 +270,15 @@ def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
-def distances(scheme: str) -> list[float]:
+def list_distances(scheme: str) -> list[float]:
     """Returns distances from the exact solution of `paper`, rad, at three rates, and the orders
     between them.
     """
-    far = [delay_equations.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
-    return [*far, *delay_equations.order("paper", scheme)]
+    far = [
+        delay_equations.measure_distance("paper", scheme, rate_hz)
+        for rate_hz in (500, 1000, 2000)
+    ]
+    return [*far, *delay_equations.measure_orders("paper", scheme)]
 
 
 def shipped_trials() -> list[Any]:
@@ -281,22 +291,26 @@ DELAYS_MS = (20, 100, 200, 400, 800, 1600)
 SETTLING_MS = (0, 20, 50, 100, 200, 400, 800)
 
 LINEAR_METHOD: dict[str, Make] = {
-    "a delay decays at {}/s": lambda: [-root("jitter")[0]],
-    "at 400 ms grows at {}/s": lambda: root("jitter", {"link.playout_ms": 400})[:1],
+    "a delay decays at {}/s": lambda: [-find_root("jitter")[0]],
+    "at 400 ms grows at {}/s": lambda: find_root("jitter", {"link.playout_ms": 400})[:1],
 }
 LINEAR: dict[str, Make] = {
     "| point masses | {} ± {} j | {} ± {} j | {} ± {} j |": lambda: [
-        part for T in (0, 200, 400) for part in continuous("free", {"link.delay_ms": T})
+        part
+        for T in (0, 200, 400)
+        for part in find_continuous_root("free", {"link.delay_ms": T})
     ],
     "| rods | {} ± {} j | {} ± {} j | {} ± {} j |": lambda: [
-        part for T in (0, 200, 400) for part in continuous("free", {"link.delay_ms": T, **RODS})
+        part
+        for T in (0, 200, 400)
+        for part in find_continuous_root("free", {"link.delay_ms": T, **RODS})
     ],
     "for good at {}, {}, {}, {}, {}, {} and {} s": lambda: [
-        fused("free", link__delay_ms=T).settled_s for T in SETTLING_MS
+        run_shipped("free", link__delay_ms=T).settled_s for T in SETTLING_MS
     ],
     "with every delay, from {} to {} rad": lambda: [rms_of_free(T) for T in (0, 800)],
     "in e: {}/s at 0, {}/s at 200 ms, {}/s at 1.6 s": lambda: [
-        root("free", {"link.delay_ms": T}, (-0.124, 0.337))[0] for T in (0, 200, 1600)
+        find_root("free", {"link.delay_ms": T}, (-0.124, 0.337))[0] for T in (0, 200, 1600)
     ],
     "| 8 | | roots | {} | {} | {} | {} | {} | {} |": lambda: [
         edge_of_p_d("p_d_margin", 0.5, T) for T in DELAYS_MS
@@ -304,31 +318,38 @@ LINEAR: dict[str, Make] = {
     "| 16 | | roots | {} | {} | {} | {} | {} | {} |": lambda: [
         edge_of_p_d("p_d_margin_two", 1.0, T) for T in DELAYS_MS
     ],
-    "the continuous loop decays at {}/s": lambda: [-continuous("paper", DIGITAL, PAPER_END)[0]],
-    "as computed grows at {}/s": lambda: root("paper", DIGITAL, PAPER_END)[:1],
-    "is stable from {} Hz on": lambda: [edge("paper", "rate_hz", 20, 400, DIGITAL, PAPER_END)],
-    "unstable, {} ± {} j": lambda: root("contact"),
-    "the margin is {} ms ({} rad/s)": lambda: margin("contact"),
-    "force gain for 200 ms is {}": lambda: [
-        edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})
+    "the continuous loop decays at {}/s": lambda: [
+        -find_continuous_root("paper", DIGITAL, PAPER_END)[0]
     ],
-    "and a margin of {} ms at them": lambda: margin("paper", {"link.delay_ms": 0})[:1],
+    "as computed grows at {}/s": lambda: find_root("paper", DIGITAL, PAPER_END)[:1],
+    "is stable from {} Hz on": lambda: [
+        find_edge("paper", "rate_hz", 20, 400, DIGITAL, PAPER_END)
+    ],
+    "unstable, {} ± {} j": lambda: find_root("contact"),
+    "the margin is {} ms ({} rad/s)": lambda: find_margin("contact"),
+    "force gain for 200 ms is {}": lambda: [
+        find_edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})
+    ],
+    "and a margin of {} ms at them": lambda: find_margin("paper", {"link.delay_ms": 0})[:1],
 }
 PORTS: dict[str, Make] = {
     **{
         f"| {T} | {{}}-{{}} Hz | {{}} at {{}} Hz | yes | {{}} / {{}} | {{}} |": lambda T=T: (
-            learning(T)
+            list_learning_numbers(T)
         )
         for T in (0, 50, 200, 800)
     },
-    "it is {} dB at T = 0 and {} dB at 200 ms": lambda: [known(0), known(200)],
-    "make it unstable, at {}-{} Hz.": lambda: ports(
+    "it is {} dB at T = 0 and {} dB at 200 ms": lambda: [
+        find_known_ratio_db(0),
+        find_known_ratio_db(200),
+    ],
+    "make it unstable, at {}-{} Hz.": lambda: analyse_shipped_ports(
         "training", timeline=[], sites__m1__hands=[], sites__m2__hands=[]
     ).absolute.below[0][:2],
     **{
-        f"| {T} | {d} | some make it unstable, {{}}-{{}} Hz": lambda T=T, d=d: reflecting(
-            T, d
-        ).absolute.below[0][:2]
+        f"| {T} | {d} | some make it unstable, {{}}-{{}} Hz": lambda T=T, d=d: (
+            analyse_reflection(T, d).absolute.below[0][:2]
+        )
         for T, d in ((20, 5), (200, 5), (200, 30))
     },
     **{
@@ -337,18 +358,22 @@ PORTS: dict[str, Make] = {
     },
 }
 ERRATA: dict[str, Make] = {
-    "with ones rises by {} J of {} J while": lambda: rise(lyapunov(ones=True).V),
+    "with ones rises by {} J of {} J while": lambda: list_rises(
+        compute_lyapunov_balance(ones=True).V
+    ),
     "M = {}`$ kg m²": lambda: [3.0 + math.sqrt(8.0)],
     r"that is $`\dot T \le {}`$.": lambda: [6.0 / (6.0 + (6.0 + math.sqrt(8.0)) ** 2)],
 }
 DAMPING: dict[str, Make] = {
     r"$`x = 0`$, and $`{}\, K T`$ for $`a = 1`$, at $`\tan x = x = {}`$. So": lambda: [
-        (asked := common_motion())[0],
-        math.sqrt(asked[2]),
+        common_motion()[0],
+        math.sqrt(common_motion()[2]),
     ],
     r"m = {}\, K T^2 / {}`$, equal": lambda: common_motion()[1:],
-    "K T`$, grow by {}/s.": lambda: root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
-    "200 ms and $`d = 4`$ grows by {}/s": lambda: root("p_d_margin", ONE_WAY, (-0.1, 0.4))[:1],
+    "K T`$, grow by {}/s.": lambda: find_root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
+    "200 ms and $`d = 4`$ grows by {}/s": lambda: find_root("p_d_margin", ONE_WAY, (-0.1, 0.4))[
+        :1
+    ],
     "1/6 of $`K T`$ is {}, 0.2172 of it {})": lambda: [2.0 / 6.0, 2.0 * common_motion()[0]],
 }
 PORT_CONDITIONS: dict[str, Make] = {
@@ -358,9 +383,11 @@ PORT_CONDITIONS: dict[str, Make] = {
 }
 LAB: dict[str, Make] = {
     "of these arms are {}, {} and {}, so": lambda: [
-        edge("p_d_margin", "control.d", 0.5, 1.5, {"control.K": 12.0}),
-        edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
-        edge("p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}),
+        find_edge("p_d_margin", "control.d", 0.5, 1.5, {"control.K": 12.0}),
+        find_edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
+        find_edge(
+            "p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}
+        ),
     ],
     "only the first decays: {} rad at 38 s": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, "")
@@ -368,19 +395,23 @@ LAB: dict[str, Make] = {
     "against {} rad at a constant 200 ms": lambda: measure_windows(
         "jitter", "error_peak_rad", (38, 40, ""), **CONSTANT
     ),
-    "the age in use is {} ms on average": lambda: [age()],
-    "the order makes it {} ms": lambda: [age(link__order="in_order")],
-    "to choose from: {} ms": lambda: [age(rate_hz=100)],
-    "so {} rad, and the run ends at {}.": lambda: anchored(0.2, 20),
-    "At 400 ms it is {}, and {}.": lambda: anchored(0.4, 40),
+    "the age in use is {} ms on average": lambda: [measure_age()],
+    "the order makes it {} ms": lambda: [measure_age(link__order="in_order")],
+    "to choose from: {} ms": lambda: [measure_age(rate_hz=100)],
+    "so {} rad, and the run ends at {}.": lambda: list_anchored_angles(0.2, 20),
+    "At 400 ms it is {}, and {}.": lambda: list_anchored_angles(0.4, 40),
     "(1 + Lambda T) = {} N m/rad": lambda: [G**2 * 1.2],
-    "moves the slave to {} rad for good": lambda: [fused("box").q[-1, 0]],
-    "without the box it returns to {}.": lambda: [fused("box", **NO_BOX).q[-1, 0]],
-    "pi = ({}, {}, {}), so": pi,
-    "proportional to ({}, {}, {}).": lambda: pi() / (10.0, 3.0, 0.3),
-    "V falls from {} to {} J": lambda: lyapunov().V[[0, -1]],
-    "With ones it rises by {} of {} J": lambda: rise(lyapunov(ones=True).V),
-    "ones still fail, by {} J": lambda: rise(lyapunov(True, **EQUAL_KD).V)[:1],
+    "moves the slave to {} rad for good": lambda: [run_shipped("box").q[-1, 0]],
+    "without the box it returns to {}.": lambda: [run_shipped("box", **NO_BOX).q[-1, 0]],
+    "pi = ({}, {}, {}), so": compute_pi,
+    "proportional to ({}, {}, {}).": lambda: compute_pi() / (10.0, 3.0, 0.3),
+    "V falls from {} to {} J": lambda: compute_lyapunov_balance().V[[0, -1]],
+    "With ones it rises by {} of {} J": lambda: list_rises(
+        compute_lyapunov_balance(ones=True).V
+    ),
+    "ones still fail, by {} J": lambda: list_rises(
+        compute_lyapunov_balance(True, **EQUAL_KD).V
+    )[:1],
     "At 20 ms one hit, then {} N.": lambda: measure_windows(
         "contact", "wall_mean_n", (14, 15, "s"), link__delay_ms=20.0
     ),
@@ -398,8 +429,8 @@ LAB: dict[str, Make] = {
     "With gravity known it stays at {} N": lambda: measure_windows(
         "windup", "wall_mean_n", (58.9, 59.1, "s"), control__Gamma=[1.0, 1.0, 1.0, 0.0, 0.0]
     ),
-    "feels 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[0], 5 * p[2] / p[0]],
-    "trainee 5 * {} / {} = {} N m": lambda: [(p := pi())[2], p[1], 5 * p[2] / p[1]],
+    "feels 5 * {} / {} = {} N m": lambda: [(p := compute_pi())[2], p[0], 5 * p[2] / p[0]],
+    "trainee 5 * {} / {} = {} N m": lambda: [(p := compute_pi())[2], p[1], 5 * p[2] / p[1]],
     "torques with it: {} rad/s and {} N m, where {} N m": lambda: [
         *measure_windows("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
         *measure_windows("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
@@ -416,7 +447,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/tutorials/lab-answers.md": LAB,
     "docs/theory/port-results.md": PORTS,
     "docs/studies/ports.md": {
-        "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": lacking,
+        "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": list_lacking_numbers,
     },
     "docs/reference/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/theory/linear-method.md": LINEAR_METHOD,
@@ -425,17 +456,18 @@ PAGES: dict[str, dict[str, Make]] = {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
             uniform_age(order, *ends)
             for ends in ((150, 250), (0, 400))
-            for order in (newest_wins, in_order)
+            for order in (newest_wins, compute_ordered_moments)
         ]
     },
     "docs/reference/certificate-premises.md": {
         "prints its edge, {} kN/m": lambda: [
-            1e-3 * edge("windup", f"{WALL}.stiffness_n_m", 1e3, 4e4, {f"{WALL}.sampled": True})
+            1e-3
+            * find_edge("windup", f"{WALL}.stiffness_n_m", 1e3, 4e4, {f"{WALL}.sampled": True})
         ],
     },
     "docs/reference/stability.md": {
         "ever more for 200 s, to {} rad/s": lambda: [
-            fused("free", 200.0, **keys(DIGITAL)).maxima[0][-2400:, 1].max()
+            run_shipped("free", 200.0, **make_overrides(**DIGITAL)).maxima[0][-2400:, 1].max()
         ],
     },
     "docs/data/map-p_d-edges.csv": {
@@ -445,29 +477,35 @@ PAGES: dict[str, dict[str, Make]] = {
         },
         **{
             f" 2,{T},{{}},": lambda T=T: [
-                edge("p_d_margin", "control.d", 0.02, 0.6, {**SOFT, "link.delay_ms": T})
+                find_edge("p_d_margin", "control.d", 0.02, 0.6, {**SOFT, "link.delay_ms": T})
             ]
             for T in (50, 100, 150, 200, 250, 300, 350, 400)
         },
     },
     "docs/theory/benchmarks.md": {
-        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances(
+        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: list_distances(
             "second_order"
         ),
-        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances(
-            "digital"
+        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: (
+            list_distances("digital")
         ),
         "part of max V | `paper` {}, `asymmetric` {}; orders {} and {}": lambda: [
-            *[energy.booked(name).residual for name in ("paper", "asymmetric")],
-            *[energy.order("paper", "second_order", rate_hz) for rate_hz in (1000, 2000)],
+            *[
+                energy.compute_shipped_balance(name).residual
+                for name in ("paper", "asymmetric")
+            ],
+            *[
+                energy.measure_order("paper", "second_order", rate_hz)
+                for rate_hz in (1000, 2000)
+            ],
         ],
         "the same with `digital` | {}, order {} and {}": lambda: [
-            energy.booked("paper", "digital").residual,
-            *[energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
+            energy.compute_shipped_balance("paper", "digital").residual,
+            *[energy.measure_order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
         "makes {} runs of the shipped": lambda: [len(shipped_trials())],
         "random once): {} s simulated": lambda: [
-            sum(one.scenario.duration_s for one in shipped_trials())
+            sum(trial.scenario.duration_s for trial in shipped_trials())
         ],
     },
     "docs/overview.md": {
@@ -502,20 +540,20 @@ PUSHED_PAGES = (
     "docs/studies/ports.md",
     "docs/theory/errata.md",
 )
-"""Of so many numbers of these pages one is made on a push; the long tests make all numbers of all pages."""
-ROWS = [
-    pytest.param(
-        page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ()
-    )
-    for page, entries in PAGES.items()
-    for n, (words, make) in enumerate(entries.items())
-    for slow in [
-        n % PUSHED > 0 or page not in PUSHED_PAGES or any(word in words for word in LONG)
-    ]
-]
+"""One of `PUSHED` numbers of these pages is tested on a push; the long tests have all numbers of all pages."""
 
 
-def numbers(phrase: str, text: str) -> list[str]:
+def list_rows() -> Iterator[Any]:
+    """Yields the page, the phrase and the source of every number, with a mark if the test is long."""
+    for page, entries in PAGES.items():
+        for n, (phrase, make) in enumerate(entries.items()):
+            is_pushed = n % PUSHED == 0 and page in PUSHED_PAGES
+            is_long = not is_pushed or any(word in phrase for word in LONG)
+            marks = pytest.mark.long if is_long else ()
+            yield pytest.param(page, phrase, make, id=f"{page}: {phrase}", marks=marks)
+
+
+def list_numbers(phrase: str, text: str) -> list[str]:
     """Returns the numbers in the single place of a text that has these words."""
     pattern = NUMBER.join(map(re.escape, phrase.split("{}")))
     matches = re.findall(pattern, " ".join(text.split()))
@@ -523,34 +561,36 @@ def numbers(phrase: str, text: str) -> list[str]:
     return [matches[0]] if isinstance(matches[0], str) else list(matches[0])
 
 
-def check(page: str, phrase: str, source: Numbers | str) -> None:
+def check_page(page: str, phrase: str, source: Numbers | str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     for word, plain in WORDS.items():
         text = text.replace(word, plain)
     wanted = (
-        list(map(float, numbers(phrase, source))) if isinstance(source, str) else list(source)
+        list(map(float, list_numbers(phrase, source)))
+        if isinstance(source, str)
+        else list(source)
     )
-    printed = numbers(phrase, text)
+    printed = list_numbers(phrase, text)
     digits = [
         10.0 ** (int(e or 0) - len(m.partition(".")[2]))
         for m, _, e in (p.partition("e") for p in printed)
     ]
     off = [
-        one is None or abs(one - float(word)) > 0.6 * digit
-        for one, word, digit in zip(wanted, printed, digits, strict=True)
+        number is None or abs(number - float(word)) > 0.6 * digit
+        for number, word, digit in zip(wanted, printed, digits, strict=True)
     ]
     assert not any(off), f"{printed} on the page, made: {wanted}"
 
 
-@pytest.mark.parametrize(("page", "phrase", "make"), ROWS)
+@pytest.mark.parametrize(("page", "phrase", "make"), list(list_rows()))
 def test_page_numbers_equal_their_source(page: str, phrase: str, make: Make) -> None:
-    check(page, phrase, make())
+    check_page(page, phrase, make())
 
 
 @pytest.mark.long
 def test_the_printed_certificate_is_the_example(tmp_path: Path) -> None:
-    for words in CERTIFIED:
-        check("docs/logs/certificate.md", words, certified(tmp_path))
+    for phrase in CERTIFIED:
+        check_page("docs/logs/certificate.md", phrase, certify_paper(tmp_path))
 
 
 TUNED = re.findall(
@@ -565,7 +605,7 @@ ENDS = [
 ]
 
 
-def tuned(duration_s: float, changes: Changes) -> CandidateScore:
+def score_candidate(duration_s: float, changes: Changes) -> CandidateScore:
     scenario = load_scenario(
         "free", {"limits.tau_limit_nm": 60, "duration_s": duration_s, **changes}
     )
@@ -574,18 +614,23 @@ def tuned(duration_s: float, changes: Changes) -> CandidateScore:
 
 def test_the_table_of_tuned_gains_has_every_range() -> None:
     rows = [
-        [law, one.name, f"{one.low:g}", f"{one.high:g}", one.unit or "-", one.where or "all"]
+        [
+            law,
+            knob.name,
+            f"{knob.low:g}",
+            f"{knob.high:g}",
+            knob.unit or "-",
+            knob.where or "all",
+        ]
         for law, space in SEARCH_SPACES.items()
-        for one in space.knobs
+        for knob in space.knobs
     ]
     assert [row[:6] for row in read_table("tuned-gains.csv")] == rows
 
 
 @pytest.mark.parametrize("row", ENDS)
 def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
-    """For the rows with gains in docs/theory/fair-comparison-results.md: four of the error,
-    then four of settling.
-    """
+    """The rows with gains in docs/theory/fair-comparison-results.md have four gains for the error, then four for settling."""
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
     (space,) = select_search_spaces([law], load_scenario("free"))
@@ -593,7 +638,7 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
         name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
     }
     controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
-    scores = tuned(
+    scores = score_candidate(
         30.0 if row < 4 else 6.0,
         {f"sites.{name}.control": table for name, table in controls.items()},
     )
@@ -608,8 +653,8 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("statement", AS_PRINTED)
 def test_printed_gains_repeat_the_page(statement: str) -> None:
-    score = tuned(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
-    check(
+    score = score_candidate(30.0, {"control.theta_hat0": AS_PRINTED[statement]})
+    check_page(
         "docs/theory/fair-comparison-results.md",
         f"| as printed{statement} | {{}} | {{}} |",
         [score.error_rad, score.effort_nm],
@@ -626,8 +671,10 @@ EDGES = read_table("map-p_d-edges.csv")
 LIVE_CELLS = read_table("map-p_d-live.csv")
 
 
-def class_of(longest_s: float, **changes: Any) -> CellClass:
-    return classify_cell(load_scenario("p_d_margin", keys(changes)).text, longest_s).verdict
+def classify_shipped(longest_s: float, **changes: Any) -> CellClass:
+    return classify_cell(
+        load_scenario("p_d_margin", make_overrides(**changes)).text, longest_s
+    ).verdict
 
 
 @pytest.mark.long
@@ -638,8 +685,8 @@ def test_p_d_edges_lie_between_two_runs(row: int) -> None:
     stiffness, delay_ms, _, low, high = map(float, EDGES[row][:5])
     soft, longest_s = (SOFT, 640.0) if stiffness == SOFT["control.K"] else ({}, 320.0)
     changes = {**soft, "link.delay_ms": delay_ms, "duration_s": longest_s / 16.0}
-    assert class_of(longest_s, **changes, control__d=low).stable is False
-    assert class_of(longest_s, **changes, control__d=high).stable is True
+    assert classify_shipped(longest_s, **changes, control__d=low).stable is False
+    assert classify_shipped(longest_s, **changes, control__d=high).stable is True
 
 
 @pytest.mark.parametrize("row", range(len(LIVE_CELLS)))
@@ -658,7 +705,9 @@ def test_live_cells_have_their_class(row: int) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
 def test_hardly_excited_modes_are_not_ignored(delay_ms: float, d: float) -> None:
-    """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
-    assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
-    cell_class = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
+    """As docs/maps/README.md says, the mode grows at 0.01 to 0.03 /s, and the cell is not decided."""
+    assert (
+        0.005 < find_root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
+    )
+    cell_class = classify_shipped(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
     assert cell_class is CellClass.UNDECIDED

@@ -120,7 +120,7 @@ def test_workers_are_processes_ignoring_ctrl_c() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def interrupted(pids: list[int]) -> None:
+def interrupt_pool(pids: list[int]) -> None:
     with worker_pool(1) as pool:
         pids.append(pool.submit(os.getpid).result())
         pool.submit(wait_for_ever)
@@ -131,7 +131,7 @@ def interrupted(pids: list[int]) -> None:
 def test_interrupts_end_endless_workers() -> None:
     pids: list[int] = []
     with pytest.raises(KeyboardInterrupt):
-        interrupted(pids)
+        interrupt_pool(pids)
     assert not is_running(pids[0])
 
 
@@ -154,7 +154,7 @@ def test_workers_end_when_their_parent_is_killed() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="holds signals back")
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_ctrl_c_while_workers_start_arrives_afterwards(elsewhere: bool) -> None:
-    """Also if another thread of this process is the one that gets the signal."""
+    """The signal arrives also if another thread of this process receives it."""
 
     def interrupt_itself() -> None:
         signal.pthread_kill(threading.get_ident(), signal.SIGINT)
@@ -162,7 +162,7 @@ def test_a_ctrl_c_while_workers_start_arrives_afterwards(elsewhere: bool) -> Non
     with Interrupt() as interrupt:
         with hold_sigint():
             if elsewhere:
-                thread = threading.Thread(target=unmasked, args=(interrupt_itself,))
+                thread = threading.Thread(target=run_unmasked, args=(interrupt_itself,))
                 thread.start()
                 thread.join()
             else:
@@ -171,7 +171,7 @@ def test_a_ctrl_c_while_workers_start_arrives_afterwards(elsewhere: bool) -> Non
         assert interrupt.is_requested()
 
 
-def unmasked(act: Callable[[], None]) -> None:
+def run_unmasked(act: Callable[[], None]) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     act()
 

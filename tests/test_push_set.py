@@ -14,7 +14,8 @@ def test_the_cheapest_test_of_every_file_stays() -> None:
 
 
 def test_slow_tests_are_left() -> None:
-    dear, cheap = f"{FILE}::test_dear", f"{FILE}::test_cheap"
+    dear = f"{FILE}::test_dear"
+    cheap = f"{FILE}::test_cheap"
     assert choose_long_tests({dear: 1.01 * MOST_S, cheap: 0.5 * DEAR_S}) == [dear]
 
 

@@ -41,8 +41,8 @@ def test_the_readme_shows_its_first_judgement(tmp_path: Path) -> None:
     page = (ROOT / "docs/tutorials/first-result.md").read_text(encoding="utf-8")
     explained = re.findall(r"^\| `(.+?)` \|", page, re.MULTILINE)
     assert len(explained) == 9
-    for line, words in zip(printed, explained, strict=False):
-        assert line.partition(" ")[2].strip().startswith(words)
+    for line, explanation in zip(printed, explained, strict=False):
+        assert line.partition(" ")[2].strip().startswith(explanation)
 
 
 def test_the_page_lists_nearly_every_command() -> None:

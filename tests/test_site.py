@@ -54,7 +54,7 @@ def test_the_first_pages_links_exist() -> None:
 
 
 def test_links_of_gathered_pages_lead_to_files(tmp_path: Path) -> None:
-    """Also links to files that stand beside docs in the repository, such as examples."""
+    """This includes links to files beside docs in the repository, such as examples."""
     folder = tmp_path / "docs"
     MAKE.gather_pages(folder)
     assert (folder / "examples/package/trilat_lag.py.md").is_file()
@@ -99,10 +99,7 @@ def test_pages_are_found_in_their_menus_folder() -> None:
 
 
 def test_pages_are_short() -> None:
-    """At most 72 000 words in all; the median page has at most 1 200, none more than 2 500.
-
-    A formula counts as a word.
-    """
+    """All pages have at most 72 000 words; the median page has at most 1 200, and none has more than 2 500."""
     pages = list((ROOT / "docs").rglob("*.md"))
     formula = re.compile(r"```math\n.*?```|\$`[^`]+`\$", re.DOTALL)
     counts = [
@@ -159,7 +156,8 @@ def test_the_site_is_whole() -> None:
     commands = Page(HTML / "reference" / "commands.html").ids
     assert not {command.replace(" ", "-") for command in all_options()} - {"trilat"} - commands
     assert (HTML / "search.js").exists()
-    absent, foreign = [], []
+    absent = []
+    foreign = []
     for path in HTML.rglob("*.html"):
         page = Page(path)
         foreign += [(path.name, address) for address in page.loads if urlsplit(address).netloc]

@@ -43,10 +43,10 @@ TABLE = {
     ("no forces", 0.02): (0.167, 0.175, 0.191, 0.313, 2.95),
     ("no forces", 0.2): (0.167, 0.193, 0.333, 0.491, 2.38),
 }
-"""Transmitted over true impedance at 0.1, 0.5, 1, 2 and 5 Hz, per variant and delay, s."""
+"""Ratios of the transmitted to the true impedance at 0.1, 0.5, 1, 2 and 5 Hz, by variant and delay in s."""
 
 
-def balance(
+def build_balance(
     s: complex,
     alpha: NDArray[np.float64],
     *,
@@ -64,25 +64,26 @@ def balance(
     `held_s`: for so long a torque of the law is held, which delays it by half of that.
     """
     n = len(alpha)
-    identity, late = np.eye(n), alpha * np.exp(-s * delay_s)
+    identity = np.eye(n)
+    late = alpha * np.exp(-s * delay_s)
     held = (1.0 - np.exp(-s * held_s)) / (s * held_s) if held_s else 1.0
-    peer, own = (np.diag(np.broadcast_to(gain, n)) for gain in (force_peer, force_own))
+    peer, own_gain = (np.diag(np.broadcast_to(gain, n)) for gain in (force_peer, force_own))
     impedance = np.diag([K_h + B_h * s for K_h, B_h in [*loads, *[(0.0, 0.0)] * n][:n]])
     # s^2 x = held tau + f and (1 - c_a late) tau = -(K + B s)(1 - late) x + felt f, f: the torque on the arm,
     # tau + f being what is sent as qdd
     slow = (identity - acceleration * late) / held
-    felt = own + (peer + acceleration * identity) @ late
+    felt = own_gain + (peer + acceleration * identity) @ late
     b = slow + felt
     return slow * s**2 + (K + B * s) * (identity - late) + b @ impedance, b
 
 
-def transmitted(
+def find_transmission(
     frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object
 ) -> float:
     """Returns |torque / velocity| for a torque on arm `at`, over |Z_e| of the wall at the last arm."""
     s = 2j * np.pi * frequency_hz
     free = [(0.0, 0.0)] * (len(alpha) - 1)
-    A, b = balance(s, alpha, loads=[*free, WALL], **law)  # type: ignore[arg-type]
+    A, b = build_balance(s, alpha, loads=[*free, WALL], **law)  # type: ignore[arg-type]
     x = np.linalg.solve(A, b[:, at])
     return float(abs(1.0 / (s * x[at])) / abs(WALL[0] / s + WALL[1]))
 
@@ -95,7 +96,7 @@ def rightmost_root(
     """
     degree = 2 * len(alpha)
     points = 10.0 * np.exp(2j * np.pi * np.arange(degree + 1) / (degree + 1))
-    values = [np.linalg.det(balance(s, alpha, loads=loads, **law)[0]) for s in points]  # type: ignore[arg-type]
+    values = [np.linalg.det(build_balance(s, alpha, loads=loads, **law)[0]) for s in points]  # type: ignore[arg-type]
     scaled = np.fft.fft(values) / (degree + 1)  # coefficients of (s / 10)^k
     return float(10.0 * np.roots(scaled[::-1]).real.max())
 

@@ -45,7 +45,7 @@ class Member:
         return other.reading_ns(true_ns) - self.reading_ns(true_ns)
 
 
-def members(log: Log) -> dict[str, Member]:
+def list_members(log: Log) -> dict[str, Member]:
     """Returns the clocks of a log's members."""
     started = next(event for event in log.events if event.kind == "start")
     announced = next(
@@ -61,7 +61,7 @@ def members(log: Log) -> dict[str, Member]:
     return clocks
 
 
-def again(log: Log, name: str) -> Member:
+def find_restarted(log: Log, name: str) -> Member:
     """Returns the clock of the last start of a member that joined the running session."""
     event = [e for e in log.events if e.kind == "coming" and e.member == name][-1]
     skew = SKEWED.search(event.clock)
@@ -92,7 +92,7 @@ class Judged:
 
 
 class Bound:
-    """The logged bounds of a site on the clock of one peer over time."""
+    """The logged bounds of a site's error about the clock of one peer, over time."""
 
     def __init__(self, log: Log, site: str, peer: str) -> None:
         self.events: list[Event] = [
@@ -112,7 +112,7 @@ class Bound:
 
 def judge_link(log: Log, site: str, peer: str) -> Judged:
     """Returns every sample of a link that its receiver echoed, against the truth."""
-    clocks = members(log)
+    clocks = list_members(log)
     peer_index = log.scenario.peers(site).index(peer)
     sent = {state.tick: state.sent_ns for state in log[peer].states}
     bound = Bound(log, site, peer)
@@ -132,11 +132,10 @@ def judge_link(log: Log, site: str, peer: str) -> Judged:
 
 
 def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
-    """Returns every logged estimate against the truth: t (s), error of the offset (us) and of
-    the drift (ppm).
-    """
-    clocks = members(log)
-    own_clock, other = clocks[site], clocks[peer]
+    """Returns the error of every logged estimate: t (s), error of the offset (us) and of the drift (ppm)."""
+    clocks = list_members(log)
+    own_clock = clocks[site]
+    other = clocks[peer]
     drift_ppm = float(other.rate / own_clock.rate - 1) * 1e6
     rows = []
     for event in Bound(log, site, peer).events:

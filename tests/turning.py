@@ -1,6 +1,5 @@
 """Motions through singular orientations, with SciPy's rotations as the truth, and logs that have them."""
 
-import io
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -8,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.log_editing import Record, edited, opened
+from tests.log.builders import Record, edit_log_bytes, open_bytes, simulate_bytes
 from trilat_net.core.step.vectors import Array
-from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -28,7 +26,7 @@ AXES = (
     (-1, 2, 0.5),
 )
 ALLOWED = 1.5
-"""Largest step of a series by that of the true motion."""
+"""The largest permitted step of a series, relative to the largest step of the true motion."""
 
 
 class Motion(NamedTuple):
@@ -41,7 +39,7 @@ class Motion(NamedTuple):
     q: Array
 
 
-def turn(number: int, records: int = RECORDS) -> Rotation:
+def make_rotation(number: int, records: int = RECORDS) -> Rotation:
     """Returns a tool that points down, half turns about every axis, or several turns about an
     axis that moves.
     """
@@ -59,12 +57,12 @@ def turn(number: int, records: int = RECORDS) -> Rotation:
     return Rotation.from_rotvec(2.0 * sway) * turns
 
 
-def move(number: int, site: str, start: Array, records: int = RECORDS) -> Motion:
+def make_motion(number: int, site: str, start: Array, records: int = RECORDS) -> Motion:
     """Returns the motion of one site; sites move alike, one later than the other."""
     random = np.random.default_rng([number, *map(ord, site)])
     s = np.linspace(0.0, 1.0, records)[:, np.newaxis]
     reach = random.uniform(-2.5, 2.5, len(start)) * np.pi
-    whole = turn(number, records + 2)
+    whole = make_rotation(number, records + 2)
     first = 1 if site == "m" else 0
     return Motion(
         whole[first : first + records], whole[2:], start + reach * s**2 * (3.0 - 2.0 * s)
@@ -77,7 +75,7 @@ def count_wraps(turned: Rotation) -> int:
     return int(np.count_nonzero(steps > np.pi))
 
 
-def largest_step(turned: Rotation) -> float:
+def find_largest_turn(turned: Rotation) -> float:
     """Returns the largest angle from one orientation to the next, rad."""
     return float((turned[1:] * turned[:-1].inv()).magnitude().max())
 
@@ -86,7 +84,8 @@ def place_links(scenario: Scenario, site: str, q: Array) -> list[Rotation]:
     """Returns the orientations of the links of an arm in its base."""
     chain = scenario.arms[site].chain
     assert chain is not None
-    links, whole = list[Rotation](), Rotation.identity()
+    links = list[Rotation]()
+    whole = Rotation.identity()
     for joint, angle in zip(chain.joints, q.T, strict=True):
         whole = (
             whole
@@ -104,16 +103,14 @@ def load_case() -> Scenario:
 
 @cache
 def _simulate() -> bytes:
-    stream = io.BytesIO()
-    write_virtual_log(load_case(), stream)
-    return stream.getvalue()
+    return simulate_bytes(load_case())
 
 
-def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
+def make_turning_log(number: int) -> tuple[Log, dict[str, Motion]]:
     """Returns a log of two arms whose records have one of the motions, and the motions by site."""
     scenario = load_case()
     motions = {
-        site: move(number, site, np.array(scenario.sites[site].q0_rad))
+        site: make_motion(number, site, np.array(scenario.sites[site].q0_rad))
         for site in scenario.names
     }
     vectors = {
@@ -122,9 +119,10 @@ def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
     }
 
     def record(fields: Record) -> Record:
-        site, k = fields["site"], min(fields["tick"], RECORDS - 1)
+        site = fields["site"]
+        k = min(fields["tick"], RECORDS - 1)
         for field, vector in zip(("x", "q_des"), vectors[site], strict=True):
             fields[field] = [*fields[field][:3], *vector[k].tolist()]
         return {**fields, "q": motions[site].q[k].tolist()}
 
-    return opened(edited(_simulate(), record=record)), motions
+    return open_bytes(edit_log_bytes(_simulate(), record=record)), motions

@@ -7,8 +7,8 @@ with one gain for both joints keeps that line: x is q1, and q2 = q1 / 2.
 from collections.abc import Mapping
 from typing import Any
 
+from tests.execution.builders import Array, sample_records
 from tests.transmission import VARIANTS
-from tests.virtual_runs import Array, sampled
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -29,10 +29,10 @@ CLAMP = {
     "damping_nm_s_rad": 0.0,
     "to_rad": [0.0, 0.0],
 }
-"""What holds a clamped slave; without it the slave is free."""
+"""A spring that clamps the slave, which is free without the spring."""
 
 
-def hand(
+def make_spring_hand(
     to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: float = 1.0
 ) -> dict[str, Any]:
     """Returns a spring hand that goes to x = `to` in two seconds."""
@@ -46,9 +46,9 @@ def hand(
     }
 
 
-H50 = hand(0.3)
+H50 = make_spring_hand(0.3)
 """The hand of most tests."""
-WALL = hand(0.0, 500.0, 5.0)
+WALL = make_spring_hand(0.0, 500.0, 5.0)
 DRIVE = {
     "kind": "multisine",
     "amplitude_nm": [2.0, 1.0],
@@ -94,35 +94,37 @@ def unit_text(
     return "\n".join(f"{key} = {_toml(value)}" for key, value in table.items())
 
 
-def unit_scenario(
+def make_unit_scenario(
     sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
 ) -> Scenario:
     """Returns the scenario of `unit_text`."""
     return allow_own_code(parse_scenario(unit_text(sites, control, **more), "unit"))
 
 
-def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
+def read_last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
     """Returns, per time, the records before it, of a compiled run: by field shape (N, 2)."""
-    rows = sampled(scenario, times_s)
+    rows = sample_records(scenario, times_s)
     columns = next(iter(scenario.names))
     fields = scenario.layout(columns).columns()
     return [{name: rows[:, k, fields[name]] for name in fields} for k in range(len(times_s))]
 
 
-def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any) -> Scenario:
+def make_four_channel_pair(
+    variant: str, delay_s: float, duration_s: float = 9.0, **more: Any
+) -> Scenario:
     """Returns a driven master and a slave at a wall, `delay_s` apart, under a variant of the
     four-channel law.
     """
 
-    def one(at: int) -> dict[str, Any]:
+    def make_control(at: int) -> dict[str, Any]:
         law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}
         return {
             key: value[at] if isinstance(value, tuple) else value for key, value in law.items()
         }
 
     sites = {
-        "m": {"hands": [DRIVE, hand(0.0)], "control": one(0)},
-        "s": {"hands": [WALL], "control": one(1)},
+        "m": {"hands": [DRIVE, make_spring_hand(0.0)], "control": make_control(0)},
+        "s": {"hands": [WALL], "control": make_control(1)},
     }
     link = {"model": "constant", "delay_ms": 1e3 * delay_s}
-    return unit_scenario(sites, {}, link=link, duration_s=duration_s)
+    return make_unit_scenario(sites, {}, link=link, duration_s=duration_s)

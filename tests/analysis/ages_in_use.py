@@ -12,18 +12,18 @@ def newest_wins(cdf, h_ms):
     samples has arrived yet.
     """
     none_yet = np.cumprod(1.0 - cdf(h_ms * np.arange(1, 20_000)))
-    return moments(np.concatenate([[1.0], none_yet]), h_ms)
+    return compute_moments(np.concatenate([[1.0], none_yet]), h_ms)
 
 
-def in_order(cdf, h_ms):
+def compute_ordered_moments(cdf, h_ms):
     """Returns the same for links that keep the order: the age exceeds n h unless the n-th
     sample back and all older ones have arrived.
     """
     all_there = np.cumprod(cdf(h_ms * np.arange(1, 20_000))[::-1])[::-1]
-    return moments(np.concatenate([[1.0], 1.0 - all_there]), h_ms)
+    return compute_moments(np.concatenate([[1.0], 1.0 - all_there]), h_ms)
 
 
-def moments(exceeds, h_ms):
+def compute_moments(exceeds, h_ms):
     """Returns mean and deviation of n h, n >= 1, from the probabilities of n > 0, 1, 2..."""
     n = np.arange(len(exceeds))
     mean = h_ms * exceeds.sum()

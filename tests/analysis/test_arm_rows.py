@@ -73,7 +73,8 @@ def test_torque_inertia_gradient_and_tip_equal_pinocchios(name: str) -> None:
 @each
 def test_the_slope_of_the_potential_energy_is_gravity(name: str) -> None:
     arm = chain_of(name)
-    n, step = len(arm.chain.joints), 1e-5
+    n = len(arm.chain.joints)
+    step = 1e-5
     q = draw_rows(n, 1)[0]
     poses = q + step * np.vstack([np.eye(n), -np.eye(n)])
     up, down = np.split(arm.potential_energy(poses), 2)
@@ -84,12 +85,14 @@ def test_friction_and_stops_equal_the_cores() -> None:
     """M qdd changes by friction and stops, and by nothing else."""
     drive = {"viscous": 0.4, "coulomb": 1.2}
     stop = {"lower": -0.5, "upper": 0.5, "stop_stiffness": 800.0, "stop_damping": 9.0}
-    rough, smooth = chain_of("arm6", **drive, **stop), chain_of("arm6")
+    rough = chain_of("arm6", **drive, **stop)
+    smooth = chain_of("arm6")
     q, qd, torque, _ = draw_rows(6, 20)
     qd[0] *= 1e-3  # within the smooth part of Coulomb's friction
     forces = []
     for arm in (rough, smooth):
-        rows, qdd = build_chain(arm.chain.joints), np.zeros_like(q)
+        rows = build_chain(arm.chain.joints)
+        qdd = np.zeros_like(q)
         for k in range(len(q)):
             place_joints(rows, q[k])
             find_acceleration(rows, arm.theta, np.zeros(3), q[k], qd[k], torque[k], qdd[k])
@@ -115,7 +118,8 @@ def test_the_planar_arm_equals_its_chain() -> None:
     np.testing.assert_allclose(
         plane.law_torque(np.tile(theta, (len(q), 1)), q, qd, v, a), theirs, atol=1e-12
     )
-    ours, theirs = plane.place_end_effector(q, qd), chain.place_end_effector(q, qd)
+    ours = plane.place_end_effector(q, qd)
+    theirs = chain.place_end_effector(q, qd)
     np.testing.assert_allclose(ours.position, theirs.position[:, :2], atol=1e-12)
     np.testing.assert_allclose(ours.J, theirs.J[:, :2], atol=1e-12)
     energies = plane.potential_energy(q), chain.potential_energy(q)
@@ -178,9 +182,10 @@ def test_fixed_parameters_join_no_combination() -> None:
     assert not base.combination[:, ~learnt].any()
 
 
-def body(places: Array, masses: Array) -> Array:
+def combine_masses(places: Array, masses: Array) -> Array:
     """Returns ten parameters of point masses."""
-    m, mc = masses.sum(), masses @ places
+    m = masses.sum()
+    mc = masses @ places
     inertia = np.sum(
         [
             w * ((p @ p) * np.eye(3) - np.outer(p, p))
@@ -194,8 +199,9 @@ def body(places: Array, masses: Array) -> Array:
 
 def test_a_negative_mass_is_inconsistent() -> None:
     random = np.random.default_rng(4)
-    places, masses = random.normal(size=(6, 3)), random.uniform(0.5, 2.0, 6)
-    sound = body(places, masses)
+    places = random.normal(size=(6, 3))
+    masses = random.uniform(0.5, 2.0, 6)
+    sound = combine_masses(places, masses)
     homogeneous = np.column_stack([places, np.ones(6)])
     wanted = (masses * homogeneous.T) @ homogeneous
     np.testing.assert_allclose(find_pseudo_inertias(sound)[0], wanted, atol=1e-12)
@@ -204,6 +210,6 @@ def test_a_negative_mass_is_inconsistent() -> None:
         False,
         False,
     ]
-    long = body(np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.ones(2))
+    long = combine_masses(np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.ones(2))
     long[4] = 5.0  # more about its own axis than the triangle inequality allows
     assert find_consistent_links(long) == [False]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     evaluate_ramps,
@@ -87,7 +87,8 @@ def test_shares_give_the_recorded_references(ramped):
     alpha = trace_dominance(ramped, "s", part.t_s).alpha
     reference = np.zeros_like(part.q)
     for peer, factor in zip(part.peers, alpha.T, strict=True):
-        used, q = part.used[peer], ramped[peer].q
+        used = part.used[peer]
+        q = ramped[peer].q
         seen = np.where(
             used[:, None] >= 0, q[np.maximum(used, 0)], ramped.scenario.sites[peer].q0_rad
         )
@@ -150,11 +151,11 @@ def test_two_groups_that_follow_nobody_outside_are_named() -> None:
 @pytest.mark.parametrize("mem", [[], [0.5] * 11])
 def test_a_record_without_lost_peers_is_reported(mem: list[float]) -> None:
     rule = {"on_stale.action": "glide", "on_stale.on_lost": "degrade", "duration_s": 0.1}
-    data = recorded("paper", rule | {"on_stale.align_limit_rad": 2.0})
-    broken = edited(
+    data = make_log_bytes("paper", rule | {"on_stale.align_limit_rad": 2.0})
+    broken = edit_log_bytes(
         data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
     )
     times_s = np.array([0.05])
-    assert not find_lost_peers(opened(data), "s", times_s).any()
+    assert not find_lost_peers(open_bytes(data), "s", times_s).any()
     with pytest.raises(LogError, match="a record of s does not have 12 numbers in `mem`"):
-        find_lost_peers(opened(broken), "s", times_s)
+        find_lost_peers(open_bytes(broken), "s", times_s)

@@ -32,7 +32,9 @@ def fit_envelope(t_s: np.ndarray, envelope: np.ndarray) -> EnvelopeFit:
     return fit_envelopes(t_s, envelope[:, np.newaxis])[0]
 
 
-def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.0) -> Array:
+def make_oscillation(
+    rate_per_s: float, omega: float, phase: float, scale: float = 1.0
+) -> Array:
     """Returns the largest |scale exp(rate t) cos(omega t + phase)| of every step, as a run keeps it."""
     t_s = np.arange(len(T_S) * 25) * (STEP_S / 25)
     error = scale * np.exp(rate_per_s * (t_s - 20.0)) * np.abs(np.cos(omega * t_s + phase))
@@ -43,7 +45,7 @@ def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.
 @settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
 def test_exponential_growth_has_its_rate(rate: float, omega: float, phase: float) -> None:
-    envelope_fit = fit_envelope(T_S, oscillation(rate, omega, phase))
+    envelope_fit = fit_envelope(T_S, make_oscillation(rate, omega, phase))
     assert envelope_fit.trend is EnvelopeTrend.GROWS
     assert envelope_fit.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
 
@@ -52,7 +54,7 @@ def test_exponential_growth_has_its_rate(rate: float, omega: float, phase: float
 @given(rate=rates, omega=quick, phase=phases)
 def test_decay_counts_from_a_factor_of_two(rate: float, omega: float, phase: float) -> None:
     """Half of the run is 20 s: ln 2 / 20 s is 0.035 /s."""
-    trend = fit_envelope(T_S, oscillation(-rate, omega, phase)).trend
+    trend = fit_envelope(T_S, make_oscillation(-rate, omega, phase)).trend
     if not 0.03 < rate < 0.045:  # there, which points the windows see decides
         assert trend is (EnvelopeTrend.DECAYS if rate > 0.035 else EnvelopeTrend.HARDLY)
 
@@ -63,7 +65,8 @@ def test_a_sustained_oscillation_of_any_size_is_steady(
     omega: float, phase: float, scale: float
 ) -> None:
     assert (
-        fit_envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is EnvelopeTrend.STEADY
+        fit_envelope(T_S, make_oscillation(0.0, omega, phase, scale)).trend
+        is EnvelopeTrend.STEADY
     )
 
 
@@ -72,9 +75,10 @@ def test_a_sustained_oscillation_of_any_size_is_steady(
 def test_the_trend_is_independent_of_units(
     rate: float, omega: float, phase: float, scale: float
 ) -> None:
-    error = np.maximum(oscillation(rate, omega, phase), 1e-3)
+    error = np.maximum(make_oscillation(rate, omega, phase), 1e-3)
     envelope_fit = fit_envelope(T_S, error)
-    larger, slower = fit_envelope(T_S, scale * error), fit_envelope(60.0 * T_S, error)
+    larger = fit_envelope(T_S, scale * error)
+    slower = fit_envelope(60.0 * T_S, error)
     assert larger.trend is slower.trend is envelope_fit.trend
     assert larger.rate_per_s == pytest.approx(envelope_fit.rate_per_s, rel=1e-6, abs=1e-9)
     assert slower.rate_per_s == pytest.approx(
@@ -88,7 +92,7 @@ def test_the_trend_is_independent_of_units(
 def test_a_signal_and_its_reverse_never_both_grow(
     rate: float, omega: float, phase: float
 ) -> None:
-    error = oscillation(rate, omega, phase)
+    error = make_oscillation(rate, omega, phase)
     assert EnvelopeTrend.GROWS not in {fit_envelope(T_S, error).trend} & {
         fit_envelope(T_S, error[::-1]).trend
     }

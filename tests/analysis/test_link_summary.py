@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import trilat_net
-from tests.analysis.ages_in_use import in_order, newest_wins
+from tests.analysis.ages_in_use import compute_ordered_moments, newest_wins
+from tests.analysis.builders import drive_run, make_busy_run, make_short_log
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.link_summary import (
     bin_ages,
     compute_statistics,
@@ -28,21 +30,19 @@ from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario import sample_uses as module
 from trilat_net.scenario.sample_uses import first_ticks
 
-from . import logs
-
 PERIOD_MS = 1.0
 
 
-def uses(log):
+def summarise_by_name(log):
     return {use.name: use for use in summarise_links(log)}
 
 
 @cache
-def busy():
-    return uses(logs.busy().log)
+def summarise_busy_run():
+    return summarise_by_name(make_busy_run().log)
 
 
-def counted(run, link):
+def find_counts(run, link):
     peer, site = link.split("->")
     return run.counts[site][run.log[site].peers.index(peer)]
 
@@ -52,7 +52,8 @@ def counted(run, link):
 
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
 def test_counts_equal_those_of_the_link(link):
-    counts, core = busy()[link].counts, counted(logs.busy(), link)
+    counts = summarise_busy_run()[link].counts
+    core = find_counts(make_busy_run(), link)
     assert counts.arrived + counts.duplicate == core.accepted
     assert (counts.lost, counts.late, counts.duplicate) == (
         core.lost,
@@ -66,7 +67,7 @@ def test_counts_equal_those_of_the_link(link):
 
 
 def test_superseded_samples_are_never_in_use():
-    log = logs.busy().log
+    log = make_busy_run().log
     for peer, site in [("b", "a"), ("c", "a"), ("c", "b")]:
         release = predict_delivery(log, peer, site, log.scenario.ticks(peer)).release(
             log[site].rate_hz
@@ -79,14 +80,14 @@ def test_superseded_samples_are_never_in_use():
             if log[site].peers[j] == peer
         }
         never = (released & arrived) - set(log[site].used[peer].tolist())
-        assert busy()[f"{peer}->{site}"].counts.superseded == len(never) > 0
+        assert summarise_busy_run()[f"{peer}->{site}"].counts.superseded == len(never) > 0
 
 
 def test_lost_and_doubled_samples_are_counted():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     burst = {("m1", 0, tick) for tick in (*range(50, 60), 80, *range(90, 93))}
-    run = logs.drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
-    link_uses = uses(run.log)
+    run = drive_run(scenario, lost=burst, twice={("s", 1, 30), ("s", 1, 31)})
+    link_uses = summarise_by_name(run.log)
     lossy = link_uses["m2->m1"]
     assert (lossy.counts.missing, lossy.counts.judged) == (14, 199)
     assert lossy.loss == 14 / 199
@@ -94,7 +95,7 @@ def test_lost_and_doubled_samples_are_counted():
     assert lossy.silence_ms == 55.0  # ten samples of 5 ms, and the one that came again
     assert not lossy.plain
     assert link_uses["m2->s"].counts.duplicate == 2
-    assert counted(run, "m2->s").duplicate == 2
+    assert find_counts(run, "m2->s").duplicate == 2
     assert (
         link_uses["s->m1"].counts.missing,
         link_uses["s->m1"].burst,
@@ -107,10 +108,10 @@ def test_lost_and_doubled_samples_are_counted():
 
 
 def test_samples_of_missing_records_have_no_fate():
-    log = logs.rewritten(
-        logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
+    log = rewrite_log(
+        make_short_log("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
     )
-    link_uses = uses(log)
+    link_uses = summarise_by_name(log)
     for link in ("m1->m2", "s->m2"):
         counts = link_uses[link].counts
         assert (counts.missing, counts.lost, counts.late) == (0, 0, 0)
@@ -121,30 +122,30 @@ def test_samples_of_missing_records_have_no_fate():
 
 def test_a_link_cut_until_the_end_loses_everything():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
-    run = logs.drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
-    cut = uses(run.log)["m2->m1"]
+    run = drive_run(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
+    cut = summarise_by_name(run.log)["m2->m1"]
     assert (cut.counts.missing, cut.burst) == (99, 99.0)  # the last one could not have come yet
     assert cut.silence_ms == 1000.0 - (99 * 5.0 + 20.0)
 
 
 def test_late_samples_equal_those_of_the_core():
     """Every sample of a link takes longer than the link's delay."""
-    log = logs.simulated("free")
+    log = make_short_log("free")
     hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
     assert hurried != log.scenario.text
-    run = logs.drive_run(parse_scenario(hurried))
+    run = drive_run(parse_scenario(hurried))
     for use in summarise_links(run.log):
-        assert use.counts.late == counted(run, use.name).late
+        assert use.counts.late == find_counts(run, use.name).late
 
 
 def test_only_out_of_range_stamps_are_refused():
     def hostile(state):
-        return logs.replaced(
+        return replace_fields(
             state,
             rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx,
         )
 
-    link_uses = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
+    link_uses = summarise_by_name(rewrite_log(make_short_log("paper"), change=hostile))
     assert [use.counts.refused for use in link_uses.values()] == [1] * 6
     assert [use.counts.sent for use in link_uses.values()] == [400] * 6
 
@@ -154,7 +155,7 @@ def test_false_tick_numbers_cost_no_memory():
 
     def far(state):
         return (
-            logs.replaced(state, tick=2**39)
+            replace_fields(state, tick=2**39)
             if (state.site, state.tick) == ("m2", 399)
             else state
         )
@@ -162,14 +163,14 @@ def test_false_tick_numbers_cost_no_memory():
     with pytest.raises(
         LogError, match="m2 has a record of tick 549755813888, but the scenario has only 400"
     ):
-        uses(logs.rewritten(logs.simulated("paper"), change=far))
+        summarise_by_name(rewrite_log(make_short_log("paper"), change=far))
 
 
 # -- ages
 
 
 def test_effective_delay_without_jitter_is_the_stated():
-    for use in summarise_links(logs.simulated("paper")):
+    for use in summarise_links(make_short_log("paper")):
         assert use.plain
         assert use.one_way_us is None
         assert use.age_ms == compute_statistics([200.0])
@@ -181,7 +182,8 @@ def test_effective_delay_without_jitter_is_the_stated():
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
 def test_recorded_ages_follow_from_fates_of_samples(link):
     peer, site = link.split("->")
-    log, part = logs.busy().log, logs.busy().log[site]
+    log = make_busy_run().log
+    part = make_busy_run().log[site]
     fate = predict_delivery(log, peer, site, log.scenario.ticks(peer))
     release = fate.release(part.rate_hz)
     usable = np.full(len(part), -1)
@@ -191,10 +193,12 @@ def test_recorded_ages_follow_from_fates_of_samples(link):
     in_use = np.maximum.accumulate(usable)
     t_ns = np.arange(len(part)) * 10**9 // part.rate_hz
     ages = [(t_ns[tick] - fate.stamp_ns[n]) / 1e6 for tick, n in enumerate(in_use) if n >= 0]
-    assert tuple(busy()[link].age_ms) == pytest.approx(tuple(compute_statistics(ages)))
+    assert tuple(summarise_busy_run()[link].age_ms) == pytest.approx(
+        tuple(compute_statistics(ages))
+    )
 
 
-def hyperexponential(t_ms):
+def hyperexponential_cdf(t_ms):
     above = np.maximum(t_ms - 30.0, 0.0)
     return 0.7 * -np.expm1(-above / 5.0) + 0.3 * -np.expm1(-above / 60.0)
 
@@ -224,20 +228,21 @@ MODELS = {
         {"model": "normal", "delay_ms": 80.0, "deviation_ms": 20.0},
         stats.norm(80, 20).cdf,
     ),
-    "s->m1": (MIXED, hyperexponential),
+    "s->m1": (MIXED, hyperexponential_cdf),
     "s->m2": ({"model": "lognormal", "delay_ms": 60.0, "deviation_ms": 30.0}, LOG.cdf),
 }
 
 
 @cache
-def jittery(order):
+def simulate_jitter(order):
     links = {f"links.{name}": {**table, "order": order} for name, (table, _) in MODELS.items()}
     return trilat_net.simulate(load_scenario("free", {"duration_s": 2.0, **links}))
 
 
 @pytest.mark.parametrize("link", MODELS)
 @pytest.mark.parametrize(
-    ("order", "theory", "margin"), [("newest", newest_wins, 0.1), ("in_order", in_order, 0.2)]
+    ("order", "theory", "margin"),
+    [("newest", newest_wins, 0.1), ("in_order", compute_ordered_moments, 0.2)],
 )
 def test_effective_delay_under_jitter_follows_theory(link, order, theory, margin):
     """P(age > n h) is a product over independent samples, summed here; the run draws and
@@ -246,9 +251,9 @@ def test_effective_delay_under_jitter_follows_theory(link, order, theory, margin
     A run of two seconds starts with nothing older to wait for, and the largest of many delays
     varies.
     """
-    log = jittery(order)
+    log = simulate_jitter(order)
     mean_ms, deviation_ms = theory(MODELS[link][1], PERIOD_MS)
-    use = uses(log)[link]
+    use = summarise_by_name(log)[link]
     assert use.age_ms.mean == pytest.approx(mean_ms, rel=margin)
     peer, site = link.split("->")
     release = predict_delivery(log, peer, site, 100_000).release(1000)
@@ -270,8 +275,12 @@ def test_effective_delays_equal_the_documented_figures():
     """
     assert newest_wins(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(162.2, abs=0.05)
     assert newest_wins(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(24.74, abs=0.05)
-    assert in_order(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(238.8, abs=0.05)
-    assert in_order(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(376.3, abs=0.05)
+    assert compute_ordered_moments(stats.uniform(150, 100).cdf, 1.0)[0] == pytest.approx(
+        238.8, abs=0.05
+    )
+    assert compute_ordered_moments(stats.uniform(0, 400).cdf, 1.0)[0] == pytest.approx(
+        376.3, abs=0.05
+    )
 
 
 # -- losses
@@ -290,7 +299,7 @@ def test_measured_loss_and_bursts_follow_the_model():
 
 
 def test_playout_makes_smaller_jitter_constant():
-    use = busy()["b->c"]
+    use = summarise_busy_run()["b->c"]
     assert use.drawn_ms.deviation == pytest.approx(20.0, rel=0.4)
     assert use.age_ms.p50 < 80.0  # a tick of 5 ms, a sample every 6.67 ms
     assert use.stated[0].link.moments().deviation_ms < 21.0
@@ -300,10 +309,10 @@ def test_playout_makes_smaller_jitter_constant():
 
 
 def test_histogram_counts_ticks_in_few_round_bins():
-    for use in busy().values():
+    for use in summarise_busy_run().values():
         bins = use.ages
         assert sum(bins.ticks) == pytest.approx(
-            (6.0 - use.first_use_s) * logs.busy().log[use.site].rate_hz
+            (6.0 - use.first_use_s) * make_busy_run().log[use.site].rate_hz
         )
         assert len(bins.ticks) <= 50
         assert bins.first_ms <= use.age_ms.min
@@ -321,7 +330,7 @@ def test_one_age_gives_one_bin():
 
 
 def test_an_empty_log_has_no_link_statistics():
-    log = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
+    log = rewrite_log(make_short_log("paper"), keep=lambda _: False, finished=False)
     for use in summarise_links(log):
         assert use.stated[0].link.delay_ms == 200.0
         assert use.plain
@@ -332,25 +341,25 @@ def test_an_empty_log_has_no_link_statistics():
 
 def test_measured_delays_equal_those_in_the_records():
     def timed(state):
-        return logs.replaced(
+        return replace_fields(
             state, rx=[[j, tick, 100 * (j + 1) + tick] for j, tick, _ in state.rx]
         )
 
-    log = logs.rewritten(logs.simulated("paper"), change=timed, driver="live")
-    use = uses(log)["m2->m1"]
+    log = rewrite_log(make_short_log("paper"), change=timed, driver="live")
+    use = summarise_by_name(log)["m2->m1"]
     assert (use.one_way_us.min, use.one_way_us.max) == (100.0, 100.0 + 398)
-    old = logs.rewritten(log, change=lambda s: logs.replaced(s, v=1), driver="live")
+    old = rewrite_log(log, change=lambda s: replace_fields(s, v=1), driver="live")
     # before version 2 it was the age of the stamp
-    assert uses(old)["m2->m1"].one_way_us is None
+    assert summarise_by_name(old)["m2->m1"].one_way_us is None
 
 
 COUNT = 900
 LINKS = [(peer, site) for site in "abc" for peer in "abc" if peer != site]
 
 
-def decided(peer: str, site: str) -> Site:
+def make_decided_site(peer: str, site: str) -> Site:
     """Returns the site of the core, given every change at the tick at which it was applied."""
-    log = logs.busy().log
+    log = make_busy_run().log
     core = Site(log.scenario.setup(site))
     index = log[site].peers.index(peer)
     for tick, commands in log.commands(site).items():
@@ -362,7 +371,8 @@ def decided(peer: str, site: str) -> Site:
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
 def test_fates_equal_those_of_the_cores_link(peer, site):
-    log, core = logs.busy().log, decided(peer, site)
+    log = make_busy_run().log
+    core = make_decided_site(peer, site)
     delivery_ticks = predict_delivery(log, peer, site, COUNT).release(core.rate_hz).tolist()
     index = log[site].peers.index(peer)
     expected = [core.release_tick(index, sample) for sample in range(COUNT)]
@@ -371,7 +381,7 @@ def test_fates_equal_those_of_the_cores_link(peer, site):
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
 def test_fates_are_independent_of_the_sample_count(peer, site, monkeypatch):
-    log = logs.busy().log
+    log = make_busy_run().log
     whole = predict_delivery(log, peer, site, COUNT)
     monkeypatch.setattr(module, "_BLOCK", 64)
     part = predict_delivery(log, peer, site, 500)
@@ -382,7 +392,7 @@ def test_fates_are_independent_of_the_sample_count(peer, site, monkeypatch):
 
 
 def test_order_and_playout_follow_the_drawn_delays():
-    log = logs.busy().log
+    log = make_busy_run().log
     for peer, site in LINKS:
         fate = predict_delivery(log, peer, site, COUNT)
         assert ((fate.drawn_ns == LOST) == fate.lost).all()
@@ -394,7 +404,7 @@ def test_order_and_playout_follow_the_drawn_delays():
 
 
 def test_lost_samples_equal_those_of_the_link():
-    log = logs.busy().log
+    log = make_busy_run().log
     cut = predict_delivery(log, "a", "b", COUNT)
     in_outage = (cut.stamp_ns >= 2 * 10**9) & (cut.stamp_ns < 3 * 10**9)
     assert (cut.lost == in_outage).all()

@@ -5,11 +5,11 @@ from typing import Any
 import pytest
 
 import trilat_net as tn
+from tests.execution.builders import run_fused
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.run_remarks import list_remarks
 from trilat_net.analysis.theory.loop_roots import find_log_roots, find_run_roots
-from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.page_timeline import list_moments
 from trilat_net.scenario import load_scenario
@@ -29,8 +29,7 @@ def test_roots_of_program_loops_are_no_proof() -> None:
     assert roots.verdict == "stable"
     assert roots.leaves_out == LEFT_OUT
     assert not roots.is_proof
-    run = FusedRun(log.scenario)
-    run.advance_to(5.0)
+    run = run_fused(log.scenario, 5.0)
     assert find_run_roots(log.scenario, run).leaves_out == LEFT_OUT
     script = find_log_roots(tn.simulate("free", duration_s=5.0))
     assert script.is_proof

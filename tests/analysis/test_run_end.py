@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import make_diverged_log
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.run_end import (
     NO_BUCKETS,
     EndBehaviour,
@@ -23,47 +24,62 @@ from trilat_net.scenario import load_scenario
 
 
 @cache
-def still() -> Log:
+def simulate_rest() -> Log:
     return trilat_net.simulate(
         "two_sites", {"duration_s": 12, "rate_hz": 50, "sites.m.hands": []}
     )
 
 
-def moving(e: Callable[[float], float], qd: Callable[[float], float]) -> Log:
+def make_moving_log(e: Callable[[float], float], qd: Callable[[float], float]) -> Log:
     """Returns a log whose sites move as given."""
 
     def changed(state):
         t_s = state.t_ns * 1e-9
-        return logs.replaced(state, q=[e(t_s), 0.0], q_des=[0.0, 0.0], qd=[qd(t_s), 0.0])
+        return replace_fields(state, q=[e(t_s), 0.0], q_des=[0.0, 0.0], qd=[qd(t_s), 0.0])
 
-    return logs.rewritten(still(), change=changed)
+    return rewrite_log(simulate_rest(), change=changed)
 
 
-def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]:
+def make_swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]:
     return lambda t_s: amplitude * np.exp(rate_per_s * t_s) * np.sin(2 * np.pi * 1.5 * t_s)
 
 
 @pytest.mark.parametrize(
     ("e", "qd", "motion", "says"),
     [
-        (swing(-0.8), swing(-0.7), EndBehaviour.CONVERGED, "converged: largest |e| "),
-        (swing(-0.7), swing(-0.15), EndBehaviour.DECAYS, "decaying at m joint 1 (|e| -0.7"),
-        (swing(-0.15), swing(-0.15), EndBehaviour.DECAYS, "|qd| -0.15"),
+        (make_swing(-0.8), make_swing(-0.7), EndBehaviour.CONVERGED, "converged: largest |e| "),
         (
-            swing(-0.15),
-            swing(-0.1),
+            make_swing(-0.7),
+            make_swing(-0.15),
+            EndBehaviour.DECAYS,
+            "decaying at m joint 1 (|e| -0.7",
+        ),
+        (make_swing(-0.15), make_swing(-0.15), EndBehaviour.DECAYS, "|qd| -0.15"),
+        (
+            make_swing(-0.15),
+            make_swing(-0.1),
             EndBehaviour.HARDLY,
             "hardly decaying at m joint 1 (|e| -0.15",
         ),
-        (swing(-0.1), swing(-0.15), EndBehaviour.HARDLY, "|qd| -0.15"),
-        (swing(0.0), swing(0.0), EndBehaviour.BOUNDED, "bounded oscillation at 1.5"),
-        (swing(-0.8), swing(0.0), EndBehaviour.BOUNDED, "Hz at m joint 1"),
-        (swing(0.0), swing(-0.02), EndBehaviour.HARDLY, "|qd| -0.02"),
-        (swing(0.0), swing(-0.15), EndBehaviour.DECAYS, "(|e| steady, |qd| -0.15"),
-        (swing(0.2), swing(0.2), EndBehaviour.GROWS, "growing at m joint 1 (|e| +0.2"),
-        (swing(-0.3), swing(0.3), EndBehaviour.GROWS, "|qd| +0.3"),
-        (swing(0.2), swing(0.0), EndBehaviour.UNDECIDED, "|e| grows, |qd| steady"),
-        (lambda _: 0.2, swing(-0.8), EndBehaviour.CONVERGED, "at rest, with errors that stay"),
+        (make_swing(-0.1), make_swing(-0.15), EndBehaviour.HARDLY, "|qd| -0.15"),
+        (make_swing(0.0), make_swing(0.0), EndBehaviour.BOUNDED, "bounded oscillation at 1.5"),
+        (make_swing(-0.8), make_swing(0.0), EndBehaviour.BOUNDED, "Hz at m joint 1"),
+        (make_swing(0.0), make_swing(-0.02), EndBehaviour.HARDLY, "|qd| -0.02"),
+        (make_swing(0.0), make_swing(-0.15), EndBehaviour.DECAYS, "(|e| steady, |qd| -0.15"),
+        (
+            make_swing(0.2),
+            make_swing(0.2),
+            EndBehaviour.GROWS,
+            "growing at m joint 1 (|e| +0.2",
+        ),
+        (make_swing(-0.3), make_swing(0.3), EndBehaviour.GROWS, "|qd| +0.3"),
+        (make_swing(0.2), make_swing(0.0), EndBehaviour.UNDECIDED, "|e| grows, |qd| steady"),
+        (
+            lambda _: 0.2,
+            make_swing(-0.8),
+            EndBehaviour.CONVERGED,
+            "at rest, with errors that stay",
+        ),
         (
             lambda _: 0.1,
             lambda _: 0.4,
@@ -74,7 +90,7 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
     ],
 )
 def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None:
-    run_end = RunEnd.of_log(moving(e, qd))
+    run_end = RunEnd.of_log(make_moving_log(e, qd))
     assert run_end.behaviour is motion
     assert says in run_end.text
 
@@ -121,21 +137,26 @@ def test_wall_hammering_shows_only_in_longer_records() -> None:
 
 def test_a_site_without_records_leaves_it_undecided() -> None:
     run_end = RunEnd.of_log(
-        logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda state: state.site == "m")
+        rewrite_log(
+            make_moving_log(make_swing(-0.8), make_swing(-0.8)), lambda state: state.site == "m"
+        )
     )
     assert run_end.behaviour is EndBehaviour.UNDECIDED
     assert run_end.text == "undecided: no record of s"
 
 
 def test_only_times_recorded_by_all_sites_count() -> None:
-    torn = logs.rewritten(
-        moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300)
+    torn = rewrite_log(
+        make_moving_log(make_swing(-0.8), make_swing(-0.8)),
+        lambda s: (s.site == "m") == (s.tick < 300),
     )
     assert RunEnd.of_log(torn).behaviour is EndBehaviour.UNDECIDED
 
 
 def test_a_late_jump_is_undecided() -> None:
-    run_end = RunEnd.of_log(moving(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, swing(-0.5)))
+    run_end = RunEnd.of_log(
+        make_moving_log(lambda t_s: 1e-3 + (t_s > 11.0) * 0.5, make_swing(-0.5))
+    )
     assert run_end.behaviour is EndBehaviour.UNDECIDED
     assert run_end.stability is Stability.OPEN
     assert "record longer" in run_end.text
@@ -144,13 +165,13 @@ def test_a_late_jump_is_undecided() -> None:
 def test_short_runs_are_undecided_and_stopped_ones_diverged() -> None:
     short = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 50})
     assert RunEnd.of_log(short).behaviour is EndBehaviour.UNDECIDED
-    stopped = RunEnd.of_log(logs.diverged())
+    stopped = RunEnd.of_log(make_diverged_log())
     assert stopped.behaviour is EndBehaviour.DIVERGED
-    assert stopped.text == f"diverged: {logs.diverged().describe_divergence()}"
+    assert stopped.text == f"diverged: {make_diverged_log().describe_divergence()}"
 
 
 def test_a_log_without_records_is_undecided() -> None:
-    empty = logs.rewritten(still(), lambda _: False)
+    empty = rewrite_log(simulate_rest(), lambda _: False)
     assert RunEnd.of_log(empty).behaviour is EndBehaviour.UNDECIDED
 
 
@@ -159,11 +180,11 @@ def test_a_decaying_joint_hides_no_growing_one() -> None:
 
     def changed(state):
         t_s = state.t_ns * 1e-9
-        small = swing(0.2, 1e-4)(t_s) if state.site == "s" else 0.0
-        wide = swing(-0.3)(t_s)
-        return logs.replaced(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
+        small = make_swing(0.2, 1e-4)(t_s) if state.site == "s" else 0.0
+        wide = make_swing(-0.3)(t_s)
+        return replace_fields(state, q=[wide, small], q_des=[0.0, 0.0], qd=[wide, small])
 
-    run_end = RunEnd.of_log(logs.rewritten(still(), change=changed))
+    run_end = RunEnd.of_log(rewrite_log(simulate_rest(), change=changed))
     assert (run_end.behaviour, run_end.where) == (EndBehaviour.GROWS, "s joint 2")
     assert run_end.stability is Stability.NOT_STABLE
 
@@ -183,10 +204,10 @@ def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stabilit
     )
 
     def changed(state):
-        x = swing(0.2)(state.t_ns * 1e-9)
-        return logs.replaced(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
+        x = make_swing(0.2)(state.t_ns * 1e-9)
+        return replace_fields(state, q=[x, 0.0], q_des=[0.0, 0.0], qd=[x, 0.0])
 
-    run_end = RunEnd.of_log(logs.rewritten(log, change=changed))
+    run_end = RunEnd.of_log(rewrite_log(log, change=changed))
     assert run_end.behaviour is EndBehaviour.GROWS
     assert run_end.stability is stability
 
@@ -209,11 +230,11 @@ def test_growth_while_an_operator_acts_is_open(pushed: bool, stability: Stabilit
 def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, says) -> None:
     def changed(state):
         q = [angle if state.site == "s" else 0.0, 0.0]
-        return logs.replaced(
+        return replace_fields(
             state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0]
         )
 
-    run_end = RunEnd.of_log(logs.rewritten(still(), change=changed))
+    run_end = RunEnd.of_log(rewrite_log(simulate_rest(), change=changed))
     assert run_end.stability is stability
     assert says in run_end.text
 
@@ -223,8 +244,8 @@ def test_sites_at_rest_agree_unless_forced_apart(angle, e, tau_x, stability, say
     [([-1.5, 0.05], "m, s hang: the arms fell"), ([2.5, 0.0], "away from every start pose")],
 )
 def test_hanging_or_thrown_arms_are_not_stable(pose: list[float], says: str) -> None:
-    change = lambda s: logs.replaced(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
-    run_end = RunEnd.of_log(logs.rewritten(still(), change=change))
+    change = lambda s: replace_fields(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
+    run_end = RunEnd.of_log(rewrite_log(simulate_rest(), change=change))
     assert run_end.stability is Stability.OPEN
     assert says in run_end.text
 
@@ -237,18 +258,19 @@ def test_a_driven_joint_does_not_oscillate(wide: float, motion: EndBehaviour) ->
 
     def changed(state):
         t_s = state.t_ns * 1e-9
-        steady = swing(0.0, 0.05)(t_s) if state.site == "s" else 0.0
-        falls = swing(-0.1, wide)(t_s)
-        return logs.replaced(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
+        steady = make_swing(0.0, 0.05)(t_s) if state.site == "s" else 0.0
+        falls = make_swing(-0.1, wide)(t_s)
+        return replace_fields(state, q=[falls, steady], q_des=[0.0, 0.0], qd=[falls, steady])
 
-    assert RunEnd.of_log(logs.rewritten(still(), change=changed)).behaviour is motion
+    assert RunEnd.of_log(rewrite_log(simulate_rest(), change=changed)).behaviour is motion
 
 
-RATE_HZ, SPAN_S = 50, 40.0
+RATE_HZ = 50
+SPAN_S = 40.0
 T_S = np.arange(round(RATE_HZ * SPAN_S)) / RATE_HZ
 
 
-def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
+def make_trace(speed: Array, *, one_way: bool = False) -> RunTrace:
     """Returns a run of three sites whose joints swing at 1 Hz, or move one way, at a given
     speed, without errors.
     """
@@ -272,7 +294,7 @@ def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
 )
 def test_small_speed_is_rest_only_while_falling(speed, behaviour: EndBehaviour) -> None:
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
-    assert trace(speed(T_S)).classify_end(scenario).behaviour is behaviour
+    assert make_trace(speed(T_S)).classify_end(scenario).behaviour is behaviour
 
 
 @pytest.mark.parametrize(
@@ -284,9 +306,9 @@ def test_small_speed_is_rest_only_while_falling(speed, behaviour: EndBehaviour) 
     ],
 )
 def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehaviour) -> None:
-    """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
+    """An arm that sinks by 5, 17 or 69 mrad in the second half, with a speed that falls by 10 %, has not converged."""
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
-    sinking = trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
+    sinking = make_trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
     assert sinking.classify_end(scenario).behaviour is behaviour
 
 
@@ -297,6 +319,6 @@ def test_slow_sinking_has_not_converged(speed_rad_s: float, behaviour: EndBehavi
 def test_a_late_change_needs_a_longer_record(at_s: float, stability: Stability) -> None:
     later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
-    run_end = trace(np.exp(-0.5 * T_S)).classify_end(scenario)
+    run_end = make_trace(np.exp(-0.5 * T_S)).classify_end(scenario)
     assert run_end.stability is stability
     assert ("the loop changes until 39 s" in run_end.text) is (stability is Stability.OPEN)

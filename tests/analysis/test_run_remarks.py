@@ -2,7 +2,8 @@
 
 import pytest
 
-from tests.analysis import logs
+from tests.analysis.builders import make_short_log
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net import simulate
 from trilat_net.analysis.run_remarks import LARGE_PUSH_SHARE, list_remarks
 from trilat_net.net.messages import State
@@ -10,27 +11,27 @@ from trilat_net.net.messages import State
 
 @pytest.mark.parametrize("ticks", [1, 7, 40])
 def test_ticks_at_the_torque_limit_are_counted(ticks: int) -> None:
-    log = logs.simulated("paper")  # 200 Hz
+    log = make_short_log("paper")  # 200 Hz
     limits_nm = {site: log.scenario.sites[site].limits.tau_limit_nm for site in log.sites}
 
     def saturate(row: State) -> State:
         if row.site == "s" or row.tick >= (ticks if row.site == "m1" else 2 * ticks):
             return row
-        return logs.replaced(row, tau=[0.0, limits_nm[row.site]])
+        return replace_fields(row, tau=[0.0, limits_nm[row.site]])
 
-    remarks = list_remarks(logs.rewritten(log, change=saturate))
+    remarks = list_remarks(rewrite_log(log, change=saturate))
     times = f"{ticks / 200:.3g} s and {2 * ticks / 200:.3g} s"
     assert remarks == (f"m1 and m2 were at their torque limit for {times}",)
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_pushes_above_half_the_limit_are_named(share: float) -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     limit_nm = log.scenario.sites["m2"].limits.tau_limit_nm
     push_nm = share * LARGE_PUSH_SHARE * limit_nm
-    pushed = logs.rewritten(
+    pushed = rewrite_log(
         log,
-        change=lambda row: logs.replaced(
+        change=lambda row: replace_fields(
             row, tau_x=[-push_nm if row.site == "m2" else 0.0, 0.0]
         ),
     )
@@ -40,10 +41,10 @@ def test_pushes_above_half_the_limit_are_named(share: float) -> None:
 
 
 def test_late_ticks_are_counted() -> None:
-    log = logs.simulated("paper")
-    late = logs.rewritten(
+    log = make_short_log("paper")
+    late = rewrite_log(
         log,
-        change=lambda row: logs.replaced(row, late_us=5000 if row.tick in (3, 9) else 4999),
+        change=lambda row: replace_fields(row, late_us=5000 if row.tick in (3, 9) else 4999),
         keep=lambda row: row.site != "m2",
         driver="live",
     )
@@ -53,9 +54,9 @@ def test_late_ticks_are_counted() -> None:
 
 
 def test_calm_and_empty_logs_have_no_remarks() -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     assert list_remarks(log) == ()
-    assert list_remarks(logs.rewritten(log, lambda _: False)) == ()
+    assert list_remarks(rewrite_log(log, lambda _: False)) == ()
 
 
 @pytest.mark.parametrize("half_width_ms", [0.0, 2.0, 50.0, 200.0])

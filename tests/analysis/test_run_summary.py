@@ -10,21 +10,34 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import trilat_net
-from tests.log_editing import edited, opened, recorded, without
+from tests.analysis.builders import (
+    make_busy_run,
+    make_diverged_log,
+    make_log_without_hands,
+    make_short_log,
+)
+from tests.log.builders import (
+    add_clock_readings,
+    drop_records,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    replace_fields,
+    rewrite_log,
+    write_log,
+)
 from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
 from trilat_net.errors import LogError
 
-from . import logs
 
-
-def strict(facts):
+def parse_strictly(facts):
     """Parses JSON as strict programs do; NaN and arrays are errors."""
     return json.loads(json.dumps(facts, allow_nan=False))
 
 
 def test_numbers_agree_with_the_records():
-    log = logs.simulated("paper")
-    facts = strict(summarise_run(log, logs.twin("paper")))
+    log = make_short_log("paper")
+    facts = parse_strictly(summarise_run(log, make_log_without_hands("paper")))
     for name in log.sites:
         states = log[name].states
         site = facts["sites"][name]
@@ -39,7 +52,7 @@ def test_numbers_agree_with_the_records():
         assert site["saturated_ticks"] == 0
         moved = [
             [abs(a - b) for a, b in zip(s.q, t.q, strict=True)]
-            for s, t in zip(states, logs.twin("paper")[name].states, strict=True)
+            for s, t in zip(states, make_log_without_hands("paper")[name].states, strict=True)
         ]
         assert site["hands_moved_max_rad"] == [max(joint) for joint in zip(*moved, strict=True)]
     link = facts["links"]["m2->s"]
@@ -59,13 +72,13 @@ def test_a_run_settles_with_its_last_site():
         off = 0.02 * (state.tick == 250 and state.site == "m2")
         return msgspec.structs.replace(state, q=[q + off for q in state.q_des])
 
-    facts = summarise_run(logs.rewritten(logs.simulated("paper"), change=settle))
+    facts = summarise_run(rewrite_log(make_short_log("paper"), change=settle))
     assert [site["settle_s"] for site in facts["sites"].values()] == [0.0, 250 / 200, 0.0]
     assert facts["settle_s"] == 250 / 200
 
 
 def test_loop_times_are_summarised():
-    facts = summarise_run(logs.timed(logs.simulated("four")))
+    facts = summarise_run(add_clock_readings(make_short_log("four")))
     site = facts["sites"]["c"]  # 200 Hz: 400 ticks, late by 0 to 399 us
     assert site["late_us"]["p50"] == 199.5
     assert site["late_us"]["p99_9"] == pytest.approx(np.percentile(np.arange(400), 99.9))
@@ -80,7 +93,7 @@ def test_overruns_begin_at_a_whole_period():
             state, late_us={10: 4999, 20: 5000, 30: 9000}.get(state.tick, 1)
         )
 
-    facts = summarise_run(logs.rewritten(logs.simulated("paper"), change=late))
+    facts = summarise_run(rewrite_log(make_short_log("paper"), change=late))
     # 200 Hz: 5000 us
     assert [site["overruns"] for site in facts["sites"].values()] == [
         2,
@@ -90,17 +103,17 @@ def test_overruns_begin_at_a_whole_period():
 
 
 def test_saturation_is_counted():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     limit = log.scenario.sites["m1"].limits.tau_limit_nm
 
     def cut(state):
         return msgspec.structs.replace(state, tau=[0.0, -limit]) if state.tick < 5 else state
 
-    assert summarise_run(logs.rewritten(log, change=cut))["sites"]["m1"]["saturated_ticks"] == 5
+    assert summarise_run(rewrite_log(log, change=cut))["sites"]["m1"]["saturated_ticks"] == 5
 
 
 def test_divergence_is_reported_without_missing_records():
-    facts = strict(summarise_run(logs.diverged()))
+    facts = parse_strictly(summarise_run(make_diverged_log()))
     assert facts["diverged"] is True
     assert facts["missing"] == 0
     assert (
@@ -112,15 +125,15 @@ def test_divergence_is_reported_without_missing_records():
 
 def test_a_held_site_has_not_diverged():
     def hold(state):
-        return logs.replaced(state, mode="hold" if state.tick > 350 else "run")
+        return replace_fields(state, mode="hold" if state.tick > 350 else "run")
 
-    facts = strict(summarise_run(logs.rewritten(logs.simulated("paper"), change=hold)))
+    facts = parse_strictly(summarise_run(rewrite_log(make_short_log("paper"), change=hold)))
     assert facts["diverged"] is False
     assert facts["sites"]["m1"]["modes"] == [{"mode": "hold", "from_s": 351 / 200, "to_s": 2.0}]
 
 
 def test_changes_are_reported_with_their_author():
-    facts = strict(summarise_run(logs.busy().log))
+    facts = parse_strictly(summarise_run(make_busy_run().log))
     changes = [
         (c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"])
         for c in facts["changes"]
@@ -137,7 +150,7 @@ def test_a_measured_link_states_no_delay():
     log = trilat_net.simulate(
         "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
     )
-    facts = strict(summarise_run(log))
+    facts = parse_strictly(summarise_run(log))
     for link in facts["links"].values():
         assert (link["delay_ms"], link["drawn_ms"], link["stated"][0]["mean_ms"]) == (
             None,
@@ -149,8 +162,8 @@ def test_a_measured_link_states_no_delay():
 
 
 def test_missing_records_are_counted():
-    log = logs.rewritten(
-        logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
+    log = rewrite_log(
+        make_short_log("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
     )
     facts = summarise_run(log)
     assert [site["missing"] for site in facts["sites"].values()] == [0, 50, 0]
@@ -159,10 +172,8 @@ def test_missing_records_are_counted():
 
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_nulls_and_no_nan(records):
-    log = logs.rewritten(
-        logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False
-    )
-    facts = strict(summarise_run(log, logs.twin("paper")))
+    log = rewrite_log(make_short_log("paper"), keep=lambda s: s.tick < records, finished=False)
+    facts = parse_strictly(summarise_run(log, make_log_without_hands("paper")))
     assert facts["session"]["complete"] is False
     for site in facts["sites"].values():
         assert site["records"] == records
@@ -173,22 +184,16 @@ def test_short_logs_have_nulls_and_no_nan(records):
     assert facts["links"]["s->m1"]["late_samples"] == (0 if records else None)
 
 
-WHOLE = recorded("paper")
+WHOLE = make_log_bytes("paper")
 STATE = "/trilat/paper/m1/state"
 RATES = {"m1": 1000, "m2": 1000, "s": 1000}
-
-
-def write_log(folder: Path, data: bytes) -> Path:
-    path = folder / "run.mcap"
-    path.write_bytes(data)
-    return path
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sets(st.integers(0, 119), max_size=100))
 def test_gaps_count_missing_records(tmp_path: Path, lost: set[int]) -> None:
     """Records missing behind the last one do not count, because no number reveals them."""
-    path = write_log(tmp_path, edited(WHOLE, record=without("m1", lost)))
+    path = write_log(tmp_path, edit_log_bytes(WHOLE, record=drop_records("m1", lost)))
     facts = FileInventory([path]).channels("paper", RATES, {})[STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
@@ -202,7 +207,7 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
     paths = []
     for n, half in enumerate(halves):
         paths.append(tmp_path / f"{n}.mcap")
-        paths[-1].write_bytes(edited(WHOLE, record=half))
+        paths[-1].write_bytes(edit_log_bytes(WHOLE, record=half))
     inventory = FileInventory(paths)
     facts = inventory.channels("paper", RATES, {})[STATE]
     assert (facts["messages"], facts["missing"]) == (120, 0)
@@ -225,7 +230,7 @@ def test_an_unreadable_file_is_an_error(tmp_path: Path) -> None:
 
 
 def test_ticks_are_those_of_the_last_start() -> None:
-    log = opened(recorded("two_sites", {"duration_s": 0.2}))
+    log = make_log("two_sites", {"duration_s": 0.2})
     last = next(event for event in log.events if (event.kind, event.member) == ("end", "s"))
     log.events.insert(0, msgspec.structs.replace(last, ticks=30, t_ns=0))
     assert summarise_run(log)["sites"]["s"]["made_ticks"] == last.ticks == 200

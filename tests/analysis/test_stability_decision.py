@@ -23,7 +23,7 @@ NO_ROOTS = LoopRoots("", None, False, "this rest: no roots: its code may not run
 THEOREM = "the theorem (continuous time; every premise checked here holds)"
 
 
-def end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> RunEnd:
+def make_run_end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> RunEnd:
     trend = EnvelopeTrend.STEADY
     if behaviour in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
         trend = EnvelopeTrend.DECAYS
@@ -34,7 +34,7 @@ def end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> Run
     return whole._replace(**more)
 
 
-def pushed(
+def make_twin_growth(
     trend: EnvelopeTrend = EnvelopeTrend.DECAYS, rate_per_s: float = -0.2, **more: object
 ) -> TwinGrowth:
     factor = math.exp(10.0 * rate_per_s)
@@ -44,19 +44,19 @@ def pushed(
     return TwinGrowth("", from_s=10.0, to_s=20.0, pushes=pushes)._replace(**more)
 
 
-GROWING = pushed(EnvelopeTrend.GROWS, 0.2)
+GROWING = make_twin_growth(EnvelopeTrend.GROWS, 0.2)
 
 
 def decide(**findings: object) -> StabilityDecision:
-    return decide_stability(RunFindings(**{"end": end(), **findings}))  # type: ignore[arg-type]
+    return decide_stability(RunFindings(**{"end": make_run_end(), **findings}))  # type: ignore[arg-type]
 
 
 def test_stable_needs_a_proof() -> None:
     assert decide().stability is Stability.OPEN
-    assert decide(twins=pushed()).stability is Stability.SETTLED
-    assert decide(twins=pushed(), roots=NO_ROOTS).stability is Stability.SETTLED
-    assert decide(twins=pushed(), roots=STABLE_ROOTS).stability is Stability.STABLE
-    assert decide(twins=pushed(), proofs=[THEOREM]).stability is Stability.STABLE
+    assert decide(twins=make_twin_growth()).stability is Stability.SETTLED
+    assert decide(twins=make_twin_growth(), roots=NO_ROOTS).stability is Stability.SETTLED
+    assert decide(twins=make_twin_growth(), roots=STABLE_ROOTS).stability is Stability.STABLE
+    assert decide(twins=make_twin_growth(), proofs=[THEOREM]).stability is Stability.STABLE
     assert decide(proofs=[THEOREM]).stability is Stability.STABLE
 
 
@@ -64,10 +64,10 @@ def test_the_decision_names_its_basis() -> None:
     assert decide(roots=STABLE_ROOTS).rests_on == "exact roots, slowest -0.163 /s"
     both = decide(roots=STABLE_ROOTS, proofs=[THEOREM])
     assert both.rests_on == f"{THEOREM}; exact roots, slowest -0.163 /s"
-    settled = decide(twins=pushed(), roots=NO_ROOTS)
+    settled = decide(twins=make_twin_growth(), roots=NO_ROOTS)
     expected = f"{len(PUSHES)} pushes over 20 s, all of which died away; {NO_ROOTS.text}"
     assert settled.rests_on == expected
-    moving = end(EndBehaviour.UNDECIDED)
+    moving = make_run_end(EndBehaviour.UNDECIDED)
     assert decide(end=moving, twins=GROWING).rests_on == GROWING.text
 
 
@@ -75,7 +75,7 @@ def test_the_decision_names_its_basis() -> None:
     "roots", [STABLE_ROOTS._replace(exact=False), STABLE_ROOTS._replace(verdict="at the edge")]
 )
 def test_inexact_or_unstable_roots_prove_nothing(roots: LoopRoots) -> None:
-    assert decide(twins=pushed(), roots=roots).stability is Stability.SETTLED
+    assert decide(twins=make_twin_growth(), roots=roots).stability is Stability.SETTLED
 
 
 @pytest.mark.parametrize(
@@ -83,10 +83,15 @@ def test_inexact_or_unstable_roots_prove_nothing(roots: LoopRoots) -> None:
 )
 def test_exact_roots_exclude_the_opposite_word(behaviour: EndBehaviour) -> None:
     """This holds for any end and any twins of a run within its limits."""
-    for twins in (None, pushed(), GROWING, pushed(EnvelopeTrend.STEADY, 0.0)):
-        stable = decide(end=end(behaviour), twins=twins, roots=STABLE_ROOTS)
+    for twins in (
+        None,
+        make_twin_growth(),
+        GROWING,
+        make_twin_growth(EnvelopeTrend.STEADY, 0.0),
+    ):
+        stable = decide(end=make_run_end(behaviour), twins=twins, roots=STABLE_ROOTS)
         assert stable.stability is not Stability.NOT_STABLE
-        unstable = decide(end=end(behaviour), twins=twins, roots=UNSTABLE_ROOTS)
+        unstable = decide(end=make_run_end(behaviour), twins=twins, roots=UNSTABLE_ROOTS)
         assert unstable.stability is Stability.NOT_STABLE
         assert unstable.rests_on == "exact roots, fastest growing +0.0424 /s"
 
@@ -94,17 +99,19 @@ def test_exact_roots_exclude_the_opposite_word(behaviour: EndBehaviour) -> None:
 def test_unstable_roots_of_distant_rest_raise_doubt() -> None:
     """The run may come to rest in another pose, whose roots may be stable."""
     distant = UNSTABLE_ROOTS._replace(distance_rad=0.3)
-    decision = decide(twins=pushed(), roots=distant)
+    decision = decide(twins=make_twin_growth(), roots=distant)
     assert decision.stability is Stability.OPEN
     assert decision.reasons == (distant.text,)
-    assert decide(twins=pushed(delay_period_s=145.2), roots=distant).stability is (
+    assert decide(twins=make_twin_growth(delay_period_s=145.2), roots=distant).stability is (
         Stability.NOT_STABLE
     )
 
 
 def test_a_diverged_run_is_never_stable() -> None:
-    diverged = end(EndBehaviour.DIVERGED, diverged_at_s=3.0)
-    decision = decide(end=diverged, twins=pushed(), roots=STABLE_ROOTS, proofs=[THEOREM])
+    diverged = make_run_end(EndBehaviour.DIVERGED, diverged_at_s=3.0)
+    decision = decide(
+        end=diverged, twins=make_twin_growth(), roots=STABLE_ROOTS, proofs=[THEOREM]
+    )
     assert decision.stability is Stability.NOT_STABLE
 
 
@@ -114,17 +121,17 @@ def test_a_diverged_run_is_never_stable() -> None:
 def test_unstable_ends_stand_unless_pushes_contradict(
     behaviour: EndBehaviour,
 ) -> None:
-    bad = end(behaviour)
+    bad = make_run_end(behaviour)
     assert decide(end=bad).stability is Stability.NOT_STABLE
-    assert decide(end=bad, twins=pushed()).stability is Stability.OPEN
+    assert decide(end=bad, twins=make_twin_growth()).stability is Stability.OPEN
     assert decide(end=bad, twins=GROWING).stability is Stability.NOT_STABLE
-    beat = pushed(EnvelopeTrend.STEADY, 0.0, delay_period_s=592.9)
+    beat = make_twin_growth(EnvelopeTrend.STEADY, 0.0, delay_period_s=592.9)
     assert decide(end=bad, twins=beat).stability is Stability.OPEN
 
 
 def test_few_loss_bursts_need_growing_pushes() -> None:
-    bad = end(EndBehaviour.BOUNDED)
-    steady = pushed(EnvelopeTrend.STEADY, 0.01, burst_interval_s=3.0)
+    bad = make_run_end(EndBehaviour.BOUNDED)
+    steady = make_twin_growth(EnvelopeTrend.STEADY, 0.01, burst_interval_s=3.0)
     decision = decide(end=bad, twins=steady)
     assert decision.stability is Stability.OPEN
     assert "has 3.3 bursts of lost samples" in decision.reasons[0]
@@ -135,7 +142,7 @@ def test_few_loss_bursts_need_growing_pushes() -> None:
 
 
 def test_an_acting_operator_leaves_a_run_open() -> None:
-    acting = end(operator_acts=True, reasons=("an operator acts",))
+    acting = make_run_end(operator_acts=True, reasons=("an operator acts",))
     for roots in (None, STABLE_ROOTS, UNSTABLE_ROOTS):
         assert decide(end=acting, twins=GROWING, roots=roots).stability is Stability.OPEN
 
@@ -143,26 +150,26 @@ def test_an_acting_operator_leaves_a_run_open() -> None:
 def test_slow_runs_agree_with_confirmed_slow_roots() -> None:
     """P+d at 190 ms and d = 0.93: -0.00134 /s, for which 40 s show a factor of 0.97."""
     slow_root = STABLE_ROOTS._replace(rate_per_s=-0.00134)
-    swinging = end(EndBehaviour.BOUNDED)
-    confirming = pushed(EnvelopeTrend.STEADY, -0.00131)
+    swinging = make_run_end(EndBehaviour.BOUNDED)
+    confirming = make_twin_growth(EnvelopeTrend.STEADY, -0.00131)
     assert decide(end=swinging, twins=confirming, roots=slow_root).stability is Stability.STABLE
-    flat = pushed(EnvelopeTrend.STEADY, 1e-5)
+    flat = make_twin_growth(EnvelopeTrend.STEADY, 1e-5)
     open_run = decide(end=swinging, twins=flat, roots=slow_root)
     assert open_run.stability is Stability.OPEN
     assert "a run of 4.14e+03 s would" in open_run.reasons[0]
 
 
 def test_departure_from_rest_needs_proof_for_stable() -> None:
-    leaving = pushed(departure=RestDeparture(1.0, 9.0, 0.3, "m joint 1"))
+    leaving = make_twin_growth(departure=RestDeparture(1.0, 9.0, 0.3, "m joint 1"))
     assert decide(twins=leaving).stability is Stability.NOT_STABLE
     assert decide(twins=leaving, roots=STABLE_ROOTS).stability is not Stability.NOT_STABLE
 
 
 def test_doubts_and_hidden_periods_leave_a_run_open() -> None:
     doubt = ["V rises at the end"]
-    decision = decide(twins=pushed(), roots=STABLE_ROOTS, doubts=doubt)
+    decision = decide(twins=make_twin_growth(), roots=STABLE_ROOTS, doubts=doubt)
     assert (decision.stability, decision.reasons) == (Stability.OPEN, tuple(doubt))
-    hidden = pushed(delay_period_s=145.2)
+    hidden = make_twin_growth(delay_period_s=145.2)
     assert decide(twins=hidden).stability is Stability.OPEN
     assert decide(twins=hidden, roots=STABLE_ROOTS).stability is Stability.STABLE
 
@@ -170,9 +177,9 @@ def test_doubts_and_hidden_periods_leave_a_run_open() -> None:
 def test_twins_may_exclude_inexact_unstable_roots() -> None:
     """Pushes that decay over 10 s exclude growth by a hundredfold: 0.46 /s."""
     slow = UNSTABLE_ROOTS._replace(exact=False)
-    assert decide(twins=pushed(), roots=slow).stability is Stability.OPEN
+    assert decide(twins=make_twin_growth(), roots=slow).stability is Stability.OPEN
     fast = slow._replace(rate_per_s=0.5)
-    assert decide(twins=pushed(), roots=fast).stability is Stability.SETTLED
+    assert decide(twins=make_twin_growth(), roots=fast).stability is Stability.SETTLED
 
 
 def test_missing_twins_are_explained() -> None:
@@ -183,14 +190,14 @@ def test_missing_twins_are_explained() -> None:
 
 
 @pytest.mark.parametrize("behaviour", [EndBehaviour.BOUNDED, EndBehaviour.DRIFTS])
-@pytest.mark.parametrize("pushes", [None, pushed(EnvelopeTrend.STEADY, 0.0)])
+@pytest.mark.parametrize("pushes", [None, make_twin_growth(EnvelopeTrend.STEADY, 0.0)])
 def test_a_slow_numerical_decay_stays_open(
     behaviour: EndBehaviour, pushes: TwinGrowth | None
 ) -> None:
     """The word depends on whether the roots would halve the motion in the judged part."""
     judged_s = 20.0
     steady = EnvelopeFit(EnvelopeTrend.STEADY, 0.0, False)
-    lasting = end(behaviour, error=steady, speed=steady, lasts_s=2.0 * judged_s)
+    lasting = make_run_end(behaviour, error=steady, speed=steady, lasts_s=2.0 * judged_s)
     for share in (0.01, 0.5, 0.99, 1.01, 3.0, 100.0):
         rate_per_s = -share * math.log(2.0) / judged_s
         roots = LoopRoots(
@@ -216,7 +223,7 @@ def test_a_slow_numerical_decay_stays_open(
 def test_only_slow_numerical_swings_excuse_oscillations(changes: dict[str, object]) -> None:
     """A slow root that does not oscillate explains no oscillation."""
     roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
-    lasting = end(EndBehaviour.BOUNDED, lasts_s=40.0)
+    lasting = make_run_end(EndBehaviour.BOUNDED, lasts_s=40.0)
     assert decide(end=lasting, roots=roots).stability is Stability.OPEN
     changed = roots._replace(**changes)  # type: ignore[arg-type]
     assert decide(end=lasting, roots=changed).stability is Stability.NOT_STABLE
@@ -226,10 +233,10 @@ def test_growing_motion_is_not_excused_by_roots() -> None:
     roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
     growing = EnvelopeFit(EnvelopeTrend.GROWS, 0.01, False)
     for run_end in (
-        end(EndBehaviour.GROWS, lasts_s=40.0),
-        end(EndBehaviour.BOUNDED, lasts_s=40.0, error=growing),
-        end(EndBehaviour.BOUNDED, lasts_s=40.0, speed=growing),
+        make_run_end(EndBehaviour.GROWS, lasts_s=40.0),
+        make_run_end(EndBehaviour.BOUNDED, lasts_s=40.0, error=growing),
+        make_run_end(EndBehaviour.BOUNDED, lasts_s=40.0, speed=growing),
     ):
         assert decide(end=run_end, roots=roots).stability is Stability.NOT_STABLE
-    lasting = end(EndBehaviour.BOUNDED, lasts_s=40.0)
+    lasting = make_run_end(EndBehaviour.BOUNDED, lasts_s=40.0)
     assert decide(end=lasting, roots=roots, twins=GROWING).stability is Stability.NOT_STABLE

@@ -4,6 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.analysis.builders import make_busy_run, make_short_log, make_site_log
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.timeline import (
     find_mode_intervals,
     list_changes,
@@ -13,12 +15,10 @@ from trilat_net.analysis.timeline import (
 from trilat_net.errors import LogError
 from trilat_net.net.messages import MODES
 
-from . import logs
-
 
 @given(st.lists(st.sampled_from(list(MODES)), max_size=60))
 def test_spans_are_ticks_of_not_following(modes):
-    part = logs.in_modes(modes)
+    part = make_site_log(modes)
     spans = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
     intervals = [
         (span.mode, k)
@@ -38,7 +38,7 @@ def test_spans_are_ticks_of_not_following(modes):
 
 
 def test_stated_link_settings_follow_changes():
-    log = logs.busy().log
+    log = make_busy_run().log
     assert [
         (s.from_s, s.link.describe())
         for s in list_stated_models(log, "a->c", list_changes(log))
@@ -55,15 +55,15 @@ def test_stated_link_settings_follow_changes():
 )
 def test_a_record_naming_a_foreign_change_is_refused(text):
     def spoiled(state):
-        return logs.replaced(
+        return replace_fields(
             state, cmd=[text] if (state.site, state.tick) == ("a", 3) else state.cmd
         )
 
     with pytest.raises(LogError):
-        list_changes(logs.rewritten(logs.busy().log, change=spoiled))
+        list_changes(rewrite_log(make_busy_run().log, change=spoiled))
 
 
 def test_a_log_without_records_ends_as_planned():
-    empty = logs.rewritten(logs.simulated("paper"), keep=lambda _: False, finished=False)
+    empty = rewrite_log(make_short_log("paper"), keep=lambda _: False, finished=False)
     assert recorded_end_s(empty) == 2.0
     assert find_mode_intervals(empty["m1"]) == []

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run
 from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.torque_sources import (
@@ -22,13 +22,14 @@ gains = st.tuples(st.floats(0.0, 500.0), st.floats(0.0, 500.0))
 
 
 @st.composite
-def actors(draw: st.DrawFn) -> TorqueSource:
+def draw_source(draw: st.DrawFn) -> TorqueSource:
     acts = draw(
         st.sampled_from(
             [TorqueKind.HAND, TorqueKind.TASK_HAND, TorqueKind.VISCOUS, TorqueKind.WALL]
         )
     )
-    start, move = draw(st.floats(0.0, 2.0)), draw(st.floats(0.0, 2.0))
+    start = draw(st.floats(0.0, 2.0))
+    move = draw(st.floats(0.0, 2.0))
     angle = draw(st.floats(0.0, 6.3))
     after = (
         (float(np.cos(angle)), float(np.sin(angle))) if acts is TorqueKind.WALL else draw(pairs)
@@ -43,7 +44,10 @@ def actors(draw: st.DrawFn) -> TorqueSource:
 
 
 @settings(max_examples=60, deadline=None)
-@given(actors(), st.lists(st.tuples(st.floats(0.0, 4.0), pairs, pairs), min_size=1, max_size=5))
+@given(
+    draw_source(),
+    st.lists(st.tuples(st.floats(0.0, 4.0), pairs, pairs), min_size=1, max_size=5),
+)
 def test_every_torque_equals_the_cores(
     actor: TorqueSource, states: list[tuple[float, tuple, tuple]]
 ) -> None:
@@ -63,7 +67,7 @@ def test_every_torque_equals_the_cores(
 
 
 def test_hand_and_environment_torques_sum_to_the_record() -> None:
-    log = runs.run("rich").log
+    log = make_run("rich").log
     for site, track in align_records(log).items():
         by = attribute_torque(track, log.scenario)
         np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
@@ -74,7 +78,7 @@ def test_hand_and_environment_torques_sum_to_the_record() -> None:
 
 
 def test_an_unscripted_hand_has_no_script() -> None:
-    log = runs.run("rich").log
+    log = make_run("rich").log
     track = align_records(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
     assert attribute_torque(other, log.scenario).script is None
@@ -88,8 +92,6 @@ def test_scripts_are_torques_at_a_fixed_pose(acts: TorqueKind) -> None:
     t_s = np.linspace(0.0, 4.0, 41)
     still = np.tile([0.3, 1.1], (len(t_s), 1))
     tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(still, 0.0 * still)
-    torque, script = (
-        compute_source_torque(actor, t_s, still, 0.0 * still, tip),
-        compute_operator_script(actor, t_s, tip.J[0]),
-    )
+    torque = compute_source_torque(actor, t_s, still, 0.0 * still, tip)
+    script = compute_operator_script(actor, t_s, tip.J[0])
     np.testing.assert_allclose(script - script[0], torque - torque[0], atol=1e-12)

@@ -21,38 +21,39 @@ TWO = load_scenario("two_sites")
 JOINTS = ("m joint 1", "m joint 2", "s joint 1", "s joint 2")
 
 
-def difference(rate_per_s: float, omega_rad_s: float = 7.0, seconds: float = 20.0) -> Twins:
+def make_twins(rate_per_s: float, omega_rad_s: float = 7.0, seconds: float = 20.0) -> Twins:
     """Returns one mode of a difference, largest at s joint 1, which is rescaled again and again."""
     t_s = np.arange(int(20 * seconds)) / 20.0 + 0.05
     shape = np.array([0.2, 0.1, 1.0, 0.5])
-    last, scale = 1e-6 * np.cos(omega_rad_s * t_s)[:, np.newaxis] * shape, rate_per_s * t_s
+    last = 1e-6 * np.cos(omega_rad_s * t_s)[:, np.newaxis] * shape
+    scale = rate_per_s * t_s
     push = Push("1e-06 rad at m joint 1", "q", np.eye(2) * 1e-6, again=False)
     path = TwinPath(push, t_s, np.log(np.abs(last)) + scale[:, np.newaxis], last, scale, (0,))
     return Twins([path], JOINTS, np.full((len(t_s), 4), 1e-3), True)
 
 
-def grown(rate_per_s: float) -> TwinGrowth:
-    return judge_twins(TWO, difference(rate_per_s), 0.0, math.inf)
+def judge_difference(rate_per_s: float) -> TwinGrowth:
+    return judge_twins(TWO, make_twins(rate_per_s), 0.0, math.inf)
 
 
 @pytest.mark.parametrize("rate_per_s", [-0.55, -0.02, 0.0, 0.02, 0.55])
 def test_rate_of_modes_is_found_without_swing(rate_per_s: float) -> None:
-    growth = grown(rate_per_s).pushes[0]
+    growth = judge_difference(rate_per_s).pushes[0]
     assert growth.rate_per_s == pytest.approx(rate_per_s, abs=2e-3)
     assert growth.factor == pytest.approx(math.exp(10.0 * rate_per_s), rel=0.05)
     assert growth.joint == "s joint 1"
 
 
 def test_the_words_follow_the_trend() -> None:
-    trends = {rate: grown(rate).trend for rate in (-0.55, 0.0, 0.2)}
+    trends = {rate: judge_difference(rate).trend for rate in (-0.55, 0.0, 0.2)}
     assert list(trends.values()) == [
         EnvelopeTrend.DECAYS,
         EnvelopeTrend.STEADY,
         EnvelopeTrend.GROWS,
     ]
     log = tn.simulate("two_sites", duration_s=0.1)
-    texts = [PushedTwins(log, 0.0, grown(rate)).headline() for rate in trends]
-    rates = [grown(rate).pushes[0].rate_per_s for rate in trends]
+    texts = [PushedTwins(log, 0.0, judge_difference(rate)).headline() for rate in trends]
+    rates = [judge_difference(rate).pushes[0].rate_per_s for rate in trends]
     push = "a push of 1e-06 rad at m joint 1 at 0 s"
     assert texts[0].startswith(f"{push} becomes ")
     assert texts[0].endswith(f"rad/s in 20 s ({rates[0]:+.3g} /s), most at s joint 1")
@@ -62,7 +63,7 @@ def test_the_words_follow_the_trend() -> None:
 
 
 def test_infinite_numbers_are_null() -> None:
-    row = grown(80.0).to_json()["pushes"][0]
+    row = judge_difference(80.0).to_json()["pushes"][0]
     assert (row["becomes_rad_s"], row["factor"]) == (None, None)
     assert row["rate_per_s"] == pytest.approx(80.0, rel=0.05)
 
@@ -115,7 +116,7 @@ def test_part_of_a_period_has_no_trend() -> None:
             "period_s": 1.21,
         },
     }
-    growth = judge_twins(load_scenario("two_sites", sines), difference(-0.5), 0.0, math.inf)
+    growth = judge_twins(load_scenario("two_sites", sines), make_twins(-0.5), 0.0, math.inf)
     assert growth.delay_period_s == pytest.approx(145.2)
     assert growth.hides_period
     assert "145.2 s" in growth.period_text

@@ -27,6 +27,9 @@ import numpy as np
 from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net
+from tests.certificate.drawn_loops import make_experiment, make_swinging_hand
+from tests.execution.builders import run_fused
+from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.premises import find_missing_functionals
 from trilat_net.analysis.judge import judge_virtual_run
 from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
@@ -40,41 +43,38 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
-from .drawn_loops import (
-    SAMPLED,
-    STIFFNESS,
-    WIDE_FROM,
-    Drawn,
-    draw_experiment,
-    experiment,
-    p_d,
-    swinging,
-)
+from .drawn_loops import SAMPLED, STIFFNESS, WIDE_FROM, Drawn, draw_experiment, p_d
 from .hidden_loops import NEAR_PER_S, draw_hidden, write_scenario
 
 HIDDEN = range(1000)
 """Seeds of `hidden_loops` that the table has."""
 DRAWN = (*range(600), *range(WIDE_FROM, WIDE_FROM + 400))
-"""Seeds of `drawn_loops` that it has."""
+"""Seeds of `drawn_loops` that the table has."""
 LONGER = 8.0
-"""The run that knows the truth is so many times as long."""
+"""The run that shows the truth is longer than the judged run by this factor."""
 SEEN = 1e-6
-"""A growing mode counts from this size on, rad/s, in the records."""
+"""The smallest speed of a growing mode that counts, in rad/s."""
 SLOW_PER_S = 0.01
-"""A stable root this slow hardly dies within eight times the run: then the root decides."""
+"""A stable root slower than this hardly decays within eight times the run, so that the root decides."""
 NEAR_AN_EDGE = (0.8, 1.2)
-DEAD_RAD_S, AT_REST_RAD_S = 1e-11, 1e-4
-"""Slower has died; slower than the second is called a rest, if every push dies."""
-NUDGE_RAD, LINEAR_RAD_S, LOST_RAD_S = 1e-8, 1e-5, 1e-13
-"""A push; a difference that is made small again; one that is lost in the rounding of the numbers."""
+DEAD_RAD_S = 1e-11
+"""A difference of speeds below this has died."""
+AT_REST_RAD_S = 1e-4
+"""A run below this speed is at rest, if every push dies."""
+NUDGE_RAD = 1e-8
+"""The size of a push."""
+LINEAR_RAD_S = 1e-5
+"""A difference above this is made small again."""
+LOST_RAD_S = 1e-13
+"""A difference below this is lost in the rounding of the numbers."""
 WINDOW_S = 4.0
-"""In windows of this length the difference is looked at."""
+"""The length of the windows in which the difference is measured."""
 LEAST_WINDOWS = 12
-"""Of fewer windows no rate is told."""
+"""The least number of windows from which a rate is computed."""
 GROWS_PER_S = 0.004
-"""A push grows from this rate on."""
+"""The least rate of a push that grows."""
 TRUTHS = Path(__file__).with_name("truths.csv")
-"""Per seed: the digest of its scenario, and its truth."""
+"""The digest and the truth of each seed's scenario."""
 SEEDS = 2000
 """Seeds below `WIDE_FROM` whose truth is stored."""
 
@@ -93,12 +93,14 @@ def two_pairs(
         }
         for name, q1 in zip("abce", q1_rad, strict=True)
     }
-    own, other = dict(zip("abce", "baec", strict=True)), dict(zip("abce", "ceab", strict=True))
+    partner = dict(zip("abce", "baec", strict=True))
+    other = dict(zip("abce", "ceab", strict=True))
     dominance = {
-        i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()
+        i: {j: 1.0 - across, **({other[i]: across} if across else {})}
+        for i, j in partner.items()
     }
     keys = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
-    return experiment("pairs", **{**keys, **more})
+    return make_experiment("pairs", **{**keys, **more})
 
 
 class Row(NamedTuple):
@@ -108,29 +110,29 @@ class Row(NamedTuple):
         mark: its number; mirrors end in "=".
         what: in words.
         make: its scenario.
-        words: what may be said of it.
+        verdicts: The words that may be said of the run.
         reason: what its judgement names, in lower case; "" for anything.
     """
 
     mark: str
     what: str
     make: Callable[[], Scenario]
-    words: tuple[str, ...]
+    verdicts: tuple[str, ...]
     reason: str = ""
 
 
 NEVER_STABLE = ("not stable", "open")
 AT_REST = ("stable", "settled")
-"""What may be said of a run that comes to rest; stable with a proof alone."""
+"""The permitted words for a run that comes to rest; `stable` needs a proof."""
 
 
 def _load(
     name: str, overrides: Mapping[str, Any] | None = None, /, **more: Any
 ) -> Callable[[], Scenario]:
-    """Makes a shipped scenario with changes, at the speed limit for which its verdict was judged."""
-    changes = {key.replace("__", "."): value for key, value in more.items()}
+    """Returns a maker of a shipped scenario with overrides, at the speed limit for which the verdict was judged."""
     limit = {"limits.qd_limit_rad_s": 100.0}
-    return lambda: load_scenario(name, {**limit, **(overrides or {}), **changes})
+    changes = {**limit, **(overrides or {}), **make_overrides(**more)}
+    return lambda: load_scenario(name, changes)
 
 
 PUSH = [{"kind": "recorded", "points": [[0.0, 3.0, 0.0], [1e3, 3.0, 0.0]]}]
@@ -167,9 +169,9 @@ def _margin(
     return _load("p_d_margin", keys, **more)
 
 
-WIDER = [swinging([(0.0, 0.0), (39.98, 12.0)])]
-EARLY = [swinging([(0.0, 0.0), (10.0, 6.0)])]
-LASTING = [swinging([(0.0, 5.0), (40.0, 5.0)])]
+WIDER = [make_swinging_hand([(0.0, 0.0), (39.98, 12.0)])]
+EARLY = [make_swinging_hand([(0.0, 0.0), (10.0, 6.0)])]
+LASTING = [make_swinging_hand([(0.0, 5.0), (40.0, 5.0)])]
 WIDE = (0.9, -0.9, 1e-3, -1e-3)
 APART = (0.35, 0.25, -0.15, -0.25)
 LEARNT = ({"law": "adaptive", "theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]},) * 2
@@ -249,14 +251,15 @@ def _turntables(
     }
     link = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 199.0, "period_s": period_s}
     arm = {"urdf": "arm6.urdf", "tip": "shoulder", "armature_kg_m2": 2.5}
-    law, keys = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
-    return lambda: experiment(
+    law = {"law": "p_d", "K": 5.0, "d": d}
+    keys = {"rate_hz": 100, "duration_s": 60.0}
+    return lambda: make_experiment(
         "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **keys
     )
 
 
-def pair(first: Any, second: Any, **more: Any) -> Scenario:
-    """Two sites that follow each other."""
+def make_pair_scenario(first: Any, second: Any, **more: Any) -> Scenario:
+    """Returns two sites that follow each other."""
     sites = {"a": {"role": "master", "q0_rad": [0.3, 0.4], **first}}
     sites["b"] = {"role": "slave", "q0_rad": [0.3, 0.4], **second}
     keys = {
@@ -264,14 +267,14 @@ def pair(first: Any, second: Any, **more: Any) -> Scenario:
         "sites": sites,
         "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}},
     }
-    return experiment("pair", **{**keys, **more})
+    return make_experiment("pair", **{**keys, **more})
 
 
 def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[], Scenario]:
-    """P+d without delay between sites that tick at two rates."""
+    """Returns P+d without delay between sites that tick at two rates."""
     first, second = ({"rate_hz": rate_hz} for rate_hz in rates_hz)
     law = {"law": "p_d", "K": K, "d": d}
-    return lambda: pair(
+    return lambda: make_pair_scenario(
         first, second | {"q0_rad": [0.5, 0.4]}, control=law, link={"delay_ms": 0.0}
     )
 
@@ -288,7 +291,7 @@ def _reserve(
     )
     keys = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
     return lambda: load_scenario(
-        pair(around, around, **keys), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
+        make_pair_scenario(around, around, **keys), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
     )
 
 
@@ -322,16 +325,16 @@ def _wave(b: float, K: float, damped: float = 0.0) -> Callable[[], Scenario]:
         {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
     )
     keys = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
-    return lambda: pair(around, around, **keys)
+    return lambda: make_pair_scenario(around, around, **keys)
 
 
 def _coasting(follows: dict[str, float], law: str = "tdpa") -> Callable[[], Scenario]:
-    """A user lets go of an arm that no spring holds, and the slave follows it."""
+    """Returns a run in which a user lets go of an arm that no spring holds, and the slave follows the arm."""
     gains = {"K": 40.0, "B": 5.0}
     push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [0.4, 0.2]}
     keys = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
     gains = gains if law in ("wave", "tdpa") else {**follows}
-    return lambda: pair(
+    return lambda: make_pair_scenario(
         {"control": {"law": law, **follows}, "hands": [push]},
         {"control": {"law": law, **gains}},
         **keys,
@@ -341,7 +344,7 @@ def _coasting(follows: dict[str, float], law: str = "tdpa") -> Callable[[], Scen
 def _free_swinging(
     period_s: float, swing_ms: float = 200.0, duration_s: float = 60.0
 ) -> Callable[[], Scenario]:
-    """The paper's law over a delay of 200 ms that swings."""
+    """Returns the paper's law over a delay that swings about 200 ms."""
     link = {
         "link.model": "sine",
         "link.delay_ms": 200.0,
@@ -613,7 +616,8 @@ def find_truth(drawn: Drawn) -> Truth:
     """
     if drawn.wide:
         return find_wide_truth(drawn.scenario)
-    scenario, ends_s = drawn.scenario, drawn.scenario.duration_s
+    scenario = drawn.scenario
+    ends_s = drawn.scenario.duration_s
     run = FusedRun(extend_scenario(scenario, LONGER * ends_s))
     states = []
     for t_s in np.linspace(0.75, 1.0, 100) * ends_s if has_sampled_wall(scenario) else ():
@@ -629,19 +633,17 @@ def find_truth(drawn: Drawn) -> Truth:
     at = Equilibrium(run.q, run.theta_hat, "", 0.0)
     if run.diverged_s is not None:
         at = at._replace(q=np.array([spec.q0_rad for spec in scenario.sites.values()]))
-    root = _rightmost(scenario, at)
+    root = _find_rightmost(scenario, at)
     near = False
     if drawn.key and root is not None:
-        beside = [_rightmost(_scaled(drawn, factor), at) for factor in NEAR_AN_EDGE]
+        beside = [_find_rightmost(_scale_key(drawn, factor), at) for factor in NEAR_AN_EDGE]
         near = any(
             exponent is not None and (exponent > 0.0) != (root > 0.0) for exponent in beside
         )
     if run.diverged_s is not None:
         return Truth(True, root, near)
-    early, late = (
-        _peak_speeds(run, 0.75 * ends_s, ends_s),
-        _peak_speeds(run, (LONGER - 1.0) * ends_s),
-    )
+    early = _peak_speeds(run, 0.75 * ends_s, ends_s)
+    late = _peak_speeds(run, (LONGER - 1.0) * ends_s)
     slow = root is not None and -SLOW_PER_S < root < 0.0
     lasts = bool((late > np.maximum((1.2 if slow else 0.5) * early, SEEN)).any())
     grows = root is not None and root > 0.0 and not scenario.links_random
@@ -656,12 +658,9 @@ def find_wide_truth(scenario: Scenario) -> Truth:
     push in it grows, for the while that it lasts, and one slower than `AT_REST_RAD_S` that drawn delays keep
     up although every push in it dies.
     """
-    whole, ends_s = (
-        extend_scenario(scenario, LONGER * scenario.duration_s),
-        scenario.duration_s,
-    )
-    run = FusedRun(whole)
-    run.advance_to(LONGER * ends_s)
+    whole = extend_scenario(scenario, LONGER * scenario.duration_s)
+    ends_s = scenario.duration_s
+    run = run_fused(whole, LONGER * ends_s)
     if run.diverged_s is not None:
         return Truth(True, None, False)
     early, late = (_largest_speed(run, end_s) for end_s in (ends_s, LONGER * ends_s))
@@ -686,12 +685,15 @@ def measure_exponent(scenario: Scenario, until_s: float) -> float:
     again when it is large, and pushed anew when it is lost in the rounding of the numbers. The rate is that
     of the later half of its windows, in which what decays faster is gone; of one that is lost, over its life.
     """
-    run, pushed = FusedRun(scenario), FusedRun(scenario)
-    for one in (run, pushed):
-        one.plan([round(until_s * spec.rate_hz) for spec in scenario.sites.values()])
+    run = FusedRun(scenario)
+    pushed = FusedRun(scenario)
+    for either in (run, pushed):
+        either.plan([round(until_s * spec.rate_hz) for spec in scenario.sites.values()])
     joints = max(scenario.layout(name).joints for name in scenario.names)
     by = NUDGE_RAD * np.random.default_rng(1).uniform(-1.0, 1.0, (len(scenario.names), joints))
-    scale, sizes, lost = 0.0, [], []
+    scale = 0.0
+    sizes = []
+    lost = []
     for start_s in np.arange(0.25 * until_s, until_s - 1e-9, WINDOW_S):
         run.step_to(round(start_s * NS_PER_S))
         if not sizes:
@@ -720,8 +722,8 @@ def _largest_difference(run: FusedRun, pushed: FusedRun, start_s: float) -> floa
     """
     differences = []
     for t_s in np.linspace(start_s, start_s + WINDOW_S, 21)[1:]:
-        for one in (run, pushed):
-            one.step_to(round(t_s * NS_PER_S))
+        for either in (run, pushed):
+            either.step_to(round(t_s * NS_PER_S))
         differences.append(pushed.measure_distance(run, "qd"))
     return max(differences)
 
@@ -736,13 +738,13 @@ def has_sampled_wall(scenario: Scenario) -> bool:
 
 
 def _peak_speeds(run: FusedRun, from_s: float, to_s: float = np.inf) -> Array:
-    """The largest |qd| of every joint over a span, shape (N, 2), rad/s."""
+    """Returns the largest |qd| of every joint over a span, shape (N, 2), in rad/s."""
     first, last = (round(t_s * BUCKETS_PER_S) for t_s in (from_s, min(to_s, run.ran_s)))
     return np.array([site[first:last, JOINTS : 2 * JOINTS].max(axis=0) for site in run.buckets])
 
 
-def _rightmost(scenario: Scenario, at: Equilibrium) -> float | None:
-    """The real part of the rightmost root at the rest next to a pose; None without a loop or a rest there."""
+def _find_rightmost(scenario: Scenario, at: Equilibrium) -> float | None:
+    """Returns the real part of the rightmost root at the rest next to a pose, or None without such a rest."""
     if scenario.links_random:
         # ages are counted sample by sample
         scenario = load_scenario(scenario, {"duration_s": 4.0})
@@ -754,7 +756,7 @@ def _rightmost(scenario: Scenario, at: Equilibrium) -> float | None:
     return None if root is None else root.s.real
 
 
-def _scaled(drawn: Drawn, factor: float) -> Scenario:
+def _scale_key(drawn: Drawn, factor: float) -> Scenario:
     """Returns the experiment with its key times a factor."""
     if drawn.key == STIFFNESS:
         value = drawn.scenario.sites["s"].environment[0].stiffness_n_m
@@ -778,8 +780,7 @@ def say_of_run(scenario: Scenario) -> str:
     """
     if not find_missing_functionals(scenario):
         return say_of(trilat_net.simulate(scenario))
-    run = FusedRun(scenario)
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario)
     return str(judge_virtual_run(scenario, run).decision.stability)
 
 
@@ -818,7 +819,7 @@ def read_truth(seed: int, drawn: Drawn) -> Truth:
     """Returns the truth of a seed, as stored for exactly this scenario."""
     digest, unstable, root_per_s, near = _read_rows()[seed]
     anew = "python -m tests.certificate.adversaries --find-truths"
-    assert digest == _digest(drawn), (
+    assert digest == _compute_digest(drawn), (
         f"seed {seed} draws another scenario than its truth is of: run {anew}"
     )
     return Truth(unstable == "1", float(root_per_s) if root_per_s else None, near == "1")
@@ -834,7 +835,7 @@ def count_stored() -> int:
     return len(_read_rows())
 
 
-def _digest(drawn: Drawn) -> str:
+def _compute_digest(drawn: Drawn) -> str:
     return drawn.scenario.sha256[:12]
 
 
@@ -843,11 +844,11 @@ def write_truth(seed: int) -> str:
     drawn = draw_experiment(seed)
     unstable, root, near = find_truth(drawn)
     root_per_s = "" if root is None else f"{root:.6g}"
-    return f"{seed},{_digest(drawn)},{unstable:d},{root_per_s},{near:d}"
+    return f"{seed},{_compute_digest(drawn)},{unstable:d},{root_per_s},{near:d}"
 
 
 class Tally(NamedTuple):
-    """Counts over some experiments."""
+    """The counts of the judgements of some experiments."""
 
     runs: int
     unstable: int
@@ -858,7 +859,7 @@ class Tally(NamedTuple):
     undecided: int
 
 
-def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
+def count_judgements(judged: Iterable[Judged], by: str = "certified") -> Tally:
     """Returns the counts of the words of `by`: wrongly stable, wrongly not, settled, and open."""
     rows = [(entry.truth, getattr(entry, by)) for entry in judged]
     return Tally(
@@ -874,7 +875,7 @@ def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
 
 def tally_clear(judged: Iterable[Judged], by: str = "certified") -> Tally:
     """Returns the same counts for experiments that are not near an edge."""
-    return tally((entry for entry in judged if not entry.truth.near), by)
+    return count_judgements((entry for entry in judged if not entry.truth.near), by)
 
 
 def main() -> None:
@@ -892,16 +893,17 @@ def main() -> None:
         if arguments.find_truths:
             _write_truths(pool.map(write_truth, range(count_stored()), chunksize=8))
             return
-        drawn, hidden = DRAWN[: arguments.seeds], HIDDEN[: arguments.seeds]
+        drawn = DRAWN[: arguments.seeds]
+        hidden = HIDDEN[: arguments.seeds]
         judged = [
             *pool.map(judge_by_certify, drawn, chunksize=8),
             *pool.map(judge_hidden, hidden, chunksize=8),
         ]
     print_table(judged)
-    for seed, one in zip((*drawn, *hidden), judged, strict=True):
-        counts = tally([one])
+    for seed, verdict in zip((*drawn, *hidden), judged, strict=True):
+        counts = count_judgements([verdict])
         if counts.false_ok or counts.false_alarm:
-            print(f"seed {seed}: {one.drawn.kind}, {one.truth}: {one.certified}")
+            print(f"seed {seed}: {verdict.drawn.kind}, {verdict.truth}: {verdict.certified}")
 
 
 def judge_by_certify(seed: int) -> Judged:
@@ -920,9 +922,7 @@ def _write_truths(rows: Iterable[str]) -> None:
 
 
 def print_table(judged: list[Judged]) -> None:
-    """Prints a row per kind, and one of all; and the upper bound on the rate of errors that did
-    not occur.
-    """
+    """Prints a row for each kind and for all kinds, and the upper bound on the rate of errors that did not occur."""
     columns = "runs | unstable | near an edge | false ok | false alarms | settled | open"
     print(f"| experiments | {columns} |")
     print("|---|" + " --: |" * len(Tally._fields))
@@ -933,8 +933,8 @@ def print_table(judged: list[Judged]) -> None:
             for entry in judged
             if (entry.drawn.has == "hidden", entry.drawn.kind) == (hides, kind)
         ]
-        print(f"| {kind} | " + " | ".join(map(str, tally(groups))) + " |")
-    total = tally(judged)
+        print(f"| {kind} | " + " | ".join(map(str, count_judgements(groups))) + " |")
+    total = count_judgements(judged)
     print("| all | " + " | ".join(map(str, total)) + " |")
     print(
         f"{total.false_ok} of {total.unstable} unstable runs are called stable: with 95 % confidence "

@@ -18,7 +18,6 @@ from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 DRAWN_S = 40.0
 """The length of a drawn run."""
 RODS = {"lc1_m": 0.5, "lc2_m": 0.5, "I1_kg_m2": 1 / 12, "I2_kg_m2": 1 / 12}
-CIRCLE = {"m1": {"m2": 0.5, "s": 0.5}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 0.5, "m2": 0.5}}
 STIFFNESS = "sites.s.environment.0.stiffness_n_m"
 SAMPLED = "sites.s.environment.0.sampled"
 
@@ -40,7 +39,7 @@ def _toml(value: Any) -> str:
     return json.dumps(value)
 
 
-def experiment(name: str, **tables: Any) -> Scenario:
+def make_experiment(name: str, **tables: Any) -> Scenario:
     """Returns the scenario of some tables."""
     keys = {
         "name": name,
@@ -52,7 +51,9 @@ def experiment(name: str, **tables: Any) -> Scenario:
     return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in keys.items()))
 
 
-def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[str, Any]:
+def make_swinging_hand(
+    peaks: Iterable[tuple[float, float]], hertz: float = 1.0
+) -> dict[str, Any]:
     """Returns a hand whose torque swings on joint 1 and 2, its size linear between (time s, N m)."""
     times, sizes = np.array(list(peaks)).T
     t_s = np.arange(times[0], times[-1] + 1e-9, 0.02)
@@ -84,7 +85,7 @@ class Drawn(NamedTuple):
         return bool(self.has)
 
 
-def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str, Any]:
+def _draw_sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str, Any]:
     """Draws arms of several masses, about one pose."""
     pose = rng.uniform(-0.8, 0.8, 2)
     return {
@@ -101,7 +102,7 @@ def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str,
     }
 
 
-def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]:
+def _draw_shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]:
     """Draws shares of every site, of all of its peers or of one."""
     rows = {}
     for name in names:
@@ -114,13 +115,11 @@ def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]
     return rows
 
 
-def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
+def _draw_loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
     """Draws a network of P+d or PD+d whose damping is about the edge of stability."""
-    shares, T_ms, K = (
-        _shares(rng, names),
-        float(rng.uniform(80.0, 400.0)),
-        float(rng.uniform(8.0, 40.0)),
-    )
+    shares = _draw_shares(rng, names)
+    T_ms = float(rng.uniform(80.0, 400.0))
+    K = float(rng.uniform(8.0, 40.0))
     alpha = np.array([[shares[i].get(j, 0.0) for j in names] for i in names])
     worst = max(float(np.abs(np.linalg.eigvals(alpha).real.min())), 0.2173)
     bound = worst * K * (T_ms + 10.0) / 1e3
@@ -135,46 +134,49 @@ def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
         "scheme": str(rng.choice(["second_order", "digital"])),
         "control": control,
         "link": {"delay_ms": T_ms},
-        "sites": _sites(rng, names, spread),
+        "sites": _draw_sites(rng, names, spread),
         "dominance": shares,
         **more,
     }
 
 
 def _draw_network(rng: np.random.Generator) -> Drawn:
-    loop_keys = _loop(rng, "abce"[: rng.integers(2, 5)])
-    return Drawn("network", experiment("network", **loop_keys), "control.d")
+    loop_keys = _draw_loop(rng, "abce"[: rng.integers(2, 5)])
+    return Drawn("network", make_experiment("network", **loop_keys), "control.d")
 
 
 def _draw_noisy(rng: np.random.Generator) -> Drawn:
-    loop_keys = _loop(rng, "abc"[: rng.integers(2, 4)])
+    loop_keys = _draw_loop(rng, "abc"[: rng.integers(2, 4)])
     loop_keys["link"] |= {
         "model": "uniform",
         "half_width_ms": min(3.0, loop_keys["link"]["delay_ms"]),
         "loss": 0.02,
     }
-    return Drawn("noise", experiment("noise", **loop_keys), "control.d")
+    return Drawn("noise", make_experiment("noise", **loop_keys), "control.d")
 
 
 def _draw_groups(rng: np.random.Generator) -> Drawn:
     """Draws two closed groups, one of which hides the motion of the other."""
-    keys, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
+    keys = _draw_loop(rng, "abce")
+    T = 0.001 * float(rng.uniform(50.0, 300.0))
     d = 10.0 * T * rng.uniform([1.2, 0.7], [2.5, 1.3])
-    sites = _sites(rng, "abce", 0.5)
+    sites = _draw_sites(rng, "abce", 0.5)
     for n, name in enumerate("abce"):
         sites[name]["control"] = p_d(float(d[n // 2]))
         if n >= 2:
             sites[name]["q0_rad"] = [0.1 + 1e-3 * n, 0.2]
     pairs = {"a": {"b": 1.0}, "b": {"a": 1.0}, "c": {"e": 1.0}, "e": {"c": 1.0}}
     keys |= {"sites": sites, "dominance": pairs, "link": {"delay_ms": 1e3 * T}}
-    return Drawn("groups", experiment("groups", **{**keys, "control": p_d(1.0)}), "control.d")
+    return Drawn(
+        "groups", make_experiment("groups", **{**keys, "control": p_d(1.0)}), "control.d"
+    )
 
 
 def _draw_adaptive(rng: np.random.Generator) -> Drawn:
     """Draws the paper's law at rates at which sampling may feed it."""
     names = "abc"[: rng.integers(2, 4)]
     late = rng.random() < 0.6
-    loop_keys = _loop(
+    loop_keys = _draw_loop(
         rng, names, link={"delay_ms": float(rng.uniform(20.0, 500.0)) if late else 0.0}
     )
     loop_keys["control"] = {
@@ -184,7 +186,7 @@ def _draw_adaptive(rng: np.random.Generator) -> Drawn:
     }
     return Drawn(
         "adaptive",
-        experiment("adaptive", **{**loop_keys, "rate_hz": int(rng.choice([50, 100]))}),
+        make_experiment("adaptive", **{**loop_keys, "rate_hz": int(rng.choice([50, 100]))}),
     )
 
 
@@ -197,10 +199,10 @@ def _draw_delay(rng: np.random.Generator) -> Drawn:
         "amplitude_ms": T * float(rng.choice([0.1, 0.9])),
         "period_s": 1.0 / rng.uniform(1.0, 2.5),
     }
-    loop_keys = _loop(rng, "abc", link=link)
+    loop_keys = _draw_loop(rng, "abc", link=link)
     if rng.random() < 0.5:
         loop_keys["control"] = {"law": "adaptive"}
-    return Drawn("delay", experiment("delay", **loop_keys))
+    return Drawn("delay", make_experiment("delay", **loop_keys))
 
 
 def _draw_wall(rng: np.random.Generator) -> Drawn:
@@ -220,14 +222,14 @@ def _draw_wall(rng: np.random.Generator) -> Drawn:
 
 def _draw_operator(rng: np.random.Generator) -> Drawn:
     """Draws a hand that swings to the end, or lets go long before the end."""
-    loop_keys = _loop(rng, "abc")
+    loop_keys = _draw_loop(rng, "abc")
     loop_keys["control"] = p_d(float(rng.uniform(2.0, 6.0)))
     until_s = DRAWN_S - 0.02 if rng.random() < 0.5 else 0.3 * DRAWN_S
-    hand = swinging(
+    hand = make_swinging_hand(
         [(0.0, 0.0), (until_s, float(rng.uniform(2.0, 10.0)))], float(rng.uniform(0.3, 1.5))
     )
     loop_keys["sites"]["a"]["hands"] = [hand]
-    return Drawn("operator", experiment("operator", **loop_keys))
+    return Drawn("operator", make_experiment("operator", **loop_keys))
 
 
 KINDS: tuple[tuple[float, Callable[[np.random.Generator], Drawn]], ...] = (
@@ -242,7 +244,7 @@ KINDS: tuple[tuple[float, Callable[[np.random.Generator], Drawn]], ...] = (
 
 
 WIDE_FROM = 2000
-"""From this seed on everything is drawn."""
+"""The first seed that draws every feature of a scenario."""
 _OF_TWO = ("p_f", "smith")
 _LEARN = ("adaptive", "adaptive_box", "adaptive_robust", "sync", "adaptive_kinematics")
 _TYPICAL: Mapping[str, Mapping[str, float]] = {
@@ -268,7 +270,7 @@ _TYPICAL: Mapping[str, Mapping[str, float]] = {
 """Gains about which those of every law are drawn."""
 
 
-def _about(rng: np.random.Generator, value: float, factor: float = 2.0) -> float:
+def _draw_about(rng: np.random.Generator, value: float, factor: float = 2.0) -> float:
     """Draws a number within a factor of another."""
     return float(f"{value * factor ** rng.uniform(-1.0, 1.0):.4g}")
 
@@ -276,7 +278,7 @@ def _about(rng: np.random.Generator, value: float, factor: float = 2.0) -> float
 def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, Any]]:
     """Draws a law with its gains, for every site."""
     gains: dict[str, Any] = {"law": law} | {
-        key: _about(rng, x) for key, x in _TYPICAL[law].items()
+        key: _draw_about(rng, x) for key, x in _TYPICAL[law].items()
     }
     if law in _LEARN and rng.random() < 0.5:
         gains["theta_hat0"] = [3.0, 1.0, 1.0, 2.0, 1.0]
@@ -305,17 +307,13 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
 
 def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
     """Draws a link's name and its keys: constant, swinging, drifting, or recorded."""
-    T_ms, kind = (
-        round(float(rng.uniform(20.0, 250.0)), 1),
-        str(rng.choice(["constant", "sine", "ar1", "trace"])),
-    )
+    T_ms = round(float(rng.uniform(20.0, 250.0)), 1)
+    kind = str(rng.choice(["constant", "sine", "ar1", "trace"]))
     if kind == "constant":
         return kind, {"delay_ms": T_ms}
     if kind == "sine":
-        swing, period_s = (
-            round(T_ms * float(rng.uniform(0.1, 0.99)), 1),
-            round(float(rng.uniform(0.4, 4.0)), 3),
-        )
+        swing = round(T_ms * float(rng.uniform(0.1, 0.99)), 1)
+        period_s = round(float(rng.uniform(0.4, 4.0)), 3)
         return kind, {
             "model": kind,
             "delay_ms": T_ms,
@@ -339,10 +337,11 @@ def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
 
 def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
     """Draws a hand that holds, lets go or pushes, or an environment that resists, and returns its kind."""
-    names, to = list(sites), [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
-    spring = {"kind": "spring", "to_rad": to, "stiffness_nm_rad": _about(rng, 30.0, 3.0)}
+    names = list(sites)
+    to = [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
+    spring = {"kind": "spring", "to_rad": to, "stiffness_nm_rad": _draw_about(rng, 30.0, 3.0)}
     spring |= {
-        "damping_nm_s_rad": _about(rng, 6.0, 3.0),
+        "damping_nm_s_rad": _draw_about(rng, 6.0, 3.0),
         "move_start_s": 1.0,
         "move_end_s": 4.0,
     }
@@ -362,12 +361,15 @@ def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
             {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [6.0, 3.0]}
         ]
     if kind in ("damper", "wall"):
-        wall: dict[str, Any] = {"kind": "viscous", "damping_nm_s_rad": _about(rng, 4.0, 3.0)}
+        wall: dict[str, Any] = {
+            "kind": "viscous",
+            "damping_nm_s_rad": _draw_about(rng, 4.0, 3.0),
+        }
         if kind == "wall":
             wall = {"kind": "wall", "point_m": [1.4, 0.0], "normal": [-1.0, 0.0]}
             wall |= {
-                "stiffness_n_m": _about(rng, 600.0, 4.0),
-                "damping_n_s_m": _about(rng, 10.0, 5.0),
+                "stiffness_n_m": _draw_about(rng, 600.0, 4.0),
+                "damping_n_s_m": _draw_about(rng, 10.0, 5.0),
             }
         sites[names[-1]]["environment"] = [wall | {"sampled": bool(rng.random() < 0.5)}]
     return kind
@@ -389,7 +391,8 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
     law = str(rng.choice(list(_TYPICAL)))
     names = "ab" if law in _OF_TWO or (law != "six_channel" and rng.random() < 0.4) else "abc"
     rate_hz = int(rng.choice([100, 200]))
-    sites, space = _sites(rng, names, 0.0), "joints"
+    sites = _draw_sites(rng, names, 0.0)
+    space = "joints"
     spread = float(f"{10.0 ** rng.uniform(-10.0, 0.0):.3g}")
     for name, control in zip(names, _draw_law(rng, law, names), strict=True):
         sites[name]["control"] = control
@@ -398,14 +401,16 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
             sites[name]["rate_hz"] = int(rng.choice([rate_hz // 2, rate_hz, 3 * rate_hz // 4]))
     link, keys = _draw_link(rng)
     touch = _draw_touch(rng, sites)
-    loop_keys: dict[str, Any] = {"link": keys, "dominance": _shares(rng, names)}
+    loop_keys: dict[str, Any] = {"link": keys, "dominance": _draw_shares(rng, names)}
     starts = np.array(sites["a"]["q0_rad"]).round(3)
     if law in ("adaptive", "p_d", "pd_d") and rng.random() < 0.25:
-        loop_keys["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
+        loop_keys["task"] = {"space": "position", "axes": ["x", "y"]}
+        space = "position"
         starts = np.array([0.2, 1.4])
     elif touch == "nobody" and rng.random() < 0.15 and law != "adaptive_kinematics":
         loop_keys["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
-        starts, space = np.array([0.2, -1.0, 1.2]), "chain"
+        starts = np.array([0.2, -1.0, 1.2])
+        space = "chain"
         for name in names:
             del sites[name]["arm"]
             sites[name]["control"].pop("theta_hat0", None)
@@ -418,7 +423,7 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
         loop_keys["scheme"] = "digital"
     for name in names:
         sites[name]["q0_rad"] = starts.tolist()
-    alike = experiment("wide", sites=sites, **loop_keys)
+    alike = make_experiment("wide", sites=sites, **loop_keys)
     start_keys = {
         f"sites.{name}.q0_rad": [
             float(q + round(spread * x, 13)) for q, x in zip(starts, row, strict=True)

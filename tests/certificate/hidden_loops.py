@@ -11,28 +11,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.certificate.drawn_loops import make_experiment
 from trilat_net.scenario import Scenario, load_scenario
 
-from .drawn_loops import experiment
 from .linear_truth import Loop, Way, gravity_gradient, measure_growth, planar_inertia
 
 SPREAD_RAD = 1e-3
 RATE_HZ = 100
 SPAN_S = 600.0
-"""Length of the simulation that tells the truth."""
+"""Length of the simulation that shows the truth."""
 RANDOM_SPAN_S = 4000.0
-"""The same of links that lose samples, whose rate is a mean over what is drawn."""
+"""The same length for links that lose samples, whose rate is a mean over the draws."""
 EDGE_SPAN_S = 400.0
 """Length of the simulations that look for an edge, which need not be exact."""
 OWN_LAW = "tests.own_laws:JointPD"
-LEAST_PER_S, LEAST_RANDOM_PER_S = 2e-3, 5e-3
-"""Slower growth or decay is not drawn; the second of links that lose samples, whose rate is an estimate."""
+LEAST_PER_S = 2e-3
+"""The slowest growth or decay that is drawn."""
+LEAST_RANDOM_PER_S = 5e-3
+"""The same for links that lose samples, whose rate is an estimate."""
 MOST_PER_S = 1.5
-"""Nothing grows faster, so that runs end next to the pose about which their loop was linearised."""
+"""The fastest growth, with which runs still end next to the pose at which the loop was linearised."""
 NEAR_PER_S = 0.01
 """A loop that grows or decays more slowly is near an edge."""
 BRACKET = (0.5, 2.5)
-"""Factors on the damping, between which an edge is looked for."""
+"""The factors on the damping between which the edge is searched."""
 
 
 class Hidden(NamedTuple):
@@ -84,7 +86,9 @@ def _draw_arms(
     rng: np.random.Generator, count: int, pose: np.ndarray
 ) -> tuple[list[dict[str, float]], np.ndarray, np.ndarray]:
     """Draws arms of unlike masses, and M and the gradient of gravity of each at the pose."""
-    arms, inertias, gravity = [], [], []
+    arms = []
+    inertias = []
+    gravity = []
     for _ in range(count):
         m1, m2 = _round(np.exp(rng.uniform(-0.7, 0.7, 2)), 3)
         arm = {"l1_m": 1.0, "l2_m": 1.0, "m1_kg": m1, "m2_kg": m2}
@@ -161,7 +165,8 @@ def _draw_traces(rng: np.random.Generator) -> Hidden:
     length_s = float(rng.choice([3.0, 7.5, 20.0, 45.0, 90.0]))
 
     def way() -> Way:
-        mean_ms, times = rng.uniform(80.0, 220.0), np.arange(0.0, length_s, 0.5)
+        mean_ms = rng.uniform(80.0, 220.0)
+        times = np.arange(0.0, length_s, 0.5)
         table_ms = mean_ms * np.clip(1.0 + rng.uniform(-0.8, 0.8, len(times)), 0.1, 2.0)
         if rng.random() < 0.5:  # a good half and a bad one
             table_ms = np.where(times < length_s / 2.0, 0.5, 1.5) * mean_ms
@@ -210,7 +215,8 @@ def _draw_own_law(rng: np.random.Generator) -> Hidden:
 
 def _draw_bursts(rng: np.random.Generator) -> Hidden:
     """Draws losses in bursts, during which the last sample is used, or the reference stays where it is."""
-    loss, burst = round(float(rng.uniform(0.05, 0.5)), 2), float(rng.integers(2, 40))
+    loss = round(float(rng.uniform(0.05, 0.5)), 2)
+    burst = float(rng.integers(2, 40))
     hidden = _draw_loop(rng, lambda: _constant(rng)._replace(loss=loss, burst=burst))
     hold_s = None
     if rng.random() < 0.6:
@@ -229,7 +235,7 @@ KINDS: Mapping[str, Callable[[np.random.Generator], Hidden]] = {
     "own law": _draw_own_law,
     "bursts": _draw_bursts,
 }
-"""How growth is hidden, by name; seeds take turns."""
+"""The ways of hiding growth, by name; successive seeds use them in turn."""
 PUSH = range(len(KINDS))
 """Seeds that every push judges."""
 
@@ -271,10 +277,13 @@ def _find_edge(hidden: Hidden) -> float:
 
 def write_scenario(hidden: Hidden) -> Scenario:
     """Returns the scenario of a drawn loop."""
-    loop, names = hidden.loop, "abc"[: len(hidden.arms)]
-    sites, laws = {}, {}
+    loop = hidden.loop
+    names = "abc"[: len(hidden.arms)]
+    sites = {}
+    laws = {}
     for n, name in enumerate(names):
-        stiffness, damping = float(loop.stiffness[n, 0]), loop.damping[n].tolist()
+        stiffness = float(loop.stiffness[n, 0])
+        damping = loop.damping[n].tolist()
         law: dict[str, Any] = {"law": "p_d", "K": stiffness, "d": damping}
         if hidden.own_law:
             law = {"law": OWN_LAW, "K": [stiffness] * 2, "d": damping}
@@ -320,7 +329,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
             "age_ms": 1e3 * loop.hold_s,
             "return_s": loop.return_s,
         }
-    scenario = experiment("hidden", **keys)
+    scenario = make_experiment("hidden", **keys)
     return load_scenario(scenario, laws) if hidden.own_law else scenario
 
 

@@ -29,10 +29,10 @@ from scipy.linalg import expm
 Array = NDArray[np.float64]
 US = 1_000_000
 WINDOW_S = 4.0
-"""The largest speed is taken of windows of this length, or of the longest table of a link."""
+"""The length of the windows in which the largest speed is measured, unless the table of a link is longer."""
 LEAST_WINDOWS = 20
 EARLY_SHARE = 0.3
-"""Share of a run in which faster modes die, which is not judged."""
+"""The share of a run that is left out, because faster modes decay in it."""
 
 
 class Way(NamedTuple):
@@ -98,7 +98,10 @@ def planar_inertia(
     q2_rad: float,
 ) -> Array:
     """Returns M of a planar arm of two links, from any textbook, kg m^2."""
-    (l1, _), (m1, m2), (c1, c2), (i1, i2) = lengths_m, masses_kg, centres_m, inertias_kg_m2
+    l1 = lengths_m[0]
+    m1, m2 = masses_kg
+    c1, c2 = centres_m
+    i1, i2 = inertias_kg_m2
     cosine = np.cos(q2_rad)
     m22 = i2 + m2 * c2**2
     m12 = m22 + m2 * l1 * c2 * cosine
@@ -116,7 +119,10 @@ def gravity_gradient(
     """Returns the derivative of the gravity torques of such an arm, whose first angle is from
     the horizontal, N m/rad.
     """
-    (l1, _), (m1, m2), (c1, c2), (q1, q2) = lengths_m, masses_kg, centres_m, q_rad
+    l1 = lengths_m[0]
+    m1, m2 = masses_kg
+    c1, c2 = centres_m
+    q1, q2 = q_rad
     outer = -m2 * c2 * g_m_s2 * np.sin(q1 + q2)
     inner = -(m1 * c1 + m2 * l1) * g_m_s2 * np.sin(q1)
     return np.array([[inner + outer, outer], [outer, outer]])
@@ -127,7 +133,8 @@ def _move_exactly(inertia: Array, gravity: Array, h_s: float) -> Array:
     mobility = np.linalg.inv(inertia)
     rates = np.zeros((6, 6))
     rates[:2, 2:4] = np.eye(2)
-    rates[2:4, :2], rates[2:4, 4:] = -mobility @ gravity, mobility
+    rates[2:4, :2] = -mobility @ gravity
+    rates[2:4, 4:] = mobility
     return np.asarray(expm(h_s * rates)[:4])
 
 
@@ -153,7 +160,8 @@ def list_newest(
     arrives = np.maximum(-(-(sent_us + delay_us) // tick_us), sent + 1)
     if way.loss:
         lost = _draw_losses(way, ticks, rng)
-        sent, arrives = sent[~lost], arrives[~lost]
+        sent = sent[~lost]
+        arrives = arrives[~lost]
     newest = np.full(ticks, -1)
     in_time = arrives < ticks
     np.maximum.at(newest, arrives[in_time], sent[in_time])
@@ -165,7 +173,8 @@ def _draw_losses(way: Way, ticks: int, rng: np.random.Generator) -> NDArray[np.b
     if not way.burst:
         return rng.random(ticks) < way.loss
     lost = np.zeros(ticks, dtype=bool)
-    at, between = 0, way.burst * (1.0 - way.loss) / way.loss
+    at = 0
+    between = way.burst * (1.0 - way.loss) / way.loss
     while at < ticks:
         at += rng.geometric(1.0 / between)
         length = rng.geometric(1.0 / way.burst)
@@ -179,7 +188,8 @@ def measure_growth(loop: Loop, span_s: float, seed: int = 0) -> float:
     rng = np.random.default_rng(seed)
     window_s = max([WINDOW_S, *(way.table_s for way in loop.ways.values())])
     span_s = max(span_s, LEAST_WINDOWS * window_s)
-    count, ticks = len(loop.shares), round(span_s * loop.rate_hz)
+    count = len(loop.shares)
+    ticks = round(span_s * loop.rate_hz)
     newest = np.zeros((ticks, count, count), dtype=np.int64)
     for (i, j), way in loop.ways.items():
         newest[:, i, j] = list_newest(way, ticks, loop.rate_hz, rng)
@@ -232,12 +242,17 @@ def _simulate(
                     reach = max(reach, k - newest[k, i, j] + 1)
     past = np.zeros((reach, count, 2))
     past[:] = start
-    x, v = start.copy(), np.zeros((count, 2))
-    before, ref = np.zeros((count, 2)), start.copy()
-    held, since = start.copy(), np.full(count, -1)
+    x = start.copy()
+    v = np.zeros((count, 2))
+    before = np.zeros((count, 2))
+    ref = start.copy()
+    held = start.copy()
+    since = np.full(count, -1)
     stale = np.zeros(count, dtype=np.bool_)
     state = np.zeros(6)
-    sizes, scale, largest = np.zeros(ticks // window), 0.0, 0.0
+    sizes = np.zeros(ticks // window)
+    scale = 0.0
+    largest = 0.0
     for k in range(ticks):
         past[k % reach] = x
         tau = np.zeros((count, 2))
@@ -264,10 +279,12 @@ def _simulate(
                 tau[i, n] = stiffness[i, n] * (ref[i, n] - x[i, n]) - damping[i, n] * v[i, n]
                 tau[i, n] += gravity[i, n, 0] * x[i, 0] + gravity[i, n, 1] * x[i, 1]
         for i in range(count):
-            state[:2], state[2:4] = x[i], v[i]
+            state[:2] = x[i]
+            state[2:4] = v[i]
             state[4:] = 1.5 * tau[i] - 0.5 * before[i] if second_order and k else tau[i]
             after = moves[i] @ state
-            x[i], v[i] = after[:2], after[2:]
+            x[i] = after[:2]
+            v[i] = after[2:]
             largest = max(largest, np.abs(v[i]).max())
         before[:] = tau
         if (k + 1) % window == 0:

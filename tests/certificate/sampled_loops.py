@@ -77,12 +77,14 @@ class Delay(NamedTuple):
         return delays_us[np.maximum(rows, 0)]
 
 
-def constant(delay_ms: float) -> Delay:
+def make_constant_delay(delay_ms: float) -> Delay:
     """Returns a constant delay."""
     return Delay(points=((0, round(1e3 * delay_ms)),))
 
 
-def sine(mean_ms: float, amplitude_ms: float, period_s: float, phase_rad: float = 0.0) -> Delay:
+def make_sine_delay(
+    mean_ms: float, amplitude_ms: float, period_s: float, phase_rad: float = 0.0
+) -> Delay:
     """Returns a delay that follows a sinusoid."""
     return Delay(
         period_us=round(_US_PER_S * period_s),
@@ -91,7 +93,7 @@ def sine(mean_ms: float, amplitude_ms: float, period_s: float, phase_rad: float 
     )
 
 
-def burst(usual_ms: float, late_ms: float, from_s: float, period_s: float) -> Delay:
+def make_burst_delay(usual_ms: float, late_ms: float, from_s: float, period_s: float) -> Delay:
     """Returns a looped trace with one delay, and a longer delay at the end of each period.
 
     Args:

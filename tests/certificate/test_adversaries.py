@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
+from tests.certificate.adversaries import count_judgements
+from tests.certificate.drawn_loops import make_experiment
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -25,29 +27,28 @@ from .adversaries import (
     say_of,
     say_of_run,
     say_of_sweep,
-    tally,
     tally_clear,
     under_noise,
 )
-from .drawn_loops import WIDE_FROM, Drawn, draw_experiment, experiment
+from .drawn_loops import WIDE_FROM, Drawn, draw_experiment
 from .hidden_loops import PUSH as HIDDEN_PUSH
 
 
-def _named(row: Row) -> str:
+def _describe_row(row: Row) -> str:
     return f"{row.mark} {row.what}"
 
 
-@pytest.mark.parametrize("row", ROWS, ids=_named)
+@pytest.mark.parametrize("row", ROWS, ids=_describe_row)
 def test_a_row_has_its_word_and_its_reason(row: Row) -> None:
     certificate = trilat_net.certify(trilat_net.simulate(row.make()))
-    assert certificate.stability in row.words
+    assert certificate.stability in row.verdicts
     decision = certificate.decision
     texts = [certificate.end.text, decision.rests_on, *decision.reasons]
     assert row.reason in " ".join(texts).lower()
 
 
 @pytest.mark.parametrize(
-    "row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_named
+    "row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_describe_row
 )
 def test_a_mirror_is_stable_on_live_links_too(row: Row) -> None:
     certificate = trilat_net.certify(trilat_net.simulate(under_noise(row.make())))
@@ -59,9 +60,10 @@ def test_every_row_has_its_mirror() -> None:
     assert {f"{mark.rstrip('=')}=" for mark in marks} <= marks
 
 
-def _speed(scenario: Scenario, *at_s: float) -> list[float]:
+def _measure_speeds(scenario: Scenario, *at_s: float) -> list[float]:
     """Returns the largest |qd| of the second before each time."""
-    run, speeds = FusedRun(scenario), []
+    run = FusedRun(scenario)
+    speeds = []
     for end_s in at_s:
         run.advance_to(end_s - 1.0)
         peaks = []
@@ -73,21 +75,23 @@ def _speed(scenario: Scenario, *at_s: float) -> list[float]:
 
 
 def test_every_drawn_laws_condition_has_a_value() -> None:
-    """For any law, space, number of sites and links."""
+    """The condition of every law has a value in any space, for any number of sites and links."""
     for seed in range(WIDE_FROM, WIDE_FROM + 120):
         assert describe_law_conditions(draw_experiment(seed).scenario) is not None
 
 
-def _row(what: str) -> Scenario:
+def _find_scenario(what: str) -> Scenario:
     return next(row.make() for row in ROWS if row.what == what)
 
 
 @pytest.mark.long
 def test_rows_that_decay_later_are_true() -> None:
     """Parametric resonance detunes itself after minutes, and so does the limit cycle; both grew before."""
-    first, last = _speed(_row("the delay swings at 1.7 Hz"), 60.0, 120.0)
+    first, last = _measure_speeds(_find_scenario("the delay swings at 1.7 Hz"), 60.0, 120.0)
     assert last > 5.0 * first > 1.0
-    first, last = _speed(_row("100 Hz, no delay: a limit cycle"), 100.0, 170.0)
+    first, last = _measure_speeds(
+        _find_scenario("100 Hz, no delay: a limit cycle"), 100.0, 170.0
+    )
     assert last > first > 0.5
 
 
@@ -95,7 +99,7 @@ GROW = [row for row in ROWS if row.mark in ("F1", "F5", "F2") or "hammers" in ro
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("row", GROW, ids=_named)
+@pytest.mark.parametrize("row", GROW, ids=_describe_row)
 def test_rows_that_grow_are_true(row: Row) -> None:
     assert find_truth(Drawn("row", row.make())).unstable
 
@@ -129,29 +133,31 @@ def test_certificates_of_random_runs_are_right(seeds: range) -> None:
     """The words of `certify` and of a sweep on runs of which a third are near an edge of stability."""
     judged = list(map(judge_experiment, seeds))
     for by in ("certified", "swept"):
-        _hold_near_an_edge(tally(judged, by))
+        _hold_near_an_edge(count_judgements(judged, by))
 
 
 @pytest.mark.push
 def test_sweeps_of_random_runs_are_right() -> None:
-    _hold_near_an_edge(tally([_sweep(seed, draw_experiment(seed)) for seed in SWEPT], "swept"))
+    _hold_near_an_edge(
+        count_judgements([_judge_sweep(seed, draw_experiment(seed)) for seed in SWEPT], "swept")
+    )
 
 
-def _sweep(seed: int, drawn: Drawn) -> Judged:
+def _judge_sweep(seed: int, drawn: Drawn) -> Judged:
     return Judged(drawn, read_truth(seed, drawn), swept=say_of_sweep(drawn.scenario))
 
 
-def _hold_near_an_edge(found: Tally) -> None:
-    assert found.false_ok == 0
-    assert found.false_alarm <= 0.02 * found.runs
-    assert found.undecided <= max(3, 0.15 * found.runs)  # of sixteen runs, three are chance
-    assert found.near >= 0.3 * found.runs
+def _hold_near_an_edge(counts: Tally) -> None:
+    assert counts.false_ok == 0
+    assert counts.false_alarm <= 0.02 * counts.runs
+    assert counts.undecided <= max(3, 0.15 * counts.runs)  # of sixteen runs, three are chance
+    assert counts.near >= 0.3 * counts.runs
 
 
 @pytest.mark.long
 def test_certificates_of_widely_drawn_runs_are_right() -> None:
-    """Of those near no edge; `truths.csv` has the rates at which pushes grow."""
-    _hold(tally_clear(map(judge_experiment, range(WIDE_FROM, count_stored()))))
+    """Runs near an edge do not count; `truths.csv` has the rates at which pushes grow."""
+    _assert_right(tally_clear(map(judge_experiment, range(WIDE_FROM, count_stored()))))
 
 
 @pytest.mark.push
@@ -164,14 +170,16 @@ def test_sweeps_of_widely_drawn_runs_are_right() -> None:
         if drawn_case.kind in OF_THE_CORE and drawn_case.has.endswith("joints")
     ]
     assert len(LOGGED) + len(SWEPT) + len(HIDDEN_PUSH) + len(known) == BLOCK
-    _hold(tally_clear([_sweep(seed, drawn_case) for seed, drawn_case in known], "swept"))
+    _assert_right(
+        tally_clear([_judge_sweep(seed, drawn_case) for seed, drawn_case in known], "swept")
+    )
 
 
-def _hold(found: Tally) -> None:
+def _assert_right(counts: Tally) -> None:
     """Asserts that no unstable run is called stable, and that few words are wrong otherwise, or missing."""
-    assert found.false_ok == 0
-    assert found.false_alarm <= 0.01 * found.runs
-    assert found.undecided <= max(1, OPEN_SHARE * found.runs)
+    assert counts.false_ok == 0
+    assert counts.false_alarm <= 0.01 * counts.runs
+    assert counts.undecided <= max(1, OPEN_SHARE * counts.runs)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +187,8 @@ def _hold(found: Tally) -> None:
 )
 def test_stored_truths_are_reproducible(seed: int) -> None:
     drawn = draw_experiment(seed)
-    stored, truth = read_truth(seed, drawn), find_truth(drawn)
+    stored = read_truth(seed, drawn)
+    truth = find_truth(drawn)
     assert (truth.unstable, truth.near) == (stored.unstable, stored.near)
 
 
@@ -190,14 +199,14 @@ def test_a_run_without_motion_is_read_whole() -> None:
         for name in "abc"
     }
     shares = {name: dict.fromkeys(set("abc") - {name}, 0.5) for name in "abc"}
-    given = {
+    overrides = {
         "rate_hz": 200,
         "scheme": "digital",
         "dominance": shares,
         "link": {"delay_ms": 0.0},
     }
-    still = experiment(
-        "still", sites=sites, control={"law": "wave", "b": 60.0, "K": 0.0}, **given
+    still = make_experiment(
+        "still", sites=sites, control={"law": "wave", "b": 60.0, "K": 0.0}, **overrides
     )
     log = trilat_net.simulate(still)
     assert [len(log[name]) for name in "abc"] == [6000] * 3
@@ -218,7 +227,8 @@ def test_a_run_without_motion_is_read_whole() -> None:
 def test_stored_truths_and_words_are_reproducible(seeds: Iterable[int]) -> None:
     for seed in seeds:
         drawn = draw_experiment(seed)
-        stored, truth = read_truth(seed, drawn), find_truth(drawn)
+        stored = read_truth(seed, drawn)
+        truth = find_truth(drawn)
         assert (truth.unstable, truth.near) == (stored.unstable, stored.near), seed
         if None in (truth.root_per_s, stored.root_per_s):
             assert truth.root_per_s is stored.root_per_s, seed
@@ -234,4 +244,6 @@ def test_stored_truths_and_words_are_reproducible(seeds: Iterable[int]) -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_unstable_runs_are_never_called_stable(seed: int) -> None:
     judged_experiment = judge_experiment(seed, stored=False)
-    assert not any(tally([judged_experiment], by).false_ok for by in ("certified", "swept"))
+    assert not any(
+        count_judgements([judged_experiment], by).false_ok for by in ("certified", "swept")
+    )

@@ -82,7 +82,7 @@ def _without_theorem(rests_on: str) -> str:
     return rests_on.removeprefix(THEOREM).removeprefix("; ")
 
 
-def judge(scenario: Scenario) -> list[Statement]:
+def list_statements(scenario: Scenario) -> list[Statement]:
     """Returns what the functions behind the commands say about the run of a scenario."""
     log = tn.simulate(scenario)
     certificate = certify_run(log)
@@ -138,7 +138,7 @@ def judge(scenario: Scenario) -> list[Statement]:
     return statements
 
 
-def disagree(statement: Statement, other: Statement) -> str:
+def find_disagreement(statement: Statement, other: Statement) -> str:
     """Returns in which way two commands disagree about a run. Empty if they agree."""
     both = f"{statement}, {other}"
     if (
@@ -168,8 +168,8 @@ def disagree(statement: Statement, other: Statement) -> str:
 
 def find_disagreements(name: str, scenario: Scenario) -> list[str]:
     """Compares all commands pairwise about the run of a scenario."""
-    pairs = combinations(judge(scenario), 2)
-    return [f"{name}: {text}" for text in (disagree(*pair) for pair in pairs) if text]
+    pairs = combinations(list_statements(scenario), 2)
+    return [f"{name}: {text}" for text in (find_disagreement(*pair) for pair in pairs) if text]
 
 
 def draw_short(seed: int) -> Scenario:

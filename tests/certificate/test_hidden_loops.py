@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.certificate.adversaries import HIDDEN, judge_hidden, tally
+from tests.certificate.adversaries import HIDDEN, count_judgements, judge_hidden
 from tests.certificate.hidden_loops import PUSH, draw_hidden, write_scenario
 
 BLOCK = 100
@@ -26,7 +26,7 @@ BLOCK = 100
 @pytest.mark.push
 def test_hidden_growth_is_found(seeds: range) -> None:
     """No growing loop is called stable, and at most one in a hundred decaying loops is condemned."""
-    counts = tally(map(judge_hidden, seeds))
+    counts = count_judgements(map(judge_hidden, seeds))
     assert counts.false_ok == 0
     assert counts.false_alarm <= max(1, 0.01 * counts.runs)
     assert counts.unstable >= 0.3 * counts.runs

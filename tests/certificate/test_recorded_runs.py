@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from tests.execution.builders import run_fused
 from trilat_net.analysis import judge
-from trilat_net.execution.fused import FusedRun
 from trilat_net.log import Log
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -32,8 +32,7 @@ def count_recordings(
     for function in ("simulate_scenario", "simulate_columns"):
         monkeypatch.setattr(judge, function, count(function))
     scenario = load_scenario(name, settings)
-    run = FusedRun(scenario)
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario)
     judgement = judge.judge_virtual_run(scenario, run)
     monkeypatch.undo()
     return len(recorded), str(judgement.decision.stability)
@@ -53,7 +52,7 @@ def test_only_laws_with_energies_are_recorded(
 
 
 def test_a_long_run_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its records would fill the memory; roots and pushes decide."""
+    """A run whose records would fill the memory is judged by its roots and pushes."""
     monkeypatch.setattr(judge, "MAX_RECORDED_TICKS", 11_999)
     counted, _ = count_recordings(monkeypatch, "free", LOSSY)
     assert counted == 0

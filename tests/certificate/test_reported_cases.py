@@ -17,15 +17,19 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from tests.certificate.sampled_loops import (
+    make_burst_delay,
+    make_constant_delay,
+    make_sine_delay,
+)
+from tests.execution.builders import make_log_with_commands, run_fused
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import list_effective_commands
-from trilat_net.execution.fused import FusedRun
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario
 
-from ..virtual_runs import simulate_with_commands
-from .sampled_loops import SampledLoop, burst, constant, sine
+from .sampled_loops import SampledLoop
 
 PAIR = ((0.0, 1.0), (1.0, 0.0))
 THREE = ((0.0, 0.5, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.0))
@@ -97,10 +101,12 @@ def assert_roots_decide(certificate: Certificate, rate_per_s: float) -> None:
     "loop",
     [
         pytest.param(
-            SampledLoop(PAIR, sine(180.0, 150.0, 0.7), 10.0, 1.5, (2.9,), 200),
+            SampledLoop(PAIR, make_sine_delay(180.0, 150.0, 0.7), 10.0, 1.5, (2.9,), 200),
             marks=pytest.mark.long,
         ),
-        SampledLoop(THREE, burst(50.0, 450.0, 1.0, 1.5), 9.0, 2.0, (), 100, "digital"),
+        SampledLoop(
+            THREE, make_burst_delay(50.0, 450.0, 1.0, 1.5), 9.0, 2.0, (), 100, "digital"
+        ),
     ],
 )
 def test_linear_loop_moves_as_the_run_does(loop: SampledLoop) -> None:
@@ -123,10 +129,10 @@ SLOW_JOINT = {
         SampledLoop(
             TWO_PAIRS,
             {
-                (0, 1): constant(100.0),
-                (1, 0): constant(100.0),
-                (2, 3): constant(30.0),
-                (3, 2): constant(30.0),
+                (0, 1): make_constant_delay(100.0),
+                (1, 0): make_constant_delay(100.0),
+                (2, 3): make_constant_delay(30.0),
+                (3, 2): make_constant_delay(30.0),
             },
             [[25.0, 25.0]] * 2 + [[5.0, 90.0]] * 2,
             [[8.0, 8.0]] * 2 + [[-0.21, 2.944]] * 2,
@@ -139,7 +145,7 @@ SLOW_JOINT = {
     "a pair and three": (
         SampledLoop(
             PAIR_AND_THREE,
-            constant(40.0),
+            make_constant_delay(40.0),
             [[25.0, 25.0]] * 2 + [[6.0, 60.0]] * 3,
             [[8.0, 8.0]] * 2 + [[-0.519, 1.789]] * 3,
             (6.0, 2.0),
@@ -151,7 +157,7 @@ SLOW_JOINT = {
     "a longer run": (
         SampledLoop(
             TWO_PAIRS,
-            constant(80.0),
+            make_constant_delay(80.0),
             [[25.0, 25.0]] * 2 + [[12.0, 50.0]] * 2,
             [[8.0, 8.0]] * 2 + [[0.7759, 4.405]] * 2,
             (2.5, 1.5),
@@ -218,14 +224,17 @@ def test_two_decaying_joints_are_settled() -> None:
 
 def two_sines(first_s: float, second_s: float) -> dict[tuple[int, int], Any]:
     """Returns delays of a pair that swing about 200 ms by 195 ms with two periods."""
-    return {(0, 1): sine(200.0, 195.0, first_s), (1, 0): sine(200.0, 195.0, second_s, np.pi)}
+    return {
+        (0, 1): make_sine_delay(200.0, 195.0, first_s),
+        (1, 0): make_sine_delay(200.0, 195.0, second_s, np.pi),
+    }
 
 
 def three_sines() -> dict[tuple[int, int], Any]:
     """Returns delays of three sites that swing with periods of 1.2 s and 1.22 s."""
-    early = sine(200.0, 190.0, 1.2)
-    late = sine(200.0, 190.0, 1.22, np.pi)
-    last = sine(200.0, 190.0, 1.22)
+    early = make_sine_delay(200.0, 190.0, 1.2)
+    late = make_sine_delay(200.0, 190.0, 1.22, np.pi)
+    last = make_sine_delay(200.0, 190.0, 1.22)
     return {
         (0, 1): early,
         (0, 2): early,
@@ -261,9 +270,12 @@ def test_two_sinusoids_are_judged_over_their_common_period(case: Case) -> None:
 
 # Row 3: looped traces of delays, of which a run shows little more than one period.
 
-ONE_LATE_LINK = {(0, 1): burst(60.0, 500.0, 21.0, 24.0), (1, 0): constant(60.0)}
-LATE_PAIR = burst(80.0, 380.0, 11.5, 13.0)
-LATE_THREE = burst(50.0, 450.0, 14.0, 16.0)
+ONE_LATE_LINK = {
+    (0, 1): make_burst_delay(60.0, 500.0, 21.0, 24.0),
+    (1, 0): make_constant_delay(60.0),
+}
+LATE_PAIR = make_burst_delay(80.0, 380.0, 11.5, 13.0)
+LATE_THREE = make_burst_delay(50.0, 450.0, 14.0, 16.0)
 LOOPED_TRACES = [
     Case(SampledLoop(PAIR, LATE_PAIR, 12.0, 1.028, (2.2,), 100), 0.03493, 18.0),
     Case(SampledLoop(THREE, LATE_THREE, 9.0, 0.2637, (), 100), 0.03445, 22.0),
@@ -326,9 +338,9 @@ def set_delay(delay_ms: float, link: str = "a->b") -> dict[str, Any]:
     return {"link": link, "to": {"model": "constant", "delay_ms": delay_ms}}
 
 
-SATURATED = SampledLoop(PAIR, constant(250.0), 16.0, 3.37, (2.0,), 100)
-SATURATED_THREE = SampledLoop(THREE, constant(200.0), 20.0, 1.718, (2.9,), 100)
-PLANAR = SampledLoop(PAIR, constant(220.0), 12.0, 2.192, (), 100)
+SATURATED = SampledLoop(PAIR, make_constant_delay(250.0), 16.0, 3.37, (2.0,), 100)
+SATURATED_THREE = SampledLoop(THREE, make_constant_delay(200.0), 20.0, 1.718, (2.9,), 100)
+PLANAR = SampledLoop(PAIR, make_constant_delay(220.0), 12.0, 2.192, (), 100)
 SAME_250 = ((6.0, set_delay(250.0)),)
 SAME_THREE = (
     (5.0, set_delay(200.0)),
@@ -356,7 +368,7 @@ IDLE_COMMANDS = [
 def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
     scenario = case.loop.write_scenario(case.duration_s, case.apart_rad, case.law)
-    log = simulate_with_commands(scenario, "b", *case.commands)
+    log = make_log_with_commands(scenario, "b", *case.commands)
     assert len(log.changes("b")) == len(case.commands)
     assert list_effective_commands(log) == []
     certificate = tn.certify(log)
@@ -366,22 +378,38 @@ def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
 
 def test_effective_commands_decide_by_later_roots() -> None:
     stable = SATURATED._replace(d=3.626)
-    later = stable._replace(delays={(0, 1): constant(250.0), (1, 0): constant(300.0)})
+    later = stable._replace(
+        delays={(0, 1): make_constant_delay(250.0), (1, 0): make_constant_delay(300.0)}
+    )
     rate_per_s = later.compute_rates(1)[0]
     assert (stable.compute_rates(1)[0], rate_per_s) == pytest.approx(
         (-0.02976, 0.0222), abs=1e-5
     )
     scenario = stable.write_scenario(16.0, -0.02)
-    log = simulate_with_commands(scenario, "b", (6.0, set_delay(300.0)))
+    log = make_log_with_commands(scenario, "b", (6.0, set_delay(300.0)))
     assert_roots_decide(tn.certify(log), rate_per_s)
 
 
 # Row 5: a user's law that may not run.
 
 ONE_SLIDES = [
-    (UNEQUAL, sine(180.0, 175.0, 1.6), [6.0, 30.0], (1.5, 1.4), (0.5312, 1.554), 20.0),
-    (PAIR, constant(150.0), [11.0, 20.0], (1.5, 0.8), (1.401, 2.175), 16.0),
-    (PAIR, burst(60.0, 420.0, 3.0, 4.0), [11.0, 15.0], (0.5, 1.5), (0.9598, 1.776), 24.0),
+    (
+        UNEQUAL,
+        make_sine_delay(180.0, 175.0, 1.6),
+        [6.0, 30.0],
+        (1.5, 1.4),
+        (0.5312, 1.554),
+        20.0,
+    ),
+    (PAIR, make_constant_delay(150.0), [11.0, 20.0], (1.5, 0.8), (1.401, 2.175), 16.0),
+    (
+        PAIR,
+        make_burst_delay(60.0, 420.0, 3.0, 4.0),
+        [11.0, 15.0],
+        (0.5, 1.5),
+        (0.9598, 1.776),
+        24.0,
+    ),
 ]
 """Shares, delay, stiffness, masses, damping of joint 1 that lacks and that suffices, duration."""
 LACKING_RATES = (0.0499, 0.0400, 0.0498)
@@ -433,7 +461,7 @@ def test_own_law_that_decays_is_settled_with_permission(number: int) -> None:
 
 BEAT = SampledLoop(
     PAIR,
-    {(0, 1): sine(200.0, 195.0, 1.2), (1, 0): sine(200.0, 195.0, 1.26)},
+    {(0, 1): make_sine_delay(200.0, 195.0, 1.2), (1, 0): make_sine_delay(200.0, 195.0, 1.26)},
     10.0,
     2.33,
     (2.5,),
@@ -441,7 +469,7 @@ BEAT = SampledLoop(
 )
 LONG_BEAT = SampledLoop(
     PAIR,
-    {(0, 1): sine(200.0, 195.0, 4.9), (1, 0): sine(200.0, 150.0, 1.21)},
+    {(0, 1): make_sine_delay(200.0, 195.0, 4.9), (1, 0): make_sine_delay(200.0, 150.0, 1.21)},
     10.0,
     1.942,
     (2.9,),
@@ -469,7 +497,7 @@ def test_growing_beat_is_not_stable() -> None:
     assert_roots_decide(certify_case(Case(loop, rate_per_s, 32.0)), rate_per_s)
 
 
-LOSSY = SampledLoop(THREE, constant(150.0), 10.0, 1.4, (2.9,), 100)
+LOSSY = SampledLoop(THREE, make_constant_delay(150.0), 10.0, 1.4, (2.9,), 100)
 
 
 def write_lossy(loop: SampledLoop, duration_s: float, seed: int) -> Scenario:
@@ -495,8 +523,7 @@ def lasts(scenario: Scenario) -> bool:
     Args:
         scenario: The run, which has the length that shows the truth.
     """
-    run = FusedRun(scenario)
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario)
     if run.diverged_s is not None:
         return True
     joints = run.buckets[0].shape[1] // 3
@@ -528,14 +555,31 @@ def test_growth_over_bursts_of_loss_is_not_stable() -> None:
 # Row 7: motions that decay so slowly that the run shows no decay.
 
 SLOW_MOTIONS = [
-    Case(SampledLoop(THREE, constant(160.0), 12.0, 0.8953, (), 100), -0.00120, 40.0),
-    Case(SampledLoop(PAIR, constant(240.0), 9.0, 1.946, (), 100, "digital"), -0.00084, 30.0),
-    Case(SampledLoop(PAIR, constant(130.0), 15.0, 1.866, (1.7,), 200), -0.00142, 40.0),
+    Case(SampledLoop(THREE, make_constant_delay(160.0), 12.0, 0.8953, (), 100), -0.00120, 40.0),
+    Case(
+        SampledLoop(PAIR, make_constant_delay(240.0), 9.0, 1.946, (), 100, "digital"),
+        -0.00084,
+        30.0,
+    ),
+    Case(
+        SampledLoop(PAIR, make_constant_delay(130.0), 15.0, 1.866, (1.7,), 200), -0.00142, 40.0
+    ),
 ]
 SLOW_GROWTH = [
-    Case(SampledLoop(THREE, constant(160.0), 12.0, 0.8899, (), 100), 0.00132, 40.0, 0.005),
-    Case(SampledLoop(PAIR, constant(240.0), 9.0, 1.941, (), 100, "digital"), 0.00119, 30.0),
-    Case(SampledLoop(PAIR, constant(130.0), 15.0, 1.854, (1.7,), 200), 0.00188, 40.0),
+    Case(
+        SampledLoop(THREE, make_constant_delay(160.0), 12.0, 0.8899, (), 100),
+        0.00132,
+        40.0,
+        0.005,
+    ),
+    Case(
+        SampledLoop(PAIR, make_constant_delay(240.0), 9.0, 1.941, (), 100, "digital"),
+        0.00119,
+        30.0,
+    ),
+    Case(
+        SampledLoop(PAIR, make_constant_delay(130.0), 15.0, 1.854, (1.7,), 200), 0.00188, 40.0
+    ),
 ]
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from tests.certificate.sampled_loops import make_constant_delay, make_sine_delay
+from tests.unit_arm import make_unit_scenario
 from trilat_net.analysis.certificate.observed_energy import (
     NEGATIVE_ENERGY_MEANING,
     ObservedFinding,
@@ -20,8 +22,7 @@ from trilat_net.execution.twins import Push, Twins
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
 
-from ..unit_arm import unit_scenario
-from .sampled_loops import SampledLoop, constant, sine
+from .sampled_loops import SampledLoop
 
 PAIR = ((0.0, 1.0), (1.0, 0.0))
 THREE = ((0.0, 0.5, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.0))
@@ -47,7 +48,7 @@ def write_tdpa(
     around = {"environment": [{"kind": "viscous", "damping_nm_s_rad": 4.0}]}
     sites = {"m": {"q0_rad": [0.3, 0.1], **around}, "s": {"q0_rad": [0.8, 0.5], **around}}
     link = {"model": "constant", "delay_ms": delay_ms}
-    return unit_scenario(sites, law, link=link, rate_hz=200, duration_s=12.0, **more)
+    return make_unit_scenario(sites, law, link=link, rate_hz=200, duration_s=12.0, **more)
 
 
 TDPA_RUNS = [
@@ -100,7 +101,9 @@ def test_energy_within_the_reserve_proves_no_decay(delay_ms: float, K: float, B:
 def test_passive_laws_prove_bounded_motion_and_no_decay(law: str) -> None:
     for delay_ms in (20.0, 300.0):
         link = {"model": "constant", "delay_ms": delay_ms}
-        scenario = unit_scenario({"m": {}, "s": {}}, {"law": law}, link=link, duration_s=5.0)
+        scenario = make_unit_scenario(
+            {"m": {}, "s": {}}, {"law": law}, link=link, duration_s=5.0
+        )
         conditions = describe_law_conditions(scenario)
         assert conditions
         for line in conditions:
@@ -143,9 +146,9 @@ def test_conditions_say_where_sampling_breaks_them(d: float, grows: bool) -> Non
 
 
 SLIDING = [
-    SampledLoop(PAIR, constant(80.0), 0.0, 0.0, (2.9,), 100),
-    SampledLoop(THREE, constant(200.0), 0.0, 0.0, (2.2,), 100),
-    SampledLoop(PAIR, constant(30.0), 0.0, 0.0, (1.5,), 200),
+    SampledLoop(PAIR, make_constant_delay(80.0), 0.0, 0.0, (2.9,), 100),
+    SampledLoop(THREE, make_constant_delay(200.0), 0.0, 0.0, (2.2,), 100),
+    SampledLoop(PAIR, make_constant_delay(30.0), 0.0, 0.0, (1.5,), 200),
 ]
 ADAPTIVE = {"law": "adaptive", "Lambda": 1.0, "Kp": 4.0, "Kd": 5.0, "Gamma": 1.0}
 
@@ -171,7 +174,7 @@ def test_theorem_covers_prismatic_joints(loop: SampledLoop) -> None:
 
 
 def test_theorem_excludes_prismatic_joints_over_varying_delay() -> None:
-    swinging = SLIDING[0]._replace(delays=sine(80.0, 60.0, 1.5))
+    swinging = SLIDING[0]._replace(delays=make_sine_delay(80.0, 60.0, 1.5))
     certificate = tn.certify(tn.simulate(write_sliding(swinging, 20.0)))
     assert "the theorem" not in certificate.decision.rests_on
 
@@ -179,9 +182,9 @@ def test_theorem_excludes_prismatic_joints_over_varying_delay() -> None:
 # Row 14: a push at 0 s is not another start.
 
 PUSHED_LOOPS = [
-    SampledLoop(PAIR, constant(200.0), 10.0, 1.2, (), 100),
-    SampledLoop(THREE, constant(300.0), 12.0, 1.9, (2.9,), 100),
-    SampledLoop(PAIR, constant(250.0), 8.0, 2.1, (1.7,), 200, "digital"),
+    SampledLoop(PAIR, make_constant_delay(200.0), 10.0, 1.2, (), 100),
+    SampledLoop(THREE, make_constant_delay(300.0), 12.0, 1.9, (2.9,), 100),
+    SampledLoop(PAIR, make_constant_delay(250.0), 8.0, 2.1, (1.7,), 200, "digital"),
 ]
 PUSH_RAD = 1e-6
 
@@ -231,7 +234,7 @@ def test_push_at_zero_keeps_the_runs_history(loop: SampledLoop) -> None:
 
 def test_push_without_delay_nearly_equals_another_start() -> None:
     """The peers see the old pose for one tick only."""
-    loop = SampledLoop(PAIR, constant(0.0), 10.0, 2.6, (), 1000)
+    loop = SampledLoop(PAIR, make_constant_delay(0.0), 10.0, 2.6, (), 1000)
     twin = measure_twin(loop, 0.5)
     start = measure_start(loop, 499)
     np.testing.assert_allclose(twin, start, rtol=0.02, atol=1e-9)

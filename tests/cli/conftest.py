@@ -1,8 +1,8 @@
 import pytest
 
-from tests.log_editing import recorded
+from tests.log.builders import make_log_bytes
 
 
 @pytest.fixture(scope="session")
 def short_log() -> bytes:
-    return recorded("paper", {"duration_s": 0.5})
+    return make_log_bytes("paper", {"duration_s": 0.5})

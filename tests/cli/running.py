@@ -19,16 +19,18 @@ from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.presentation import terminal_output
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
-"""The same as a process of its own."""
+"""The command line of `trilat` in its own process."""
 
 PLAIN = {**os.environ, "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "100"}
 
 
-class Done:
+class CommandResult:
     """The exit code of a command, and its output."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
+        self.code = code
+        self.out = out
+        self.err = err
 
     def __repr__(self) -> str:
         return f"exit code {self.code}\n--- out\n{self.out}\n--- err\n{self.err}"
@@ -50,39 +52,40 @@ class Done:
 
 
 @cache
-def whole_command() -> Any:
+def build_command() -> Any:
     """Returns `trilat` with all of its commands, built once because that takes a while."""
     return get_command(app)
 
 
-def parses(arguments: list[str]) -> None:
+def assert_parses(arguments: list[str]) -> None:
     """Asserts that a command line, `trilat` included, names a command, and only options and
     arguments of that command.
     """
     program, *rest = arguments
     assert program == "trilat"
-    command: Any = whole_command()
+    command: Any = build_command()
     while hasattr(command, "commands"):
         command = command.commands[rest.pop(0)]
     with command.make_context(command.name, rest) as context:
         assert context.args == []
 
 
-def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+def start_command(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([*COMMAND, *arguments], cwd=cwd, env=PLAIN, text=True, **pipes)
 
 
-def simulated(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:
+def simulate_by_command(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:
     options = [word for setting in settings for word in ("--set", setting)]
     trilat("sim", scenario, "--duration", seconds, "-o", "run.mcap", *options, cwd=folder)
     return "run.mcap"
 
 
-def trilat(*arguments: str | Path, cwd: Path) -> Done:
+def trilat(*arguments: str | Path, cwd: Path) -> CommandResult:
     before = dict(allowed_code)
     allowed_code.clear()
-    out, err = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    err = io.StringIO()
     code: object = None
     with (
         contextlib.chdir(cwd),
@@ -100,11 +103,11 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
         except SystemExit as end:
             code = end.code
     allowed_code.update(before)  # logs that other tests keep name laws
-    return Done(0 if code is None else int(str(code)), out.getvalue(), err.getvalue())
+    return CommandResult(0 if code is None else int(str(code)), out.getvalue(), err.getvalue())
 
 
 def shorten(file: Path) -> None:
-    """Makes the experiment of a protocol short: two participants, two conditions, a trial each."""
+    """Shortens the experiment of a protocol to two participants, two conditions and one trial each."""
     text = file.read_text(encoding="utf-8")
     text = re.sub(r"\[conditions\.(delay_100|jitter_300)\]\n[^\[]*", "", text)
     for key, value in {"participants": 2, "trials": 1, "practice": 0}.items():

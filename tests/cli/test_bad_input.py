@@ -73,7 +73,8 @@ def test_a_session_has_a_short_name(tmp_path: Path) -> None:
 
 def test_foreign_text_cannot_control_a_terminal() -> None:
     """Texts, cells, titles and JSON contain letters alone, whatever a peer or a file put into them."""
-    stream, attack = io.StringIO(), "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
+    stream = io.StringIO()
+    attack = "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
     console = TextConsole(file=stream, force_terminal=True, width=200)
     table = Table(title=attack)
     table.add_column(attack)

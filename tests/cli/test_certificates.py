@@ -4,7 +4,9 @@ import json
 import re
 from pathlib import Path
 
-from .running import simulated, trilat
+from tests.cli.running import simulate_by_command
+
+from .running import trilat
 
 PAIRS = """
 name = "pairs"
@@ -30,7 +32,7 @@ d = { c = 1.0 }
 
 
 def test_a_stable_run_exits_0(tmp_path: Path) -> None:
-    file = simulated(tmp_path, "free", "rate_hz=100", seconds="30")
+    file = simulate_by_command(tmp_path, "free", "rate_hz=100", seconds="30")
     output = trilat("certify", file, "--all", cwd=tmp_path).succeeds()
     facts = json.loads(trilat("certify", "--json", file, cwd=tmp_path).succeeds())
     assert (facts["verdict"], facts["passed"]) == ("covered", True)
@@ -48,7 +50,7 @@ def test_a_stable_run_exits_0(tmp_path: Path) -> None:
 
 
 def test_a_diverged_run_exits_1(tmp_path: Path) -> None:
-    file = simulated(tmp_path, "free", "rate_hz=200", "limits.qd_limit_rad_s=0.5")
+    file = simulate_by_command(tmp_path, "free", "rate_hz=200", "limits.qd_limit_rad_s=0.5")
     done = trilat("certify", file, cwd=tmp_path)
     assert done.code == 1
     assert done.err == ""
@@ -59,7 +61,7 @@ def test_a_diverged_run_exits_1(tmp_path: Path) -> None:
 def test_undecided_is_its_own_word_without_success(tmp_path: Path) -> None:
     done = trilat(
         "certify",
-        simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d", seconds="0.5"),
+        simulate_by_command(tmp_path, "free", "rate_hz=200", "control.law=p_d", seconds="0.5"),
         cwd=tmp_path,
     )
     assert done.code == 1

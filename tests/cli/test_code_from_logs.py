@@ -18,7 +18,7 @@ import typer
 
 import trilat_net as tn
 from tests.cli.running import COMMAND, PLAIN, shorten, trilat
-from tests.log_editing import edited, opened
+from tests.log.builders import edit_log_bytes, open_bytes
 from trilat_net.app.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
 from trilat_net.own_code.code_consent import list_imported_code
@@ -89,8 +89,8 @@ READING: list[tuple[list[str], int]] = [
     (["log", "export", "run.mcap", "--to", "csv", "-o", "tables"], 0),
     (["-c", SCRIPT], 0),
 ]
-CASES = [(words, code, law) for words, code in EXECUTING for law in FILES]
-CASES += [(words, code, "beside the log") for words, code in READING]
+CASES = [(arguments, code, law) for arguments, code in EXECUTING for law in FILES]
+CASES += [(arguments, code, "beside the log") for arguments, code in READING]
 
 
 @pytest.fixture(scope="module")
@@ -98,10 +98,17 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     (folder / "mylaws.py").write_text(LAW)
     # A process of its own: this one imports a file once, and its workers set a module up twice.
-    words = ["sim", "paper", "--duration", "0.05", "--set", "sites.s.control.law=mylaws:Spring"]
+    arguments = [
+        "sim",
+        "paper",
+        "--duration",
+        "0.05",
+        "--set",
+        "sites.s.control.law=mylaws:Spring",
+    ]
     environment = {**PLAIN, "WITNESS": str(folder / "witness")}
     subprocess.run(
-        [*COMMAND, *words, "-o", "run.mcap"], cwd=folder, env=environment, check=True
+        [*COMMAND, *arguments, "-o", "run.mcap"], cwd=folder, env=environment, check=True
     )
     assert (folder / "witness").exists()  # it does tell
     before, now = (
@@ -109,9 +116,11 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for source in (LAW, FILES["not a law"]["mylaws.py"])
     )
     log = (folder / "run.mcap").read_bytes()
-    text = opened(log).scenario_text.replace(before, now)
+    text = open_bytes(log).scenario_text.replace(before, now)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
-    (folder / "not a law.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    (folder / "not a law.mcap").write_bytes(
+        edit_log_bytes(log, scenario=lambda _: text, session=named)
+    )
     return folder
 
 
@@ -129,7 +138,7 @@ def log_folder(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     allowed_code.update(before)  # logs that other tests keep name laws
 
 
-def _marks(arguments: list[str], law: str) -> tuple[Any, ...]:
+def _find_marks(arguments: list[str], law: str) -> tuple[Any, ...]:
     brief = arguments[0] in ("verify", "rerun") or "--own-laws" in arguments
     return (
         ()
@@ -144,7 +153,7 @@ def _marks(arguments: list[str], law: str) -> tuple[Any, ...]:
         pytest.param(
             *case,
             id=f"{' '.join(case[0][:3])[:30]!r} {case[2]}",
-            marks=_marks(case[0], case[2]),
+            marks=_find_marks(case[0], case[2]),
         )
         for case in CASES
     ],
@@ -186,13 +195,15 @@ def test_looking_for_a_module_runs_no_code(code: str, log_folder: Path) -> None:
         (log_folder / name).parent.mkdir(parents=True)
         (log_folder / name).write_text(WITNESS)
     log = (log_folder / "run.mcap").read_bytes()
-    text = opened(log).scenario_text.replace("mylaws:Spring", code)
+    text = open_bytes(log).scenario_text.replace("mylaws:Spring", code)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
-    (log_folder / "run.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    (log_folder / "run.mcap").write_bytes(
+        edit_log_bytes(log, scenario=lambda _: text, session=named)
+    )
     done = subprocess.run(
         [*COMMAND, "verify", "run.mcap"], cwd=log_folder, capture_output=True, text=True
     )
-    assert (done.returncode, imports(log_folder)) == (4, []), done.stderr
+    assert (done.returncode, list_imports(log_folder)) == (4, []), done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -230,22 +241,41 @@ def list_commands(command: Any, *arguments: str) -> Iterator[str]:
 
 
 RUN_NONE = {
-    *("metrics", "identify hand", "replay", "watch", "stop", "enable", "reset"),
-    *("log info", "log check", "log sign", "log recover", "log export"),
-    *("set link", "set dominance", "router", "ros2", "doctor"),
-    *("scenario list", "scenario show", "scenario check", "scenario new", "trace import"),
-    *("experiment new", "experiment check", "experiment power"),
-    *("experiment status", "experiment analyse"),
-    *(
-        "keys new",
-        "keys add",
-        "keys renew",
-        "keys pair",
-        "keys info",
-        "new law",
-        "new hand",
-        "new plant",
-    ),
+    "metrics",
+    "identify hand",
+    "replay",
+    "watch",
+    "stop",
+    "enable",
+    "reset",
+    "log info",
+    "log check",
+    "log sign",
+    "log recover",
+    "log export",
+    "set link",
+    "set dominance",
+    "router",
+    "ros2",
+    "doctor",
+    "scenario list",
+    "scenario show",
+    "scenario check",
+    "scenario new",
+    "trace import",
+    "experiment new",
+    "experiment check",
+    "experiment power",
+    "experiment status",
+    "experiment analyse",
+    "keys new",
+    "keys add",
+    "keys renew",
+    "keys pair",
+    "keys info",
+    "new law",
+    "new hand",
+    "new plant",
 }
 """Commands of which the page says that they run no code that a log or a scenario names."""
 
@@ -264,11 +294,11 @@ def test_the_page_lists_every_command() -> None:
     named = {
         " ".join(
             word
-            for word in words.removeprefix("trilat ").split()
+            for word in command.removeprefix("trilat ").split()
             if word.islower() and word[0] != "-"
         )
         for row in rows
-        for words in re.findall("`([^`]+)`", row.split(" | ")[0])
+        for command in re.findall("`([^`]+)`", row.split(" | ")[0])
     }
     assert not named & RUN_NONE
     assert named | RUN_NONE == set(list_commands(typer.main.get_command(app)))
@@ -303,13 +333,15 @@ def test_commands_run_own_code_as_documented(name: str, log_folder: Path) -> Non
     (log_folder / "own-reaching.toml").write_text(
         protocol.replace('"paper"', '"./own.toml"', 1)
     )
-    words = {**RUNNING_OWN, **ONLY_NAMING_OWN}[name]
-    done = subprocess.run([*COMMAND, *words], cwd=log_folder, capture_output=True, text=True)
+    arguments = {**RUNNING_OWN, **ONLY_NAMING_OWN}[name]
+    done = subprocess.run(
+        [*COMMAND, *arguments], cwd=log_folder, capture_output=True, text=True
+    )
     assert "Traceback" not in done.stderr, done.stderr
-    assert bool(imports(log_folder)) == (name in RUNNING_OWN), done
+    assert bool(list_imports(log_folder)) == (name in RUNNING_OWN), done
 
 
-def imports(place: Path) -> list[str]:
+def list_imports(place: Path) -> list[str]:
     witness = place / "witness"
     return witness.read_text().split(";")[:-1] if witness.exists() else []
 
@@ -321,9 +353,9 @@ def test_only_the_named_file_runs(log_folder: Path) -> None:
     file.write_text(LAW)
     log = tn.open_log("run.mcap", law=file)
     assert tn.verify(log, virtual=True).passed
-    assert imports(log_folder) == [str(file)]
+    assert list_imports(log_folder) == [str(file)]
     tn.verify("run.mcap")  # this process has it already
-    assert imports(log_folder) == [str(file)]
+    assert list_imports(log_folder) == [str(file)]
     assert not list(file.parent.glob("__pycache__"))
 
 
@@ -331,7 +363,8 @@ def test_caches_beside_a_law_never_run(log_folder: Path) -> None:
     import importlib.util
     import py_compile
 
-    file, other = log_folder / "mylaws.py", log_folder / "other.py"
+    file = log_folder / "mylaws.py"
+    other = log_folder / "other.py"
     file.write_text(LAW)
     other.write_text("raise SystemExit('cached')")
     cached = importlib.util.cache_from_source(str(file))
@@ -379,7 +412,7 @@ def test_a_different_file_is_refused_before_running(
         "verify", "run.mcap", "--law", name, *["--other-version"] * is_asked, cwd=log_folder
     )
     done.refuses(fact)
-    assert not imports(log_folder)
+    assert not list_imports(log_folder)
 
 
 def test_files_changed_after_permission_do_not_run(log_folder: Path) -> None:
@@ -390,7 +423,7 @@ def test_files_changed_after_permission_do_not_run(log_folder: Path) -> None:
     assert tn.verify(log).result.withheld == ["s"]
     with pytest.raises(ScenarioError, match="its hash is not the permitted one"):
         tn.rerun(log, ["s"])
-    assert not imports(log_folder)
+    assert not list_imports(log_folder)
 
 
 def test_a_remembered_file_runs_for_its_hash(log_folder: Path) -> None:
@@ -453,11 +486,11 @@ def test_remembered_file_runs_with_remembered_settings_alone(reader: Path) -> No
     (reader / "witness").unlink()
     refused = trilat("verify", "stranger.mcap", cwd=reader)
     assert refused.code == 4
-    assert not imports(reader)
+    assert not list_imports(reader)
     for fact in ("it was allowed with other settings", 'secret.txt" (was its default)'):
         assert fact in refused.err
     assert trilat("verify", "class.mcap", cwd=reader).code == 4
-    assert not imports(reader)
+    assert not list_imports(reader)
     named = trilat("verify", "stranger.mcap", "--law", "mylaws.py", "--remember", cwd=reader)
     assert named.code == 0
     assert 'secret.txt"' in named.err  # what it ran with is said
@@ -483,22 +516,22 @@ def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
     ):
         with pytest.raises(CodeWithheld, match=r"secret\.txt"):
             run()
-    assert not imports(reader)
+    assert not list_imports(reader)
 
 
 def test_figures_run_only_permitted_laws(reader: Path) -> None:
     stranger = tn.open_log("stranger.mcap")
     tn.figure(stranger, "overview")
     assert "twins" not in list_drawable_figures(stranger)
-    assert not imports(reader)
+    assert not list_imports(reader)
     log = tn.open_log("own.mcap", law="mylaws.py")
-    assert not imports(reader)
+    assert not list_imports(reader)
     tn.figure(log, "overview")
-    assert imports(reader)
+    assert list_imports(reader)
     assert "twins" in list_drawable_figures(log)
     (reader / "witness").unlink()
     tn.figure(stranger, "overview")  # the permission is for other settings
-    assert not imports(reader)
+    assert not list_imports(reader)
 
 
 @pytest.mark.usefixtures("reader")
@@ -515,7 +548,7 @@ def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
     sha256 = hashlib.sha256(READER.encode()).hexdigest()
     store.write_text(json.dumps({sha256: str(reader / "mylaws.py")}))
     assert trilat("verify", "own.mcap", cwd=reader).code == 4
-    assert not imports(reader)
+    assert not list_imports(reader)
     assert (
         trilat("verify", "own.mcap", "--law", "mylaws.py", "--remember", cwd=reader).code == 0
     )
@@ -592,4 +625,4 @@ def test_a_compiled_law_runs_from_the_named_file(log_folder: Path) -> None:
         text=True,
     )
     assert "100/100 records identical" in process.stdout, process.stderr
-    assert not imports(log_folder)
+    assert not list_imports(log_folder)

@@ -63,6 +63,6 @@ def test_figures_of_two_logs_are_written(folder: Path) -> None:
     names = ["overlay", *(f"overlay_{name}" for name in COMPARED_SIGNALS)]
     written = trilat(*together, "both", cwd=folder).succeeds().split()
     assert written == [f"both/{name}.svg" for name in names]
-    one = trilat(*together, "one", "positions", cwd=folder).succeeds().split()
-    assert one == ["one/overlay_positions.svg"]
+    overlaid = trilat(*together, "one", "positions", cwd=folder).succeeds().split()
+    assert overlaid == ["one/overlay_positions.svg"]
     trilat(*together, "no", "phase", cwd=folder).refuses("'phase'", "tracking_errors")

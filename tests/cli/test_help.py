@@ -10,12 +10,13 @@ import typer.main
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 from typer.testing import CliRunner
 
+from tests.cli.running import simulate_by_command
 from tests.golden.surface import all_options
 from trilat_net.app.cli import app
 from trilat_net.app.cli.options import list_laws
 from trilat_net.presentation.exports import list_export_formats
 
-from .running import simulated, trilat
+from .running import trilat
 
 ROOT = Path(__file__).parents[2]
 PANELS = {
@@ -123,7 +124,7 @@ def test_help_lists_all_tunable_laws() -> None:
 
 def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:
     """The other commands name the logs in the folder."""
-    simulated(tmp_path, "paper", seconds="0.05")
+    simulate_by_command(tmp_path, "paper", seconds="0.05")
     (tmp_path / "logs").mkdir()
     (tmp_path / "run.mcap").rename(tmp_path / "logs" / "one.mcap")
     for command in COMMANDS:

@@ -59,7 +59,7 @@ def test_figures_are_reproducible_files(tmp_path: Path) -> None:
 
 
 def test_an_identified_hand_holds_the_ports(tmp_path: Path) -> None:
-    """As documented in docs/studies/measured-hands.md, with the sines of that page."""
+    """The commands are those of docs/studies/measured-hands.md, with the sines of that page."""
     (sines,) = (
         block.text
         for block in find_blocks("docs/studies/measured-hands.md")

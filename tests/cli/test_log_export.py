@@ -11,8 +11,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.log.dealt import a_file, dealt, messages
-from tests.log_editing import recorded
+from tests.log.builders import make_log_bytes, write_log
+from tests.log.split_logs import make_bytes_of_messages, make_parts, read_messages
 
 from .running import trilat
 
@@ -27,7 +27,7 @@ FORMS = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "run.mcap").write_bytes(recorded("paper"))
+    write_log(tmp_path, make_log_bytes("paper"))
     return tmp_path
 
 
@@ -46,12 +46,14 @@ def test_exports_replace_only_their_own_kind(folder: Path) -> None:
     assert pl.read_csv(folder / "tables" / "s_state.csv").height == 120
     done = trilat("log", "export", "run.mcap", "--to", "npz", "-o", "run.mcap", cwd=folder)
     done.refuses("run.mcap: already exists")
-    assert (folder / "run.mcap").read_bytes() == recorded("paper")
+    assert (folder / "run.mcap").read_bytes() == make_log_bytes("paper")
 
 
 def test_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
-    count = len(messages(recorded("paper")))
-    for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
+    count = len(read_messages(make_log_bytes("paper")))
+    for n, data in enumerate(
+        make_parts(make_log_bytes("paper"), [range(150), range(100, count)])
+    ):
         (folder / f"run-00{n + 1}.mcap").write_bytes(data)
     files = ("run-002.mcap", "run-001.mcap")
     trilat("log", "export", *files, "--to", "npz", "-o", "out.npz", cwd=folder).succeeds()
@@ -60,12 +62,14 @@ def test_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
 
 def test_a_folder_of_logs_becomes_episodes(folder: Path) -> None:
     """The parts of one log are one episode: 0.12 s at 1 kHz are four frames of 30 Hz, or six of 50 Hz."""
-    count = len(messages(recorded("paper")))
+    count = len(read_messages(make_log_bytes("paper")))
     (folder / "logs").mkdir()
-    for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
+    for n, data in enumerate(
+        make_parts(make_log_bytes("paper"), [range(150), range(100, count)])
+    ):
         (folder / "logs" / f"run-00{n + 1}.mcap").write_bytes(data)
     (folder / "logs" / "other.mcap").write_bytes(
-        recorded("paper", {"seed": 9, "duration_s": 0.12})
+        make_log_bytes("paper", {"seed": 9, "duration_s": 0.12})
     )
     command = ("log", "export", "logs", "--to", "lerobot")
     text = trilat(*command, cwd=folder).succeeds()
@@ -114,10 +118,12 @@ def test_csv_and_npz_need_no_extra(
 
 
 def test_an_unreadable_record_leaves_no_files(folder: Path) -> None:
-    all_messages = messages(recorded("paper"))
+    all_messages = read_messages(make_log_bytes("paper"))
     topic = next(m[0] for m in all_messages if m[0].endswith("/s/state"))
     (folder / "bad.mcap").write_bytes(
-        a_file(recorded("paper"), [*all_messages, (topic, b"\x80", 0, 0, 0)])
+        make_bytes_of_messages(
+            make_log_bytes("paper"), [*all_messages, (topic, b"\x80", 0, 0, 0)]
+        )
     )
     done = trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder)
     done.refuses("bad.mcap: a record of s cannot be")

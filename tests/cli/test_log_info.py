@@ -10,19 +10,13 @@ import pytest
 from mcap.writer import Writer
 
 from tests.cli.running import trilat
-from tests.log_editing import edited, recorded, without
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, write_log
 from trilat_net.presentation.untrusted_text import sanitize
 
-WHOLE = recorded("paper")
+WHOLE = make_log_bytes("paper")
 
 
-def write_log(folder: Path, data: bytes, name: str = "run.mcap") -> Path:
-    path = folder / name
-    path.write_bytes(data)
-    return path
-
-
-def foreign() -> bytes:
+def make_foreign_bytes() -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
@@ -52,7 +46,7 @@ def test_info_shows_session_sites_links_and_channels(tmp_path: Path) -> None:
 
 
 def test_info_in_json_has_the_same_numbers(tmp_path: Path) -> None:
-    path = write_log(tmp_path, edited(WHOLE, record=without("m1", {5, 6, 90})))
+    path = write_log(tmp_path, edit_log_bytes(WHOLE, record=drop_records("m1", {5, 6, 90})))
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "trilat"
     assert facts["session"]["scenario"]["name"] == "paper"
@@ -68,7 +62,7 @@ def test_info_in_json_has_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_info_of_a_foreign_file_shows_channels(tmp_path: Path) -> None:
-    path = write_log(tmp_path, foreign())
+    path = write_log(tmp_path, make_foreign_bytes())
     facts = json.loads(trilat("log", "info", "--json", path, cwd=tmp_path).succeeds())
     assert facts["kind"] == "mcap"
     assert facts["session"] is None
@@ -78,7 +72,7 @@ def test_info_of_a_foreign_file_shows_channels(tmp_path: Path) -> None:
 
 
 def test_info_of_an_unreadable_log_gives_reasons(tmp_path: Path) -> None:
-    path = write_log(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
+    path = write_log(tmp_path, edit_log_bytes(WHOLE, scenario=lambda _: "not toml ["))
     text = trilat("log", "info", path, cwd=tmp_path).succeeds()
     assert "cannot be opened" in text
     assert "is not TOML" in text
@@ -91,7 +85,7 @@ def test_a_sound_log_passes_every_check(tmp_path: Path) -> None:
 
 
 def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
-    path = write_log(tmp_path, edited(WHOLE, record=without("s", {7, 8, 9, 40})))
+    path = write_log(tmp_path, edit_log_bytes(WHOLE, record=drop_records("s", {7, 8, 9, 40})))
     done = trilat("log", "check", path, cwd=tmp_path)
     assert done.code == 1
     assert "FAIL sequence" in done.out
@@ -106,7 +100,7 @@ def test_a_log_that_lacks_records_fails(tmp_path: Path) -> None:
 
 
 def test_foreign_mcap_files_are_checked_for_structure(tmp_path: Path) -> None:
-    done = trilat("log", "check", write_log(tmp_path, foreign()), cwd=tmp_path)
+    done = trilat("log", "check", write_log(tmp_path, make_foreign_bytes()), cwd=tmp_path)
     assert done.code == 0
     assert len(done.out.splitlines()) == 4
     assert "not a trilat-net log" in done.err
@@ -121,7 +115,7 @@ def test_a_foreign_file_fails_the_check(tmp_path: Path) -> None:
     "command", [["log", "info"], ["log", "check"], ["verify"]], ids=" ".join
 )
 def test_every_command_names_the_repair(command: list[str], tmp_path: Path) -> None:
-    data = edited(WHOLE, chunk_bytes=4096)
+    data = edit_log_bytes(WHOLE, chunk_bytes=4096)
     path = write_log(tmp_path, data[: len(data) // 2], "run.mcap.active")
     done = trilat(*command, path, cwd=tmp_path)
     notes = [line for line in done.err.splitlines() if line.startswith("note: ")]
@@ -131,7 +125,7 @@ def test_every_command_names_the_repair(command: list[str], tmp_path: Path) -> N
 
 def test_verify_names_every_gap_and_continues(tmp_path: Path) -> None:
     lost = {3 * n for n in range(10, 30)}
-    path = write_log(tmp_path, edited(WHOLE, record=without("m2", lost)))
+    path = write_log(tmp_path, edit_log_bytes(WHOLE, record=drop_records("m2", lost)))
     done = trilat("verify", path, cwd=tmp_path)
     assert done.code == 1, done  # nothing differs, and too much is missing
     assert f"m2 {', '.join(map(str, sorted(lost)))}" in done.out
@@ -150,7 +144,9 @@ def test_file_contents_reach_terminals_only_escaped(tmp_path: Path) -> None:
     """An escape sequence in a name could clear the screen, or write text that was never there."""
     assert sanitize("\x1b[2Jred\r\n") == "\ufffd[2Jred\ufffd\ufffd"
     assert len(sanitize("x" * 10_000)) < 400
-    path = write_log(tmp_path, edited(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"}))
+    path = write_log(
+        tmp_path, edit_log_bytes(WHOLE, session={"platform": "\x1b[2J\x1b]0;owned\x07"})
+    )
     done = trilat("log", "info", path, cwd=tmp_path)
     assert "\x1b" not in done.out + done.err
     assert "\x07" not in done.out + done.err
@@ -204,7 +200,7 @@ def without_ends(payload: bytes) -> bytes:
 
 
 def test_an_unknown_end_is_reported_everywhere(tmp_path: Path) -> None:
-    write_log(tmp_path, edited(WHOLE, event=without_ends))
+    write_log(tmp_path, edit_log_bytes(WHOLE, event=without_ends))
     sentence = "the end of m1, m2 and s is unknown"
     for command in (["log", "info"], ["log", "check"], ["verify"]):
         done = trilat(*command, "run.mcap", cwd=tmp_path)

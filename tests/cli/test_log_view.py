@@ -23,7 +23,7 @@ def test_a_simulation_has_views_at_the_asked_rate(
 
 @pytest.mark.long
 def test_views_can_be_kept(log_file: Path, tmp_path: Path) -> None:
-    """Also from a log without views."""
+    """Views are kept also if the log itself has none."""
     text = trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).succeeds()
     assert "run.rrd: open it with: rerun run.rrd" in text
     assert (tmp_path / "run.rrd").read_bytes().startswith(b"RRF2")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from tests.log_editing import edited
+from tests.log.builders import edit_log_bytes
 from trilat_net.log.log_reader import open_log
 
 from .running import trilat
@@ -67,7 +67,7 @@ def test_verify_names_the_first_different_record(log_file: Path, short_log: byte
             r["tau"][0] = math.nextafter(r["tau"][0], math.inf)
         return r
 
-    log_file.write_bytes(edited(short_log, record=record))
+    log_file.write_bytes(edit_log_bytes(short_log, record=record))
     done = trilat("verify", log_file, cwd=log_file.parent)
     assert done.code == 1, done
     assert "1499/1500 records identical" in done.err
@@ -81,7 +81,7 @@ def test_verify_notices_another_gain(log_file: Path, short_log: bytes) -> None:
         assert "Kd = [3.0, 3.0]" in text
         return text.replace("Kd = [3.0, 3.0]", "Kd = [3.5, 3.0]", 1)
 
-    log_file.write_bytes(edited(short_log, scenario=gain))
+    log_file.write_bytes(edit_log_bytes(short_log, scenario=gain))
     done = trilat("verify", log_file, cwd=log_file.parent)
     assert done.code == 1, done
     assert "tau" in done.err

@@ -3,11 +3,13 @@
 import json
 from pathlib import Path
 
-from .running import simulated, trilat
+from tests.cli.running import simulate_by_command
+
+from .running import trilat
 
 
 def test_sites_links_and_walls_are_columns(tmp_path: Path) -> None:
-    file = simulated(tmp_path, "contact", "rate_hz=200", seconds="4")
+    file = simulate_by_command(tmp_path, "contact", "rate_hz=200", seconds="4")
     output = trilat("metrics", file, "--all", cwd=tmp_path).succeeds()
     lines = output.splitlines()
     heads = [line.split() for line in lines]
@@ -21,7 +23,7 @@ def test_sites_links_and_walls_are_columns(tmp_path: Path) -> None:
 
 
 def test_json_is_for_programs(tmp_path: Path) -> None:
-    file = simulated(tmp_path, "free", "rate_hz=100")
+    file = simulate_by_command(tmp_path, "free", "rate_hz=100")
     facts = json.loads(trilat("metrics", "--json", file, cwd=tmp_path).succeeds())
     assert facts["version"] == 1
     assert facts["scenario"] == "free"
@@ -30,7 +32,7 @@ def test_json_is_for_programs(tmp_path: Path) -> None:
 
 
 def test_felt_torques_are_reported(tmp_path: Path) -> None:
-    file = simulated(tmp_path, "force_sharing", "rate_hz=100", seconds="15")
+    file = simulate_by_command(tmp_path, "force_sharing", "rate_hz=100", seconds="15")
     output = trilat("metrics", file, "--all", cwd=tmp_path).succeeds()
     (line,) = (line for line in output.splitlines() if line.startswith("14.0 - 15.0 s"))
     assert line.split()[4:9] == ["1", "s", "5", "m1", "4.792"]

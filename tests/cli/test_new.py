@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.cli.running import started, trilat
+from tests.cli.running import start_command, trilat
 
 
 def test_the_skeleton_is_a_law_and_replaces_nothing(
@@ -41,7 +41,7 @@ def test_laws_compiled_anew_need_no_notice(tmp_path: Path) -> None:
     trilat("new", "law", "swift.py", cwd=tmp_path)
     arguments = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
     trilat(*arguments, "-o", "first.mcap", cwd=tmp_path).succeeds()
-    run = started(*arguments, "-o", "second.mcap", cwd=tmp_path)
+    run = start_command(*arguments, "-o", "second.mcap", cwd=tmp_path)
     out, err = run.communicate()
     assert "second.mcap" in out
     assert "compiling" not in err

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.dropped_files import look, put_beside
+from tests.dropped_files import put_beside, run_in_folder
 
 STUDY = '''
 """How far the slave lags for each seed, kept in a journal."""
@@ -73,7 +73,7 @@ print(json.dumps({
 
 def test_an_added_file_is_command_and_study(tmp_path: Path) -> None:
     put_beside(tmp_path, "app/cli", "lag.py", STUDY)
-    output = look(LOOK, tmp_path)
+    output = run_in_folder(LOOK, tmp_path)
     assert "Measures how far the slave lags, seed by seed." in output["listed"]
     assert "lag" in output["listed"].partition("─ Make your own ─")[2]
     assert "Example: trilat lag paper --seeds 3" in output["help"]

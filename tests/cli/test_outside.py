@@ -10,7 +10,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
-from tests.execution.logs import external_log
+from tests.execution.builders import make_external_arm_bytes
 from trilat_net.log.log_reader import open_log
 
 LAWS = Path(__file__).parents[1] / "laws.py"
@@ -21,17 +21,17 @@ FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.
 SHORT = ("--duration", "0.1")
 
 
-def block(language: str) -> str:
+def find_block(language: str) -> str:
     match = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
     assert match is not None
     return match[1]
 
 
 def test_the_page_works_as_written(tmp_path: Path) -> None:
-    code = block("python")
+    code = find_block("python")
     assert len([line for line in code.splitlines() if line]) <= 30
     (tmp_path / "mylaws.py").write_text(code)
-    commands = [shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()]
+    commands = [shlex.split(line, comments=True)[1:] for line in find_block("sh").splitlines()]
     sim, certify, report, verify, demo = commands
     for arguments in (certify, report):
         assert arguments[arguments.index("--law") + 1] == "mylaws.py"
@@ -56,7 +56,7 @@ def test_the_documented_law_holds_arms_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "holding_laws.py").write_text(block("python"))
+    (tmp_path / "holding_laws.py").write_text(find_block("python"))
     log = tn.simulate("paper", {"control.law": "holding_laws:Spring", "control.K": 80})
     assert tn.certify(log).stability == "open", "the law's code may not run"
     errors = np.abs(np.stack([log[name].e for name in log.scenario.names]))
@@ -72,9 +72,9 @@ def test_the_documented_law_holds_arms_together(
 
 @pytest.mark.long
 def test_the_documented_certificate_is_printed(tmp_path: Path) -> None:
-    (tmp_path / "mylaws.py").write_text(block("python"))
+    (tmp_path / "mylaws.py").write_text(find_block("python"))
     sim, certify, *_ = (
-        shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()
+        shlex.split(line, comments=True)[1:] for line in find_block("sh").splitlines()
     )
     trilat(*sim, cwd=tmp_path).succeeds()
     done = trilat(*certify, cwd=tmp_path)
@@ -83,7 +83,7 @@ def test_the_documented_certificate_is_printed(tmp_path: Path) -> None:
         trilat(*[w for w in certify if w not in ("--accept", "settled")], cwd=tmp_path).code
         == 1
     )
-    assert done.out.startswith(block("text"))
+    assert done.out.startswith(find_block("text"))
 
 
 def read_input_table() -> list[tuple[str, str, str]]:
@@ -247,7 +247,7 @@ def test_failing_laws_in_reruns_are_one_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
 def test_external_arms_cannot_be_executed_again(how: list[str], tmp_path: Path) -> None:
-    (tmp_path / "outside.mcap").write_bytes(external_log())
+    (tmp_path / "outside.mcap").write_bytes(make_external_arm_bytes())
     trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses(
         "sites.s.plant", "as in --replace m"
     )

@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
+from study_builders import SHORT
 
 from .running import shorten, trilat
 
@@ -58,8 +58,8 @@ CONTINUED = [
 """Commands without --force: most continue what is in their folder."""
 QUICK = ("sim", "scenario", "new", "rerun", "trace")
 CASES = [
-    *([*words, "--force"] for words in FORCED),
-    *([*words, "--force"] for words in SLOW),
+    *([*command, "--force"] for command in FORCED),
+    *([*command, "--force"] for command in SLOW),
     *CONTINUED,
 ]
 
@@ -89,16 +89,19 @@ def list_content(folder: Path) -> dict[Path, bytes | None]:
     "arguments",
     [
         pytest.param(
-            words, id=" ".join(words[:6]), marks=[] if words[0] in QUICK else [pytest.mark.long]
+            command,
+            id=" ".join(command[:6]),
+            marks=[] if command[0] in QUICK else [pytest.mark.long],
         )
-        for words in CASES
+        for command in CASES
     ],
 )
 def test_planted_links_redirect_no_command(
     arguments: list[str], inputs: Path, tmp_path: Path
 ) -> None:
     """Runs the command, puts links in place of each of its outputs, and runs it again."""
-    work, victim = tmp_path / "work", tmp_path / "victim"
+    work = tmp_path / "work"
+    victim = tmp_path / "victim"
     shutil.copytree(inputs, work)
     if arguments[0] == "experiment" and arguments[1] != "new":
         trilat("experiment", "new", "reaching.toml", cwd=work).succeeds()
@@ -123,10 +126,12 @@ def test_planted_links_redirect_no_command(
         assert "Traceback" not in done.err, output
         assert (victim / "thesis.tex").read_text() == "years", output
         # people link such folders to larger disks
-        own = is_folder and str(output) in (
+        replaces_folder = is_folder and str(output) in (
             *arguments,
             "runs",
         )
-        assert own or [path.name for path in victim.iterdir()] == ["thesis.tex"], output
+        assert replaces_folder or [path.name for path in victim.iterdir()] == ["thesis.tex"], (
+            output
+        )
         shutil.rmtree(again)
         shutil.rmtree(victim)

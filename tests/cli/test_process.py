@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas
 import pytest
 
+from tests.cli.running import start_command
 from tests.net.waiting import until
 from tests.other_systems import prepare_process, replace_os
 from trilat_net import __main__
@@ -20,12 +21,12 @@ from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario.scenario_reader import read_template
 
-from .running import PLAIN, started, trilat
+from .running import PLAIN, trilat
 
 
 @pytest.mark.parametrize("command", [["scenario", "show", "paper"], ["sim", "--help"]])
 def test_a_closed_pipe_is_no_error(command: list[str], tmp_path: Path) -> None:
-    process = started(*command, cwd=tmp_path)
+    process = start_command(*command, cwd=tmp_path)
     assert process.stdout is not None
     process.stdout.close()
     _, err = process.communicate(timeout=60)
@@ -33,7 +34,9 @@ def test_a_closed_pipe_is_no_error(command: list[str], tmp_path: Path) -> None:
 
 
 def test_ctrl_c_while_computing_exits_130_quietly(tmp_path: Path) -> None:
-    process = started("sim", "paper", "--duration", "2000", "-o", "long.mcap", cwd=tmp_path)
+    process = start_command(
+        "sim", "paper", "--duration", "2000", "-o", "long.mcap", cwd=tmp_path
+    )
     path = tmp_path / "long.mcap.active"
     until(lambda: path.exists() and path.stat().st_size > 100_000, timeout_s=60)
     process.send_signal(signal.SIGINT)
@@ -105,7 +108,7 @@ assert not imported & {{"zenoh", "sites", "recorder", "live"}}, imported
 """
 
 
-def elsewhere(folder: Path, *commands: str) -> str:
+def run_commands_elsewhere(folder: Path, *commands: str) -> str:
     """Runs commands with only those modules that every system has; returns their output as UTF-8."""
     program = PROGRAM.format(commands=[command.split() for command in commands])
     env = {**PLAIN, **prepare_process(folder / "start")}
@@ -120,7 +123,7 @@ def test_logs_and_studies_need_only_portable_modules(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(
         read_template().replace('title = "', 'title = "θ → 0: '), "utf-8"
     )
-    printed = elsewhere(
+    printed = run_commands_elsewhere(
         tmp_path,
         "scenario show mine.toml",
         "sim free --duration 2 -o run.mcap",

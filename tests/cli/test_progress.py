@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from tests.cli.running import simulate_by_command
 from trilat_net.presentation import terminal_output
 
-from .running import simulated, trilat
+from .running import trilat
 
 
-def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.StringIO:
+def make_terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.StringIO:
     stream = io.StringIO()
     console = Console(
         file=stream, force_terminal=interactive, force_interactive=interactive, width=80
@@ -25,7 +26,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.String
     return stream
 
 
-def work() -> None:
+def show_progress() -> None:
     with terminal_output.progress_bar("reading run.mcap") as bar:
         for done in range(0, 101, 20):
             bar(done, 100)
@@ -35,17 +36,17 @@ def work() -> None:
 def test_no_bar_off_a_terminal_or_at_once(
     interactive: bool, patience_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stream = terminal(monkeypatch, interactive=interactive)
+    stream = make_terminal(monkeypatch, interactive=interactive)
     monkeypatch.setattr(terminal_output, "PATIENCE_S", patience_s)
     monkeypatch.setattr(terminal_output, "LINES_AFTER_S", patience_s)
-    work()
+    show_progress()
     assert stream.getvalue() == ""
 
 
 def test_lines_off_terminals_tell_work_and_progress(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    stream = terminal(monkeypatch, interactive=False)
+    stream = make_terminal(monkeypatch, interactive=False)
     monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.0)
     monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
     with terminal_output.progress_bar("judging run.mcap") as bar:
@@ -62,7 +63,7 @@ def test_lines_off_terminals_tell_work_and_progress(
 
 
 def test_progress_lines_end_with_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = terminal(monkeypatch, interactive=False)
+    stream = make_terminal(monkeypatch, interactive=False)
     monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.01)
     monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
     before = threading.active_count()
@@ -87,7 +88,7 @@ WORKING = [
 def test_progress_off_terminals_goes_to_stderr(
     arguments: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulated(tmp_path, "paper", seconds="0.2")
+    simulate_by_command(tmp_path, "paper", seconds="0.2")
 
     @contextmanager
     def announce(label: str) -> Iterator[Callable[[int, int], None]]:
@@ -101,10 +102,10 @@ def test_progress_off_terminals_goes_to_stderr(
 
 
 def test_long_work_has_a_bar_that_disappears(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = terminal(monkeypatch, interactive=True)
+    stream = make_terminal(monkeypatch, interactive=True)
     monkeypatch.setattr(terminal_output, "PATIENCE_S", -1.0)
     monkeypatch.setattr(terminal_output, "_REDRAW_PERIOD_S", -1.0)
-    work()
+    show_progress()
     text = stream.getvalue()
     assert "reading run.mcap" in text
     assert "100%" in text

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import trilat_net
-from tests.log_editing import edited
+from tests.log.builders import edit_log_bytes
 from trilat_net.log.log_reader import open_log
 
 from .running import trilat
@@ -102,7 +102,7 @@ def test_a_log_differing_from_its_records_fails(log_file: Path, short_log: bytes
             r["tau"] = [1.0, 2.0]
         return r
 
-    log_file.write_bytes(edited(short_log, record=record))
+    log_file.write_bytes(edit_log_bytes(short_log, record=record))
     done = trilat("rerun", log_file, "--replace", "s", cwd=log_file.parent)
     assert done.code == 1, done
     assert "tick 300" in done.out

@@ -53,16 +53,17 @@ def test_set_durations_win_over_the_default() -> None:
 
 def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
     text = trilat(
-        *(
-            "scenario",
-            "show",
-            "paper",
-            "--set",
-            "control.Kd=5",
-            "--set",
-            "links.m1->s.delay_ms=7",
-        ),
-        *("--duration", "3", "--seed", "9"),
+        "scenario",
+        "show",
+        "paper",
+        "--set",
+        "control.Kd=5",
+        "--set",
+        "links.m1->s.delay_ms=7",
+        "--duration",
+        "3",
+        "--seed",
+        "9",
         cwd=tmp_path,
     ).succeeds()
     tables = tomllib.loads(text)

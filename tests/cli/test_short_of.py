@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.running import COMMAND, PLAIN, trilat
+from tests.log.builders import write_log
 from trilat_net.core.step.jit import COMPILING
 from trilat_net.signals import ENDING_SIGNALS, Interrupt, end_process_at_signals
 
@@ -23,7 +24,7 @@ WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE
 """Of short files Python would keep modules that are cut off."""
 
 
-def limited(
+def run_limited(
     kind: int, most: int, *arguments: str | Path, cwd: Path
 ) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
@@ -39,10 +40,10 @@ def limited(
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "form", ["pdf", *(pytest.param(one, marks=pytest.mark.long) for one in ("svg", "png"))]
+    "form", ["pdf", *(pytest.param(form, marks=pytest.mark.long) for form in ("svg", "png"))]
 )
 def test_figures_refused_by_disk_leave_no_file(form: str, tmp_path: Path) -> None:
-    done = limited(
+    done = run_limited(
         resource.RLIMIT_FSIZE,
         1000,
         "figure",
@@ -62,7 +63,7 @@ def test_figures_refused_by_disk_leave_no_file(form: str, tmp_path: Path) -> Non
 
 
 def test_keys_refused_by_disk_leave_no_file(tmp_path: Path) -> None:
-    done = limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
+    done = run_limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
     assert done.returncode == 5
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: k: cannot be written: File too large; nothing is left of it")
@@ -76,7 +77,7 @@ def test_too_little_memory_is_one_line(
     mib: int, arguments: Sequence[str], tmp_path: Path
 ) -> None:
     """With `ulimit -v` libraries cannot be loaded, or retry for ever."""
-    done = limited(resource.RLIMIT_AS, mib << 20, *arguments, LOG, cwd=tmp_path)
+    done = run_limited(resource.RLIMIT_AS, mib << 20, *arguments, LOG, cwd=tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "error: there is too little memory" in done.stderr
@@ -85,12 +86,12 @@ def test_too_little_memory_is_one_line(
 @pytest.mark.long
 def test_without_docstrings_commands_work_but_have_no_help(tmp_path: Path) -> None:
     program = [sys.executable, "-OO", "-m", "trilat_net"]
-    for words, said in (
+    for arguments, said in (
         (["keys", "new", "--help"], "left out by python -OO"),
         (["keys", "new", "k", "m"], "k/m"),
     ):
         done = subprocess.run(
-            [*program, *words],
+            [*program, *arguments],
             cwd=tmp_path,
             env=PLAIN,
             capture_output=True,
@@ -103,7 +104,7 @@ def test_without_docstrings_commands_work_but_have_no_help(tmp_path: Path) -> No
 
 def test_recovering_blames_the_unwritable_file(tmp_path: Path) -> None:
     """An earlier recovery left a file there that cannot be removed; the source can be read."""
-    (tmp_path / "run.mcap.active").write_bytes(LOG.read_bytes())
+    write_log(tmp_path, LOG.read_bytes(), "run.mcap.active")
     (tmp_path / "run.mcap.recovering").mkdir()
     trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses(
         "run.mcap.recovering: cannot be written"
@@ -186,9 +187,10 @@ main()
     "seed", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in range(2, 16))]
 )
 def test_signals_end_cold_starts_in_every_phase(seed: int, tmp_path: Path) -> None:
-    """While importing, reading, compiling or caching, whatever Python makes of the signal there."""
+    """The signal arrives during imports, reading, compilation or caching."""
     draw = random.Random(seed)
-    number, instant_s = draw.choice(ENDING_SIGNALS), draw.uniform(0.2, 8.0)
+    number = draw.choice(ENDING_SIGNALS)
+    instant_s = draw.uniform(0.2, 8.0)
     arguments = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
     command = [
         sys.executable,
@@ -213,7 +215,8 @@ def test_signals_end_a_containers_compiling_process(tmp_path: Path) -> None:
         or subprocess.run([*first, "true"], capture_output=True).returncode
     ):
         pytest.skip("no process can be the first of a namespace here")
-    instant_s, number = "4.0", signal.SIGTERM
+    instant_s = "4.0"
+    number = signal.SIGTERM
     command = [*first, sys.executable, "-c", AT_AN_INSTANT, instant_s, str(int(number))]
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(

@@ -10,9 +10,9 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.log.dealt import split
-from tests.log_editing import edited, recorded
-from tests.log_surgery import repacked, taken_apart
+from tests.log.builders import edit_log_bytes, make_log_bytes, write_log
+from tests.log.split_logs import write_late_parts
+from tests.log.surgery import repack_message, take_apart
 from trilat_net.log.log_reader import open_log
 from trilat_net.presentation import page
 from trilat_net.presentation.conclusion import conclude
@@ -26,18 +26,19 @@ ROWS = {row["state"]: row for row in csv.DictReader(TABLE.splitlines())}
 COMMANDS = ("log check", "verify", "certify", "report", "log recover")
 
 
-def whole() -> bytes:
-    return recorded("free", RUN)
+def make_whole_bytes() -> bytes:
+    return make_log_bytes("free", RUN)
 
 
-def torn() -> bytes:
-    return whole()[: len(whole()) * 2 // 3]
+def make_torn_bytes() -> bytes:
+    return make_whole_bytes()[: len(make_whole_bytes()) * 2 // 3]
 
 
-def sparse() -> bytes:
+def make_sparse_bytes() -> bytes:
     """Returns a log of an older recorder that missed every tenth record of m1, and says so."""
-    taken = taken_apart(whole()).without_chain()
-    topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
+    taken = take_apart(make_whole_bytes()).without_chain()
+    topics = taken.topics()
+    accounts = taken.metadata("trilat.accounts")
     taken.messages = [
         m
         for m in taken.messages
@@ -50,54 +51,65 @@ def sparse() -> bytes:
     return taken.bytes()
 
 
-def spliced() -> bytes:
+def make_spliced_bytes() -> bytes:
     """Returns two runs over a gap, under the starts of the first."""
-    first = taken_apart(whole()).without_chain()
-    other = taken_apart(recorded("free", {**RUN, "control.Kd": 3.5}))
+    first = take_apart(make_whole_bytes()).without_chain()
+    other = take_apart(make_log_bytes("free", {**RUN, "control.Kd": 3.5}))
     topics = first.topics()
     boots = {m.channel: m for m in first.messages if topics[m.channel].endswith("/state")}
     first.messages = [m for m in first.messages if m.channel not in boots or m.sequence < 1500]
     for message in other.messages:
         if message.channel in boots and message.sequence >= 1502:
             boot = msgpack.unpackb(boots[message.channel].payload)["boot"]
-            first.messages.append(repacked(message, boot=boot))
+            first.messages.append(repack_message(message, boot=boot))
     return first.bytes()
 
 
-def older() -> bytes:
-    return edited(whole())
+def make_older_bytes() -> bytes:
+    return edit_log_bytes(make_whole_bytes())
 
 
-def forged() -> bytes:
+def make_forged_bytes() -> bytes:
     """Returns a log in which the torque of m1 and m2 is zeroed, and the metadata claim that
     only s was executed.
     """
     claims = {"driver": "rerun", "rerun_executed": "s"}
     zeroed = {"tau": [0.0, 0.0]}
-    return edited(
-        whole(), record=lambda r: r if r["site"] == "s" else {**r, **zeroed}, session=claims
+    return edit_log_bytes(
+        make_whole_bytes(),
+        record=lambda r: r if r["site"] == "s" else {**r, **zeroed},
+        session=claims,
     )
 
 
-def changed() -> bytes:
-    pieces = taken_apart(whole())
+def make_changed_bytes() -> bytes:
+    pieces = take_apart(make_whole_bytes())
     pieces.metadata("trilat.session")["commit"] = "0" * 40
     return pieces.bytes()
 
 
-def newer() -> bytes:
-    return edited(whole(), record=lambda r: {**r, "v": 9}, session={"schema_version": "9"})
+def make_newer_bytes() -> bytes:
+    return edit_log_bytes(
+        make_whole_bytes(), record=lambda r: {**r, "v": 9}, session={"schema_version": "9"}
+    )
 
 
-MADE: dict[str, Callable[[], bytes]] = {
-    one.__name__: cache(one)
-    for one in (whole, torn, sparse, spliced, older, forged, changed, newer)
+STATES: dict[str, Callable[[], bytes]] = {
+    "whole": make_whole_bytes,
+    "torn": cache(make_torn_bytes),
+    "sparse": cache(make_sparse_bytes),
+    "spliced": cache(make_spliced_bytes),
+    "older": cache(make_older_bytes),
+    "forged": cache(make_forged_bytes),
+    "changed": cache(make_changed_bytes),
+    "newer": cache(make_newer_bytes),
 }
+"""The makers of logs, by the state that the table names."""
 
 
 def table_cells() -> Iterator[Any]:
     """Yields every cell; on a push some states are skipped, and only a torn log gets a report."""
-    for state, command in product([*MADE, "part"], COMMANDS):
+    for state, command in product([*STATES, "part"], COMMANDS):
         slow = state in ("older", "changed", "part") or (
             command == "report" and state != "torn"
         )
@@ -109,16 +121,16 @@ def test_the_table_has_the_printed_messages(state: str, command: str, tmp_path: 
     code, _, text = ROWS[state][command].partition(": ")
     file = tmp_path / "run.mcap"
     if state == "part":
-        file = split(tmp_path, refilled=range(0))[1]
+        file = write_late_parts(tmp_path, refilled=range(0))[1]
     else:
-        file.write_bytes(MADE[state]())
+        file.write_bytes(STATES[state]())
     done = trilat(*command.split(), file, cwd=tmp_path)
     assert done.code == int(code), done
     assert text.strip("`") in (done.out + done.err).replace("\n", " "), done
 
 
 def test_the_table_has_every_state() -> None:
-    assert ROWS.keys() == {*MADE, "part"}
+    assert ROWS.keys() == {*STATES, "part"}
 
 
 @pytest.mark.long
@@ -127,8 +139,7 @@ def test_reports_use_the_requested_coverage(
 ) -> None:
     """Nine tenths of the records of m1 exist: enough if half is requested."""
     monkeypatch.setattr(page, "write_report", lambda *_, verdicts, **__: [*verdicts][:0])
-    file = tmp_path / "run.mcap"
-    file.write_bytes(MADE["sparse"]())
+    file = write_log(tmp_path, STATES["sparse"]())
     conclusion = conclude(open_log(file), tmp_path, min_coverage=0.5)
     assert {line.check: line.passed for line in conclusion.findings}["records"]
     assert not any("less than 99.9 %" in note for note in conclusion.notes)

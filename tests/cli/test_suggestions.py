@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.cli.running import build_command
 from trilat_net.app.cli import _SUBJECTS, _SYNONYMS
 from trilat_net.app.cli.options import find_split_setting
 from trilat_net.errors import find_nearest, suggest_nearest
 
-from .running import trilat, whole_command
+from .running import trilat
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,7 +46,7 @@ def test_an_unknown_command_suggests_one(
 def test_subjects_without_command_lead_to_pages(tmp_path: Path) -> None:
     text = in_one_line(trilat("lerobot", cwd=tmp_path).err)
     assert "trilat log export FILE --to lerobot" in text
-    commands = whole_command().commands
+    commands = build_command().commands
     for subject, hint in _SUBJECTS.items():
         assert subject not in {*commands, *_SYNONYMS["trilat"]}
         pages = re.findall(r"\((docs/.+?)\)", hint)
@@ -59,7 +60,7 @@ def test_an_unrelated_word_lists_all_commands(tmp_path: Path) -> None:
 
 
 def test_every_synonym_leads_to_a_command() -> None:
-    root = whole_command()
+    root = build_command()
     for group, synonyms in _SYNONYMS.items():
         holder = root if group == "trilat" else root.commands[group]
         for word, suggested in synonyms.items():

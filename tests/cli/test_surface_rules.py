@@ -51,7 +51,7 @@ def test_the_version_is_that_of_the_package() -> None:
 
 
 @pytest.mark.parametrize(
-    ("phrase", "found"),
+    ("phrase", "completions"),
     [
         ("sim tw", {"two_people", "two_sites"}),
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
@@ -63,7 +63,7 @@ def test_the_version_is_that_of_the_package() -> None:
         pytest.param(f"twin {GOLDEN_LOG} --push m", {"m1", "m2"}, marks=pytest.mark.long),
     ],
 )
-def test_shells_complete_commands(phrase: str, found: set[str]) -> None:
+def test_shells_complete_commands(phrase: str, completions: set[str]) -> None:
     environment = {
         "_TRILAT_COMPLETE": "complete_fish",
         "_TYPER_COMPLETE_FISH_ACTION": "get-args",
@@ -75,7 +75,9 @@ def test_shells_complete_commands(phrase: str, found: set[str]) -> None:
         capture_output=True,
         text=True,
     )
-    assert {line.split("\t")[0] for line in done.stdout.splitlines()} == found, done.stderr
+    assert {line.split("\t")[0] for line in done.stdout.splitlines()} == completions, (
+        done.stderr
+    )
 
 
 @pytest.mark.long

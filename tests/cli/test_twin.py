@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 import trilat_net as tn
-from tests.cli.running import simulated, trilat
-from tests.execution.logs import without_records
+from tests.cli.running import simulate_by_command, trilat
+from tests.execution.builders import make_log_without
 from trilat_net.app.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
 from trilat_net.execution.fused import explain_not_repeatable
@@ -20,7 +20,7 @@ OWN_LAW = Path(__file__).parents[1] / "golden" / "own-law.mcap"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("twin")
-    simulated(folder, "two_sites", seconds="4")
+    simulate_by_command(folder, "two_sites", seconds="4")
     return folder
 
 
@@ -66,7 +66,7 @@ def test_sizes_are_separated_from_linear_growth(folder: Path) -> None:
 
 
 def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
-    other = tmp_path / simulated(tmp_path, "two_sites", "seed=2", seconds="1")
+    other = tmp_path / simulate_by_command(tmp_path, "two_sites", "seed=2", seconds="1")
     trilat("twin", "run.mcap", other, cwd=folder).refuses("not a part of the session")
 
 
@@ -77,7 +77,8 @@ def test_a_forbidden_law_has_no_twin(folder: Path) -> None:
 
 
 def test_unexecutable_logs_have_no_twin() -> None:
-    lost, log = without_records({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
+    lost = make_log_without({"m1": [7]})
+    log = tn.simulate("two_sites", duration_s=0.2)
     with pytest.raises(NotRepeatable, match="records of m1 are missing"):
         tn.twin(lost)
     with pytest.raises(

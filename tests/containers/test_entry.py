@@ -32,7 +32,7 @@ def user_map(folder: Path, text: str) -> Path:
     return path
 
 
-def owner(path: Path) -> object:
+def read_owner(path: Path) -> object:
     facts = path.lstat()
     return Owner(facts.st_uid, facts.st_gid)
 
@@ -64,7 +64,9 @@ def test_folders_made_by_the_engine_are_given_away(tmp_path: Path, exists: bool)
         results.mkdir()
         (results / "report.html").touch()
     entry.give_folder(results, SOMEBODY)
-    assert {owner(path) for path in (results.parent, results, *results.iterdir())} == {SOMEBODY}
+    assert {read_owner(path) for path in (results.parent, results, *results.iterdir())} == {
+        SOMEBODY
+    }
 
 
 @needs_root
@@ -72,27 +74,34 @@ def test_root_keeps_its_own_folder(tmp_path: Path) -> None:
     results = tmp_path / "runs" / "compose"
     results.parent.mkdir()
     entry.give_folder(results, Owner(entry.SERVANT, entry.SERVANT))
-    assert owner(results.parent) == Owner(0, 0)
-    assert owner(results) == Owner(entry.SERVANT, entry.SERVANT)
+    assert read_owner(results.parent) == Owner(0, 0)
+    assert read_owner(results) == Owner(entry.SERVANT, entry.SERVANT)
 
 
 @needs_root
 def test_nobody_loses_ownership(tmp_path: Path) -> None:
-    """Neither of a folder nor of its contents; and a link itself is given, not its target."""
-    theirs, results = tmp_path / "theirs", tmp_path / "runs" / "compose"
+    """A folder and its contents keep their owners, and a link is changed instead of its target."""
+    theirs = tmp_path / "theirs"
+    results = tmp_path / "runs" / "compose"
     results.mkdir(parents=True)
-    secret, link, kept = tmp_path / "secret", results / "link", results / "kept"
+    secret = tmp_path / "secret"
+    link = results / "link"
+    kept = results / "kept"
     secret.touch()
     kept.touch()
     link.symlink_to(secret)
     os.chown(kept, 99, 99)
     entry.give_folder(results, SOMEBODY)
-    assert (owner(secret), owner(kept), owner(link)) == (Owner(0, 0), Owner(99, 99), SOMEBODY)
+    assert (read_owner(secret), read_owner(kept), read_owner(link)) == (
+        Owner(0, 0),
+        Owner(99, 99),
+        SOMEBODY,
+    )
     theirs.mkdir()
     (theirs / "kept").touch()
     os.chown(theirs, 99, 99)
     entry.give_folder(theirs, SOMEBODY)
-    assert (owner(theirs), owner(theirs / "kept")) == (Owner(99, 99), Owner(0, 0))
+    assert (read_owner(theirs), read_owner(theirs / "kept")) == (Owner(99, 99), Owner(0, 0))
 
 
 def test_an_unwritable_folder_is_named_with_owner(
@@ -123,14 +132,15 @@ def test_a_missing_mark_is_reported(
 
 
 def test_missing_caches_fail_nothing_and_others_copy(tmp_path: Path) -> None:
-    held, own = tmp_path / "held", tmp_path / "own"
-    entry.copy_cache(held, own)
-    assert not own.exists()
+    held = tmp_path / "held"
+    private = tmp_path / "own"
+    entry.copy_cache(held, private)
+    assert not private.exists()
     (held / "deep").mkdir(parents=True)
     (held / "deep" / "code").write_bytes(b"compiled")
     for _ in range(2):  # a container that is started again has it already
-        entry.copy_cache(held, own)
-        assert (own / "deep" / "code").read_bytes() == b"compiled"
+        entry.copy_cache(held, private)
+        assert (private / "deep" / "code").read_bytes() == b"compiled"
 
 
 def test_the_entry_becomes_the_command(
@@ -138,7 +148,7 @@ def test_the_entry_becomes_the_command(
 ) -> None:
     became: list[Sequence[str]] = []
     monkeypatch.setattr(os, "getuid", lambda: 1234)
-    monkeypatch.setattr(os, "execvp", lambda _file, words: became.append(words))
+    monkeypatch.setattr(os, "execvp", lambda _file, arguments: became.append(arguments))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     results = tmp_path / "runs"
     entry.main(
@@ -186,7 +196,7 @@ def test_members_get_own_keys_and_authority_disappears(volumes: Path) -> None:
     hand_out(volumes, SOMEBODY)
     for name, whose in (("recorder", SOMEBODY), ("m1", Owner(entry.SITES, entry.SITES))):
         for file in ("members.json", "private.key"):
-            assert owner(volumes / name / file) == whose
+            assert read_owner(volumes / name / file) == whose
             assert (volumes / name / file).stat().st_mode & 0o777 == 0o600
             assert (
                 volumes / name / file

@@ -1,4 +1,4 @@
-"""A shipped scenario and working settings for each built-in law that is plugged in."""
+"""A shipped scenario and suitable settings for each built-in law that is a plug-in."""
 
 from typing import Any
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import trilat_net
-from tests.analysis.rough_arms import ROUGH, rough_urdf
+from tests.scenario.builders import rough_arm_text
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
@@ -24,7 +24,8 @@ from trilat_net.core.step.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
-RHO_NM, WIDTH_RAD_S = 3.0, 0.03
+RHO_NM = 3.0
+WIDTH_RAD_S = 0.03
 SHAKEN = """name = "shaken"
 duration_s = 20.0
 [link]
@@ -52,7 +53,7 @@ s = {{ m1 = 0.5, m2 = 0.5 }}
 ROBUST = f"rho_nm = {RHO_NM}\nwidth_rad_s = {WIDTH_RAD_S}"
 
 
-def run(law: str, more: str = "") -> Log:
+def simulate_law(law: str, more: str = "") -> Log:
     return trilat_net.simulate(parse_scenario(SHAKEN.format(law=law, more=more)))
 
 
@@ -94,15 +95,16 @@ def test_robust_dissipation_stays_bounded_unlike_the_box() -> None:
         robust_w = ROBUST_RESIDUE * float(balance.beta[0].sum()) * 2 * RHO_NM * WIDTH_RAD_S
         return robust_w + float(balance.V[0] - balance.V[-1]) / log.scenario.duration_s
 
-    robust, box = run("adaptive_robust", ROBUST), run("adaptive_box")
+    robust = simulate_law("adaptive_robust", ROBUST)
+    box = simulate_law("adaptive_box")
     assert mean_dissipation(robust, 1.0) <= bound(robust)
     assert mean_dissipation(box, 0.0) > bound(box)
 
 
 def test_energy_closes_with_unknown_friction() -> None:
     robust = 'law = "adaptive_robust"\nrho_nm = 1.5\nwidth_rad_s = 0.1\nfriction = 0.25'
-    text = ROUGH.replace('law = "adaptive"', robust)
-    log = trilat_net.simulate(parse_scenario(f"{text}{rough_urdf()}'''"))
+    text = rough_arm_text().replace('law = "adaptive"', robust)
+    log = trilat_net.simulate(parse_scenario(text))
     energies = compute_site_energies(log)
     balance = compute_energy_balance(energies)
     friction = sum(

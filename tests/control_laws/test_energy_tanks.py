@@ -5,18 +5,24 @@ energy of x: the level is 0.125 J for 0.1, filling 40 for 50. The laws that acco
 their observed energies under delays that vary; drivers agree; verify.
 """
 
-import io
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.energy_runs import JITTER, LAWS, MOBILE, draw_energy_run, least_energy, pair, ticked
-from tests.log_editing import opened
-from tests.unit_arm import H50, hand, unit_scenario
-from tests.virtual_runs import sampled, trajectories
+from tests.energy_runs import (
+    JITTER,
+    LAWS,
+    MOBILE,
+    draw_energy_run,
+    find_least_energy,
+    make_energy_pair,
+    sample_every_tick,
+)
+from tests.execution.builders import make_trajectories, sample_records
+from tests.log.builders import open_bytes, simulate_bytes
+from tests.unit_arm import H50, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.judge import list_law_proofs
-from trilat_net.execution import virtual
 from trilat_net.execution.verification import verify
 from trilat_net.scenario.describe import describe_law_conditions
 
@@ -25,31 +31,32 @@ TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40
 
 @pytest.mark.long
 def test_tanks_keep_a_diverging_layer_finite() -> None:
-    run = ticked(pair(TANKS, clamped=False, duration_s=30.0), every=2)
-    m, s = run["m"], run["s"]
+    run = sample_every_tick(make_energy_pair(TANKS, clamped=False, duration_s=30.0), every=2)
+    m = run["m"]
+    s = run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert max(m.to_all.H.max(), s.to_all.H.max()) / 1.25 == pytest.approx(0.230, abs=5e-4)
-    assert least_energy(run) >= -1e-15
+    assert find_least_energy(run) >= -1e-15
 
 
 def test_the_layer_alone_diverges() -> None:
-    none, gains = (
-        [0.0, 0.0],
-        {"level_J": 0.1, "fill_nm_s_rad_J": 50.0, "packet_1_s": 10.0, "by_shares": False},
-    )
+    none = [0.0, 0.0]
+    gains = {"level_J": 0.1, "fill_nm_s_rad_J": 50.0, "packet_1_s": 10.0, "by_shares": False}
     gains["acceleration_rad_s2"] = 100.0
     layer = {"K": [100.0, 100.0], "Kd": [2.0, 2.0], "d": none, "gravity": 1.0, "guarded": False}
     law = {"law": "trilat_net.laws.tanks:Tanks", **gains, **layer}
-    scenario = unit_scenario({"m": {"hands": [H50]}, "s": {}}, law, duration_s=11.5)
-    run = ticked(scenario, every=10)
-    assert least_energy(run) < -1.0  # what it would have taken from a tank
+    scenario = make_unit_scenario({"m": {"hands": [H50]}, "s": {}}, law, duration_s=11.5)
+    run = sample_every_tick(scenario, every=10)
+    assert find_least_energy(run) < -1.0  # what it would have taken from a tank
     speed = np.maximum(*(np.abs(run[name].qd[:, 0]) for name in "ms"))
     assert 0.01 * (1 + np.argmax(speed > 999.0)) == pytest.approx(11.4, abs=0.05)
 
 
 def test_contact_feels_like_the_layer() -> None:
-    m = ticked(pair(TANKS, clamped=True, duration_s=30.0), every=30000)["m"]
+    m = sample_every_tick(make_energy_pair(TANKS, clamped=True, duration_s=30.0), every=30000)[
+        "m"
+    ]
     assert abs(m.tau_x[-1, 0]) / m.q[-1, 0] == pytest.approx(90.909, abs=5e-4)
 
 
@@ -62,18 +69,18 @@ def test_no_shares_overdraw_the_tanks(by_shares: bool) -> None:
         "m2": {"m1": 0.0, "s": 1.0},
         "s": {"m1": 1.0, "m2": 0.0},
     }
-    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {}, "s": {}}
+    sites = {"m1": {"hands": [make_spring_hand(0.3)]}, "m2": {}, "s": {}}
     law = {**TANKS, "by_shares": by_shares}
     for link in ({"preset": "4g"}, JITTER):
-        scenario = unit_scenario(sites, law, duration_s=20.0, dominance=ring, link=link)
-        run = ticked(scenario, every=7)
-        assert least_energy(run) >= -1e-9
+        scenario = make_unit_scenario(sites, law, duration_s=20.0, dominance=ring, link=link)
+        run = sample_every_tick(scenario, every=7)
+        assert find_least_energy(run) >= -1e-9
         assert np.abs(run["s"].q[-1, 0] - 0.3) < 0.02
 
 
 def test_a_tank_sends_at_most_its_energy() -> None:
     lines = describe_law_conditions(
-        pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
+        make_energy_pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
     )
     assert "does not hold: a tank sends 2 of its energy a tick" in lines[0]
 
@@ -93,9 +100,11 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
     """Free and in contact, over a mobile network and over 0 to 400 ms with 10 % loss."""
     for link in (MOBILE, JITTER):
         for clamped in (False, True):
-            scenario = pair(LAWS[law], clamped=clamped, duration_s=12.0, link=link, seed=seed)
-            run = ticked(scenario, every=11)
-            assert least_energy(run) >= -1e-9
+            scenario = make_energy_pair(
+                LAWS[law], clamped=clamped, duration_s=12.0, link=link, seed=seed
+            )
+            run = sample_every_tick(scenario, every=11)
+            assert find_least_energy(run) >= -1e-9
             assert np.abs(run["s"].qd).max() < 5.0
 
 
@@ -107,31 +116,36 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
 )
 def test_drawn_runs_never_have_negative_energy(law: str, seeds: range) -> None:
     """Half lost, 4g, jitter; contact and pushes; ramps of dominance; drift compensation is on."""
-    least = {seed: least_energy(ticked(draw_energy_run(law, seed))) for seed in seeds}
+    least = {
+        seed: find_least_energy(sample_every_tick(draw_energy_run(law, seed))) for seed in seeds
+    }
     assert {seed: energy for seed, energy in least.items() if energy < -1e-9} == {}
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_compiled_and_stepped_runs_agree_and_verify(law: str) -> None:
-    scenario = pair(LAWS[law], clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0})
-    run, last = trajectories(scenario), sampled(scenario, (1.6,))[:, -1]
+    scenario = make_energy_pair(
+        LAWS[law], clamped=True, duration_s=1.6, link={**JITTER, "delay_ms": 200.0}
+    )
+    run = make_trajectories(scenario)
+    last = sample_records(scenario, (1.6,))[:, -1]
     for n, name in enumerate(scenario.names):
-        columns, site = scenario.layout(name).columns(), run.sites[name]
+        columns = scenario.layout(name).columns()
+        site = run.sites[name]
         assert np.abs(site.tau[-1]).max() > 0.0
         for field in ("q", "qd", "tau", "tau_x", "ch"):
             assert last[n, columns[field]].tolist() == getattr(site, field)[-1].tolist()
-    stream = io.BytesIO()
-    virtual.write_virtual_log(
-        pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE), stream
-    )
-    verdict = verify(opened(stream.getvalue()))
+    scenario = make_energy_pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE)
+    verdict = verify(open_bytes(simulate_bytes(scenario)))
     assert verdict.passed
     assert verdict.identical == verdict.records == 600
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_a_scenario_states_its_laws_premises(law: str) -> None:
-    (line, *_) = describe_law_conditions(pair(LAWS[law], clamped=False, duration_s=1.0))
+    (line, *_) = describe_law_conditions(
+        make_energy_pair(LAWS[law], clamped=False, duration_s=1.0)
+    )
     assert line.startswith(f"condition of {law} at m")
     assert "holds: motion stays bounded (decay is not proved)" in line
     assert "stable" not in line
@@ -140,4 +154,4 @@ def test_a_scenario_states_its_laws_premises(law: str) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_passivity_does_not_prove_decay(law: str) -> None:
-    assert list_law_proofs(pair(LAWS[law], clamped=False, duration_s=1.0)) == []
+    assert list_law_proofs(make_energy_pair(LAWS[law], clamped=False, duration_s=1.0)) == []

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.unit_arm import CLAMP, H50, hand, last_rows, unit_scenario
+from tests.unit_arm import CLAMP, H50, make_spring_hand, make_unit_scenario, read_last_rows
 from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.core.arms.elementary import tanh
 from trilat_net.errors import ScenarioError
@@ -20,18 +20,20 @@ SMITH = {"law": "smith", "K": 100.0, "d": 5.0}
 TRIO = ("m1", "m2", "s")
 
 
-def two(law: dict[str, Any], *, clamped: bool = False, **master: Any) -> Scenario:
+def make_pair_scenario(
+    law: dict[str, Any], *, clamped: bool = False, **master: Any
+) -> Scenario:
     sites = {"m": {"hands": [H50], **master}, "s": {"hands": [CLAMP] if clamped else []}}
-    return unit_scenario(sites, law, duration_s=30.0)
+    return make_unit_scenario(sites, law, duration_s=30.0)
 
 
-def three(
+def make_trio_scenario(
     law: dict[str, Any], slave: tuple[float, float], sites: dict[str, Any], **more: Any
 ) -> Scenario:
     """Two masters that follow the others by halves, and a slave that follows them by two shares."""
     halves = {"m1": {"m2": 0.5, "s": 0.5}, "m2": {"m1": 0.5, "s": 0.5}}
     shares = {**halves, "s": {"m1": slave[0], "m2": slave[1]}}
-    return unit_scenario(
+    return make_unit_scenario(
         {name: sites.get(name, {}) for name in TRIO},
         law,
         duration_s=40.0,
@@ -50,31 +52,34 @@ def test_the_tangent_is_that_of_the_mathematics_library() -> None:
 
 @pytest.mark.long
 def test_a_saturated_pull_ends_at_its_limit() -> None:
-    free = last_rows(two(SATURATED), 30.0)[0]
+    free = read_last_rows(make_pair_scenario(SATURATED), 30.0)[0]
     assert free["q"][:, 0] == pytest.approx(0.3, abs=1e-6)
-    clamped = last_rows(two(SATURATED, clamped=True), 30.0)[0]
+    clamped = read_last_rows(make_pair_scenario(SATURATED, clamped=True), 30.0)[0]
     assert clamped["q"][:, 0] == pytest.approx([0.20008, 0.0050], abs=5e-6)
     assert -clamped["tau_x"][0, 0] == pytest.approx(4.9959, abs=5e-5)
-    linear = last_rows(two(P_D, clamped=True), 30.0)[0]
+    linear = read_last_rows(make_pair_scenario(P_D, clamped=True), 30.0)[0]
     assert -linear["tau_x"][0, 0] == pytest.approx(9.677, abs=5e-4)
 
 
 def test_saturation_makes_the_weighted_mean_a_vote() -> None:
-    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}}
-    vote = last_rows(three(SATURATED, (0.9, 0.1), sites), 40.0)[0]
+    sites = {
+        "m1": {"hands": [make_spring_hand(0.3)]},
+        "m2": {"hands": [make_spring_hand(-0.3)]},
+    }
+    vote = read_last_rows(make_trio_scenario(SATURATED, (0.9, 0.1), sites), 40.0)[0]
     assert vote["q"][:, 0] == pytest.approx([0.2444, -0.2, 0.2389], abs=5e-5)
-    mean = last_rows(three(P_D, (0.9, 0.1), sites), 40.0)[0]
+    mean = read_last_rows(make_trio_scenario(P_D, (0.9, 0.1), sites), 40.0)[0]
     assert mean["q"][:, 0] == pytest.approx([0.135, -0.015, 0.120], abs=5e-4)
 
 
 def test_lee_and_spong_drag_common_motion() -> None:
     """The drag of both arms at one speed is 2 d + 2 K T = 4 K T at the bound."""
     law = {"law": "lee_spong", "K": 100.0, "Kd": 3.0, "T_max_ms": 200.0}
-    clamped = last_rows(two(law, clamped=True), 30.0)[0]
+    clamped = read_last_rows(make_pair_scenario(law, clamped=True), 30.0)[0]
     assert -clamped["tau_x"][0, 0] / clamped["q"][0, 0] == pytest.approx(90.909, abs=5e-4)
     push = {"kind": "recorded", "points": [[0.0, 0.8, 0.4], [100.0, 0.8, 0.4]]}
-    pushed = unit_scenario({"m": {"hands": [push]}, "s": {}}, law, duration_s=40.0)
-    assert 0.8 / last_rows(pushed, 40.0)[0]["qd"][:, 0] == pytest.approx(80.0, abs=0.05)
+    pushed = make_unit_scenario({"m": {"hands": [push]}, "s": {}}, law, duration_s=40.0)
+    assert 0.8 / read_last_rows(pushed, 40.0)[0]["qd"][:, 0] == pytest.approx(80.0, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -89,11 +94,11 @@ def test_lee_and_spong_drag_common_motion() -> None:
 def test_lee_and_spong_bound_holds_at_edge(
     scheme: str, more_ms: float, P_e: float, holds: bool
 ) -> None:
-    """As published, and with K h more for torques that are held."""
+    """The bound is the published one, and K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
     conditions = describe_law_conditions(
-        unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme)
+        make_unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme)
     )
     text = "4 (d1 - K1 h / 2) (d2" if scheme == "digital" else "4 d1 d2 >= (T1 + T2)^2 K1 K2"
     assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in conditions[0]
@@ -119,8 +124,8 @@ def test_users_share_authority_and_feel_no_environment() -> None:
     law = {"law": "authority", "K": 100.0, "d": 20.0}
     for wall, slave in (([], 0.15), ([CLAMP], 15.0 / 1100.0)):
         sites["s"] = {"control": {"leads": False}, "hands": wall}
-        scenario = three(law, (0.75, 0.25), sites, dominance=shares)
-        rest = last_rows(scenario, 40.0)[0]
+        scenario = make_trio_scenario(law, (0.75, 0.25), sites, dominance=shares)
+        rest = read_last_rows(scenario, 40.0)[0]
         assert rest["q"][:, 0] == pytest.approx([0.3, -0.3, slave], abs=1e-9)
         assert rest["tau_x"][:2, 0] == pytest.approx([-15.0, 45.0], abs=1e-4)
     text = " ".join(describe_law_conditions(scenario))
@@ -132,7 +137,7 @@ def test_users_share_authority_and_feel_no_environment() -> None:
 def test_a_single_user_closes_no_loop() -> None:
     law = {"law": "authority", "K": 100.0, "d": 20.0}
     followers = {name: {"control": {"leads": False}} for name in TRIO[1:]}
-    scenario = three(law, (0.75, 0.25), {TRIO[0]: {}, **followers})
+    scenario = make_trio_scenario(law, (0.75, 0.25), {TRIO[0]: {}, **followers})
     text = " ".join(describe_law_conditions(scenario))
     assert f"authority at {TRIO[0]} holds: nobody follows anybody" in text
 
@@ -142,12 +147,12 @@ def test_impedances_yield_as_configured() -> None:
     push = {"kind": "recorded", "points": [[0.0, 0.0, 0.0], [1.0, 3.0, 3.0], [100.0, 3.0, 3.0]]}
     law = {"law": "impedance", "K": 50.0}
     sites: dict[str, Any] = {"m1": {"hands": [push]}, "s": {"control": {"follows": True}}}
-    free = three(law, (0.75, 0.25), sites)
-    rest = last_rows(free, 40.0)[0]
+    free = make_trio_scenario(law, (0.75, 0.25), sites)
+    rest = read_last_rows(free, 40.0)[0]
     assert rest["q"][:, 0] == pytest.approx([0.06, 0.0, 0.045], abs=1e-9)
     assert "holds: the slave touches nothing" in describe_law_conditions(free)[0]
     sites["s"]["hands"] = [CLAMP]
-    held = last_rows(three(law, (0.75, 0.25), sites), 40.0)[0]
+    held = read_last_rows(make_trio_scenario(law, (0.75, 0.25), sites), 40.0)[0]
     f = held["tau_x"][2, 0]  # the force on the environment
     assert 50.0 * held["q"][:2, 0] == pytest.approx([3.0 - 0.75 * f, -0.25 * f], abs=1e-9)
 
@@ -158,12 +163,12 @@ SWINGING = {"M": 1.0, "B": 1.0, "K": 60.0, "slave": 160.0, "wall": 4.9427, "hand
 PULSE = {"kind": "pulse", "start_s": 0.5, "end_s": 0.8, "peak_nm": [1.0, 0.5]}
 
 
-def spring(stiffness: float) -> dict[str, Any]:
+def make_spring(stiffness: float) -> dict[str, Any]:
     """Returns a hand or a wall without damping at the start pose."""
     return {**CLAMP, "stiffness_nm_rad": stiffness}
 
 
-def impedances(
+def make_impedance_scenario(
     loop: dict[str, float],
     link: dict[str, Any],
     duration_s: float,
@@ -177,19 +182,19 @@ def impedances(
         "s": {"control": {**gains, "K": loop["slave"], "follows": True}, "hands": []},
     }
     if hand:
-        sites["m"]["hands"] = [PULSE, spring(hand)]
+        sites["m"]["hands"] = [PULSE, make_spring(hand)]
     if wall:
-        sites["s"]["hands"] = [spring(loop["wall"])]
-    return unit_scenario(sites, {"law": "impedance"}, link=link, duration_s=duration_s)
+        sites["s"]["hands"] = [make_spring(loop["wall"])]
+    return make_unit_scenario(sites, {"law": "impedance"}, link=link, duration_s=duration_s)
 
 
 def peak_motion(scenario: Scenario, first_s: float, last_s: float) -> float:
     """Returns the largest motion of the slave over a time, at steps of 20 ms."""
-    rows = last_rows(scenario, *np.arange(first_s, last_s, 0.02))
+    rows = read_last_rows(scenario, *np.arange(first_s, last_s, 0.02))
     return max(float(np.abs(row["q"][1]).max()) for row in rows)
 
 
-def constant(delay_ms: float) -> dict[str, Any]:
+def make_constant_link(delay_ms: float) -> dict[str, Any]:
     return {"model": "constant", "delay_ms": delay_ms}
 
 
@@ -254,8 +259,8 @@ def test_a_masters_spring_hand_voids_small_gain(name: str) -> None:
     root = rightmost_root(loop, delay_ms, 0.3 + 1j * np.sqrt((K + k) / M))
     assert root.real == pytest.approx(growth_per_s, abs=5e-3)
 
-    free = impedances(loop, constant(delay_ms), 12.0)
-    held = impedances(loop, constant(delay_ms), 12.0, hand=k)
+    free = make_impedance_scenario(loop, make_constant_link(delay_ms), 12.0)
+    held = make_impedance_scenario(loop, make_constant_link(delay_ms), 12.0, hand=k)
     assert peak_motion(free, 10.0, 12.0) < 0.1 * peak_motion(free, 1.0, 3.0)
     growth = np.log(peak_motion(held, 10.0, 12.0) / peak_motion(held, 6.0, 8.0)) / 4.0
     # The law holds its answer to the springs for a tick, which adds up to 6 % to the growth.
@@ -268,7 +273,7 @@ def test_the_condition_includes_the_masters_hands(name: str) -> None:
     loop, delay_ms, _ = HELD_LOOPS[name]
     for held, verdict in ((0.0, "holds"), (3.0, "holds"), (loop["hand"], "does not hold")):
         condition = describe_law_conditions(
-            impedances(loop, constant(delay_ms), 12.0, hand=held)
+            make_impedance_scenario(loop, make_constant_link(delay_ms), 12.0, hand=held)
         )[0]
         # the hand may let go
         gain = max(largest_loop_gain(loop, 0.0), largest_loop_gain(loop, held))
@@ -278,20 +283,22 @@ def test_the_condition_includes_the_masters_hands(name: str) -> None:
 
 
 def test_free_slave_condition_names_the_stiffest_wall() -> None:
-    untouched = impedances(LOOP, constant(20.0), 12.0, hand=LOOP["hand"], wall=False)
+    untouched = make_impedance_scenario(
+        LOOP, make_constant_link(20.0), 12.0, hand=LOOP["hand"], wall=False
+    )
     assert "up to 6.123 N m/rad at the slave" in describe_law_conditions(untouched)[0]
 
 
 def test_other_hands_leave_small_gain_undecided() -> None:
     point = {"kind": "tip_spring", "to_m": [1.0, 0.5], "stiffness_n_m": [50.0, 50.0]}
     law = {"law": "impedance"}
-    for hand_ in (point, {**spring(5.0), "sampled": True}):
-        for master, slave in (([hand_], [spring(5.0)]), ([], [hand_])):
+    for hand_ in (point, {**make_spring(5.0), "sampled": True}):
+        for master, slave in (([hand_], [make_spring(5.0)]), ([], [hand_])):
             follows = {"control": {"follows": True}, "hands": slave}
-            scenario = unit_scenario({"m": {"hands": master}, "s": follows}, law)
+            scenario = make_unit_scenario({"m": {"hands": master}, "s": follows}, law)
             assert "is undecided: known for springs" in describe_law_conditions(scenario)[0]
         alone = {"control": {"follows": True}}
-        scenario = unit_scenario({"m": {"hands": [hand_]}, "s": alone}, law)
+        scenario = make_unit_scenario({"m": {"hands": [hand_]}, "s": alone}, law)
         assert "no bound is known for walls" in describe_law_conditions(scenario)[0]
 
 
@@ -307,11 +314,15 @@ SWINGS = (
 
 
 def test_gains_below_one_need_constant_delays() -> None:
-    condition = describe_law_conditions(impedances(SWINGING, SWING, 10.0))[0]
+    condition = describe_law_conditions(make_impedance_scenario(SWINGING, SWING, 10.0))[0]
     assert "is undecided: known for constant delays" in condition
-    condition = describe_law_conditions(impedances(SWINGING, constant(440.0), 10.0))[0]
+    condition = describe_law_conditions(
+        make_impedance_scenario(SWINGING, make_constant_link(440.0), 10.0)
+    )[0]
     assert " holds: the loop gain is at most 0.9" in condition
-    condition = describe_law_conditions(impedances(SWINGING, SWING, 10.0, wall=False))[0]
+    condition = describe_law_conditions(
+        make_impedance_scenario(SWINGING, SWING, 10.0, wall=False)
+    )[0]
     assert " holds: the slave touches nothing" in condition
 
 
@@ -330,37 +341,39 @@ def test_a_varying_delay_makes_small_gains_grow(
         "amplitude_ms": amplitude_ms,
         "period_s": period_s,
     }
-    swinging = impedances(SWINGING, swing, 120.0)
+    swinging = make_impedance_scenario(SWINGING, swing, 120.0)
     growth = (
         np.log(peak_motion(swinging, 100.0, 120.0) / peak_motion(swinging, 60.0, 80.0)) / 40.0
     )
     assert growth == pytest.approx(growth_per_s, abs=2e-3)
     for constant_ms in (delay_ms - amplitude_ms, delay_ms, delay_ms + amplitude_ms):
-        still = impedances(SWINGING, constant(constant_ms), 60.0)
+        still = make_impedance_scenario(SWINGING, make_constant_link(constant_ms), 60.0)
         assert peak_motion(still, 50.0, 60.0) < peak_motion(still, 10.0, 20.0)
 
 
 @pytest.mark.long
 def test_a_prediction_removes_the_delay_from_the_loop() -> None:
     """The damping is a quarter of what P+d needs: the master moves as if there were no delay."""
-    predicting = two(SMITH, control={"predicts": True})
-    ends = last_rows(predicting, 2.0, 3.5, 30.0)
+    predicting = make_pair_scenario(SMITH, control={"predicts": True})
+    ends = read_last_rows(predicting, 2.0, 3.5, 30.0)
     assert ends[-1]["q"][:, 0] == pytest.approx(0.3, abs=1e-9)
-    near = unit_scenario(
+    near = make_unit_scenario(
         {"m": {"hands": [H50]}, "s": {}},
         {**P_D, "d": 5.0},
         link={"model": "constant", "delay_ms": 0.0},
         duration_s=30.0,
     )
-    for late, prompt in zip(ends, last_rows(near, 2.0, 3.5, 30.0), strict=True):
+    for late, prompt in zip(ends, read_last_rows(near, 2.0, 3.5, 30.0), strict=True):
         assert late["q"][0, 0] == pytest.approx(prompt["q"][0, 0], abs=2e-3)
-    plain = last_rows(two({**P_D, "d": 5.0}), 30.0)[0]
+    plain = read_last_rows(make_pair_scenario({**P_D, "d": 5.0}), 30.0)[0]
     assert abs(plain["qd"]).max() > 1.0  # without the prediction it swings ever more
 
 
 @pytest.mark.long
 def test_predictions_that_lack_contact_are_unstable_there() -> None:
-    rows = last_rows(two(SMITH, clamped=True, control={"predicts": True}), 20.0)[0]
+    rows = read_last_rows(
+        make_pair_scenario(SMITH, clamped=True, control={"predicts": True}), 20.0
+    )[0]
     assert abs(rows["qd"]).max() > 1.0
 
 
@@ -373,7 +386,8 @@ def test_saturated_pull_and_gravity_stay_below_limits() -> None:
     """The largest gravity over all poses of the textbook's arm."""
     changes = {"control.law": "saturated_pd", "control.P": 5.0, "control.d": 4.0}
     scenario = load_scenario("paper", changes)
-    spec, theta = scenario.sites["s"], scenario.arms["s"].theta
+    spec = scenario.sites["s"]
+    theta = scenario.arms["s"].theta
     poses = np.stack(np.meshgrid(*[np.linspace(0.0, 2.0 * np.pi, 201)] * 2)).reshape(2, -1)
     arm = PlacedArm(spec.arm.g_m_s2, scenario.arms["s"].lengths_m, poses)
     gravity = np.abs(arm.gravity_torque(np.repeat(theta[:, None], poses.shape[1], axis=1))).max(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.energy_runs import pair, run_contact, ticked
+from tests.energy_runs import make_energy_pair, sample_contact_run, sample_every_tick
 
 ROOT = Path(__file__).parents[2]
 WAVE = runpy.run_path(str(ROOT / "examples" / "wave_law.py"))["Wave"]
@@ -42,7 +42,7 @@ def list_values(quantity: str, settings: str = "") -> list[float]:
 
 def run_free(law: Any) -> dict[str, Any]:
     """Returns five seconds of a free slave; its arms are farthest apart within them."""
-    return ticked(pair({"law": law}, clamped=False, duration_s=5.0))
+    return sample_every_tick(make_energy_pair({"law": law}, clamped=False, duration_s=5.0))
 
 
 def measure_distance(run: dict[str, Any]) -> float:
@@ -77,7 +77,7 @@ def test_distance_of_a_line_whose_waves_carry_velocity() -> None:
 
 @pytest.mark.long
 def test_an_acceleration_margin_lowers_stiffness_while_active() -> None:
-    run = run_contact(120.0, duration_s=30.0, acceleration_rad_s2=100.0)
+    run = sample_contact_run(120.0, duration_s=30.0, acceleration_rad_s2=100.0)
     assert list_values("stiffness felt") == [
         pytest.approx(felt_stiffness(run, to_s), abs=0.06) for to_s in (20, 30)
     ]
@@ -87,6 +87,6 @@ def test_an_acceleration_margin_lowers_stiffness_while_active() -> None:
     ("loss", "row"), [(0.0, 0), pytest.param(0.5, 1, marks=pytest.mark.long)]
 )
 def test_books_of_steps_hardly_chatter(loss: float, row: int) -> None:
-    tau = run_contact(136.0, loss=loss)["m"].tau[10000:, 0]
+    tau = sample_contact_run(136.0, loss=loss)["m"].tau[10000:, 0]
     stated = list_values("chatter")[row]
     assert np.abs(np.diff(tau)).mean() == pytest.approx(stated, abs=6e-5)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.dropped_files import look
+from tests.dropped_files import run_in_folder
 from trilat_net.laws.interface import format_class_name
 from trilat_net.scenario.laws import BUILT_IN
 
@@ -57,7 +57,7 @@ print(json.dumps({
 
 def test_an_added_file_is_a_law_everywhere(tmp_path: Path) -> None:
     (tmp_path / "soft_spring.py").write_text(LAW)
-    output = look(LOOK, tmp_path)
+    output = run_in_folder(LOOK, tmp_path)
     assert output["control"] == [9.0, 9.0]
     assert any(
         "condition of soft_spring" in line and "K = 9 at s" in line for line in output["check"]

@@ -39,7 +39,7 @@ LEARNING = ("adaptive", "adaptive_box", "adaptive_robust")
 EXACT = [name for name in GAINS if name != "lee_spong"]  # its K T_max is rounded
 
 
-def build(name: str, scenario: str) -> tuple[Any, SiteArrays]:
+def make_law_and_arrays(name: str, scenario: str) -> tuple[Any, SiteArrays]:
     """Returns a law with a different gain for each joint, and the arrays of its site."""
     setup = load_scenario(scenario).setup(SITE)
     gains: dict[str, tuple[float, ...]] = {}
@@ -83,7 +83,7 @@ def compute_plain_torque(
 
 @pytest.mark.parametrize("name", GAINS)
 def test_planar_arm_has_the_plain_torque(name: str) -> None:
-    law, arrays = build(name, PLANAR)
+    law, arrays = make_law_and_arrays(name, PLANAR)
     row = arrays.site[0]
     rng = np.random.default_rng(1)
     for _ in range(STATES):
@@ -98,7 +98,7 @@ def test_planar_arm_has_the_plain_torque(name: str) -> None:
 @pytest.mark.parametrize("name", LEARNING)
 @pytest.mark.parametrize("scenario", [PLANAR, CHAIN])
 def test_estimates_advance_as_in_the_plain_law(name: str, scenario: str) -> None:
-    law, arrays = build(name, scenario)
+    law, arrays = make_law_and_arrays(name, scenario)
     stages = chain_stages if scenario == CHAIN else two_link_stages
     row = arrays.site[0]
     rng = np.random.default_rng(2)
@@ -113,7 +113,7 @@ def test_estimates_advance_as_in_the_plain_law(name: str, scenario: str) -> None
 @pytest.mark.parametrize("name", EXACT)
 def test_chain_has_the_plain_torque_of_exact_numbers(name: str) -> None:
     """The model's torque is zero here: no gravity, no estimate, no friction, no drives."""
-    law, arrays = build(name, CHAIN)
+    law, arrays = make_law_and_arrays(name, CHAIN)
     row = arrays.site[0]
     chain = arrays.chain
     assert chain is not None
@@ -135,7 +135,7 @@ def test_chain_has_the_plain_torque_of_exact_numbers(name: str) -> None:
 
 @pytest.mark.parametrize("name", GAINS)
 def test_chain_has_the_plain_torque_within_rounding(name: str) -> None:
-    law, arrays = build(name, CHAIN)
+    law, arrays = make_law_and_arrays(name, CHAIN)
     row = arrays.site[0]
     chain = arrays.chain
     assert chain is not None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.control_laws.law_settings import LAWS
-from tests.core.guarded_runs import RATE_NM_S, largest_step, ordered
-from tests.virtual_runs import sampled, trajectories
+from tests.core.guarded_runs import RATE_NM_S, find_largest_step, make_ordered_log
+from tests.execution.builders import make_trajectories, sample_records
 from trilat_net.core.plug.compiled_law import is_compiled
 from trilat_net.execution.verification import verify
 from trilat_net.scenario import Scenario, load_scenario
@@ -20,17 +20,17 @@ LONG = [
 ]
 
 
-def overrides(law: str) -> dict[str, Any]:
+def make_law_overrides(law: str) -> dict[str, Any]:
     return {"duration_s": 0.12, "link.delay_ms": 20.0, "control.law": law, **LAWS[law][1]}
 
 
-def scenario(law: str) -> Scenario:
-    return load_scenario(LAWS[law][0], overrides(law))
+def make_law_scenario(law: str) -> Scenario:
+    return load_scenario(LAWS[law][0], make_law_overrides(law))
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_checking_scenarios_states_the_laws_condition(law: str) -> None:
-    lines = describe_scenario(scenario(law))
+    lines = describe_scenario(make_law_scenario(law))
     assert (
         len([line for line in lines if line.startswith("condition of ") and law in line]) >= 1
     )
@@ -38,9 +38,9 @@ def test_checking_scenarios_states_the_laws_condition(law: str) -> None:
 
 @pytest.mark.parametrize("law", LONG)
 def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen = scenario(law)
-    ticks = trajectories(chosen)
-    fused = sampled(chosen, (0.12,))[:, 0]
+    chosen = make_law_scenario(law)
+    ticks = make_trajectories(chosen)
+    fused = sample_records(chosen, (0.12,))[:, 0]
     names = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
     columns = chosen.layout(chosen.names[0]).columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
@@ -48,7 +48,7 @@ def test_every_driver_runs_the_same_bits(law: str, monkeypatch: pytest.MonkeyPat
     kind = chosen.sites[chosen.names[0]].control.kind
     if is_compiled(kind):  # others are in the kernel
         monkeypatch.setattr(kind, "is_compiled", False)
-        plain = trajectories(chosen)
+        plain = make_trajectories(chosen)
         for name in names:
             assert (plain.stack(name) == ticks.stack(name)).all()
 
@@ -58,7 +58,7 @@ FOR_TWO = ("p_f", *DIGITAL)
 RULE: dict[str, Any] = {"action": "glide", "align_limit_rad": 4.0, "align_speed_rad_s": 2.0}
 
 
-def set_apart(law: str, **more: Any) -> Scenario:
+def make_apart_scenario(law: str, **more: Any) -> Scenario:
     """Sets arms 3 rad apart, which align at 2 rad/s."""
     name, settings = LAWS.get(law, ("two_sites" if law in FOR_TWO else "paper", {}))
     first, *others = load_scenario(name).names
@@ -87,7 +87,7 @@ def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
             {"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}
         ),  # elbows bent, and none hangs
     }
-    far_scenario = set_apart(law, **more)
+    far_scenario = make_apart_scenario(law, **more)
     orders = {
         "s": {
             2800: "stop",
@@ -105,11 +105,11 @@ def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
             6400: "reset",
         },
     }
-    log = ordered(far_scenario, orders)
+    log = make_ordered_log(far_scenario, orders)
     modes = {str(mode) for site in log.sites for mode in log[site].mode}
     assert {"waiting", "return", "run", "hold", "stopped", "fault"} <= modes
     for site in log.sites:
-        assert largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9), site
+        assert find_largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9), site
         assert np.isfinite(log[site].tau).all()
     assert verify(log).differing == 0
 
@@ -127,10 +127,10 @@ def test_arms_far_apart_approach_slowly(law: str) -> None:
     """3 rad apart, at 2 rad/s and the law's own speed, at the start and after a stop; no spring
     is wound up.
     """
-    far_scenario = set_apart(law, duration_s=6.0)
+    far_scenario = make_apart_scenario(law, duration_s=6.0)
     unheld = load_scenario(
         far_scenario, {f"sites.{site}.hands": [] for site in far_scenario.names}
     )
-    log = ordered(unheld, {"s": {1200: "stop", 4000: "enable"}})
+    log = make_ordered_log(unheld, {"s": {1200: "stop", 4000: "enable"}})
     for site in log.sites:
         assert np.abs(log[site].qd).max() < 2.5 * RULE["align_speed_rad_s"], site

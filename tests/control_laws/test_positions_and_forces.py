@@ -1,29 +1,33 @@
 """The four- and the six-channel law against their loops in the frequency domain, and runs in time."""
 
 import csv
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.log_editing import opened
+from tests.execution.builders import make_trajectories
+from tests.log.builders import open_bytes, simulate_bytes
 from tests.transmission import (
     PAIR,
     TABLE,
     VARIANTS,
     approximate_printed,
+    find_transmission,
     rightmost_root,
-    transmitted,
 )
-from tests.unit_arm import DRIVE, WALL, last_rows, two_sites, unit_scenario
-from tests.virtual_runs import trajectories
+from tests.unit_arm import (
+    DRIVE,
+    WALL,
+    make_four_channel_pair,
+    make_unit_scenario,
+    read_last_rows,
+)
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.laws.six_channel import complementary_shares, complementary_weights
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -71,7 +75,7 @@ def test_tables_of_documentation_have_these_numbers() -> None:
         felt = [float(row[f"felt_over_wall_at_{hz}_hz"]) for hz in ("0.1", "1")]
         six.setdefault(float(row["a"]), []).extend(felt)
         assert row["rightmost_root_1_s"] in ("", str(SHARED[float(row["a"])][2]))
-    assert six == {a: [*one, *other] for a, (one, other, *_) in SHARED.items()}
+    assert six == {a: [*first, *other] for a, (first, other, *_) in SHARED.items()}
 
 
 def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> Scenario:
@@ -87,14 +91,16 @@ def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> 
     }
     control = {"law": "six_channel", "K": 100.0, "B": 20.0, **more}
     link = {"model": "constant", "delay_ms": 0.0}
-    return unit_scenario(sites, control, dominance=shares, link=link, duration_s=duration_s)
+    return make_unit_scenario(
+        sites, control, dominance=shares, link=link, duration_s=duration_s
+    )
 
 
-def measured(scenario: Scenario, site: str) -> float:
+def measure_transmission(scenario: Scenario, site: str) -> float:
     """Returns the same as `transmitted` at 1 Hz, for a run in time: over its last period."""
     times_s = 8.0 + np.arange(1, 21) / 20.0
     site_index = scenario.names.index(site)
-    rows = last_rows(scenario, *times_s)
+    rows = read_last_rows(scenario, *times_s)
     turn = np.exp(-2j * np.pi * times_s)
     torque, speed = (
         np.array([row[name][site_index, 0] for row in rows]) for name in ("tau_x", "qd")
@@ -105,7 +111,7 @@ def measured(scenario: Scenario, site: str) -> float:
 @pytest.mark.parametrize(("variant", "delay_s"), TABLE)
 def test_two_sites_transmit_as_published(variant: str, delay_s: float) -> None:
     ratios = [
-        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
+        find_transmission(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
     assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
@@ -117,7 +123,7 @@ def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
     *users, root, ratios = SHARED[a]
     for at, values in enumerate(users):
         felt_ratios = [
-            transmitted(hz, alpha, at, acceleration=qdd)
+            find_transmission(hz, alpha, at, acceleration=qdd)
             for qdd in (0.0, 1.0)
             for hz in (0.1, 1.0)
         ]
@@ -144,7 +150,9 @@ def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
     ],
 )
 def test_six_channel_runs_transmit_like_their_loop(a: float, user: int, felt: float) -> None:
-    assert measured(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(felt, abs=6e-5)
+    assert measure_transmission(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(
+        felt, abs=6e-5
+    )
 
 
 @pytest.mark.long
@@ -163,17 +171,19 @@ def test_six_channel_runs_transmit_like_their_loop(a: float, user: int, felt: fl
 def test_four_channel_runs_transmit_like_their_loop(
     variant: str, delay_s: float, acceleration: float, felt: float
 ) -> None:
-    """With a part of the acceleration, as all of it is unstable; a held torque is modelled as held."""
-    ratio = measured(two_sites(variant, delay_s, acceleration=acceleration), "m")
+    """The law uses a part of the acceleration, as all of it is unstable; the model of a torque holds it over a tick."""
+    ratio = measure_transmission(
+        make_four_channel_pair(variant, delay_s, acceleration=acceleration), "m"
+    )
     law = {**VARIANTS[variant], "acceleration": acceleration, "delay_s": delay_s}
-    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
+    assert ratio == pytest.approx(find_transmission(1.0, PAIR, 0, held_s=1e-3, **law), rel=2e-4)
     assert ratio == pytest.approx(felt, abs=6e-5)
-    assert ratio == pytest.approx(transmitted(1.0, PAIR, 0, **law), rel=0.02)
+    assert ratio == pytest.approx(find_transmission(1.0, PAIR, 0, **law), rel=0.02)
 
 
 @pytest.mark.long
 def test_full_acceleration_one_tick_late_is_unstable() -> None:
-    rows = last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
+    rows = read_last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
     assert np.abs(rows["qd"]).max() > 100.0
     assert (
         "does not hold: " in describe_law_conditions(three_sites(0.5, 0, acceleration=1.0))[0]
@@ -199,7 +209,7 @@ def test_shares_without_a_single_factor_are_reported() -> None:
         "u2": {"u1": 0.2, "s": 0.8},
         "s": {"u1": 0.5, "u2": 0.5},
     }
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         {name: {} for name in others}, {"law": "six_channel"}, dominance=others
     )
     assert (
@@ -210,21 +220,24 @@ def test_shares_without_a_single_factor_are_reported() -> None:
 
 def test_two_sites_cannot_share_by_one_factor() -> None:
     with pytest.raises(ScenarioError, match="is for 3 sites"):
-        trajectories(unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01))
+        make_trajectories(
+            make_unit_scenario({"m": {}, "s": {}}, {"law": "six_channel"}, duration_s=0.01)
+        )
 
 
 @pytest.mark.long
 def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     """`trilat metrics` of a log of 26 s: stretches of 4 s, driven at 1 Hz alone."""
-    stream = io.BytesIO()
-    write_virtual_log(two_sites("without qdd", 0.001, duration_s=26.0), stream)
-    responses = compute_log_metrics(opened(stream.getvalue())).responses
+    log = open_bytes(
+        simulate_bytes(make_four_channel_pair("without qdd", 0.001, duration_s=26.0))
+    )
+    responses = compute_log_metrics(log).responses
     felt = next(
         response
         for response in responses
         if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
-    expected = transmitted(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
+    expected = find_transmission(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
         500.0 / (2j * np.pi) + 5.0
     )
     assert felt.ratio.frequency_hz == 1.0

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.unit_arm import last_rows, unit_scenario
+from tests.unit_arm import make_unit_scenario, read_last_rows
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -30,10 +30,10 @@ GAINS: dict[str, dict[str, Any]] = {
 HANGING_STARTS = ((-1.65, 0.0), (-1.8, 0.1), (-1.45, 0.0))
 
 
-def pendulums(law: str, starts: tuple[float, ...], gravity: float) -> Scenario:
+def make_pendulum_scenario(law: str, starts: tuple[float, ...], gravity: float) -> Scenario:
     names = "abc"[: len(starts)]
     share = 1.0 / (len(starts) - 1)
-    return unit_scenario(
+    return make_unit_scenario(
         {name: {"q0_rad": [start, 0.0]} for name, start in zip(names, starts, strict=True)},
         {**GAINS[law], "Lambda": 1.0, "Gamma": [1.0, 0.0, 0.0, 1.0, 0.0]},
         dominance={name: {peer: share for peer in names if peer != name} for name in names},
@@ -43,16 +43,21 @@ def pendulums(law: str, starts: tuple[float, ...], gravity: float) -> Scenario:
     )
 
 
-def ends(law: str, starts: tuple[float, ...], gravity: float, *times_s: float) -> list[Any]:
-    return [row["q"][:, 0] for row in last_rows(pendulums(law, starts, gravity), *times_s)]
+def find_final_angles(
+    law: str, starts: tuple[float, ...], gravity: float, *times_s: float
+) -> list[Any]:
+    return [
+        row["q"][:, 0]
+        for row in read_last_rows(make_pendulum_scenario(law, starts, gravity), *times_s)
+    ]
 
 
 @pytest.mark.parametrize(
     "starts", [(0.6, -0.5), pytest.param((1.0, 0.4), marks=pytest.mark.long), (0.6, -0.5, 0.1)]
 )
 def test_under_gravity_any_start_ends_at_zero(starts: tuple[float, ...]) -> None:
-    scenario = pendulums("sync", starts, 9.81)
-    first, last = (row["q"][:, 0] for row in last_rows(scenario, 20.0, 200.0))
+    scenario = make_pendulum_scenario("sync", starts, 9.81)
+    first, last = (row["q"][:, 0] for row in read_last_rows(scenario, 20.0, 200.0))
     assert abs(last).max() < 1e-13
     # a decaying rest, which the way of sampling moves by some per cent
     if starts == (
@@ -73,13 +78,13 @@ def test_under_gravity_any_start_ends_at_zero(starts: tuple[float, ...]) -> None
 def test_under_gravity_low_starts_end_hanging(start: tuple[float, float]) -> None:
     """Y_G'r = 0 also holds where cos q1 = cos(q1 + q2) = 0, whatever r is: arms of two links, no users."""
     names = ("m", "s")
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         {name: {"q0_rad": list(start)} for name in names},
         {"law": "sync", "Lambda": 1.0, "K": 3.0, "Gamma": 1.0, "theta_hat0": 0.0},
         arm={},
         duration_s=100.0,
     )
-    (last,) = last_rows(scenario, 100.0)
+    (last,) = read_last_rows(scenario, 100.0)
     assert last["q"][:, 0] == pytest.approx(-0.5 * np.pi, abs=5e-3)
     assert last["q"][:, 1] == pytest.approx(0.0, abs=5e-3)
     assert abs(last["qd"]).max() < 1e-3
@@ -107,7 +112,7 @@ def test_other_gains_make_the_start_decide_rest(name: str, height: str) -> None:
     sites, gains, delay_ms, low = OTHER_GAINS[name]
     start = low if height == "low" else (0.8, 0.3)
     share = 1.0 / (len(sites) - 1)
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         {site: {"q0_rad": list(start)} for site in sites},
         {"law": "sync", "theta_hat0": 0.0, **gains},
         arm={},
@@ -115,7 +120,7 @@ def test_other_gains_make_the_start_decide_rest(name: str, height: str) -> None:
         dominance={site: {peer: share for peer in sites if peer != site} for site in sites},
         duration_s=100.0,
     )
-    (last,) = last_rows(scenario, 100.0)
+    (last,) = read_last_rows(scenario, 100.0)
     first_joint_rad = -0.5 * np.pi if height == "low" else 0.0
     assert last["q"][:, 0] == pytest.approx(first_joint_rad, abs=5e-3)
     assert last["q"][:, 1] == pytest.approx(0.0, abs=5e-3)
@@ -124,8 +129,12 @@ def test_other_gains_make_the_start_decide_rest(name: str, height: str) -> None:
 
 @pytest.mark.long
 def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
-    assert ends("adaptive", (0.6, -0.5), 9.81, 200.0)[0] == pytest.approx(-0.047162, rel=1e-3)
-    assert ends("adaptive", (0.6, -0.5), 0.0, 200.0)[0] == pytest.approx(0.05, abs=1e-6)
+    assert find_final_angles("adaptive", (0.6, -0.5), 9.81, 200.0)[0] == pytest.approx(
+        -0.047162, rel=1e-3
+    )
+    assert find_final_angles("adaptive", (0.6, -0.5), 0.0, 200.0)[0] == pytest.approx(
+        0.05, abs=1e-6
+    )
 
 
 @pytest.mark.long
@@ -133,7 +142,7 @@ def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
     ("starts", "pose"), [((0.6, -0.5), 0.038255), ((0.6, -0.5, 0.1), 0.055753)]
 )
 def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> None:
-    assert ends("sync", starts, 0.0, 200.0)[0] == pytest.approx(pose, abs=6e-7)
+    assert find_final_angles("sync", starts, 0.0, 200.0)[0] == pytest.approx(pose, abs=6e-7)
 
 
 @pytest.mark.parametrize("law", ["sync", "adaptive_kinematics"])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.unit_arm import unit_scenario
+from tests.unit_arm import make_unit_scenario
 
 Pair = list[float]
 H = 1e-3
@@ -99,7 +99,7 @@ class Hand(NamedTuple):
         }
 
 
-def advance(arm: Arm, hand: Hand | None, t: float, q: Pair, qd: Pair, tau: Pair) -> Any:
+def advance_arm(arm: Arm, hand: Hand | None, t: float, q: Pair, qd: Pair, tau: Pair) -> Any:
     """Advances by one period under a held torque, classical Runge-Kutta; the hand acts in every stage."""
 
     def slope(t: float, q: Pair, qd: Pair) -> tuple[Pair, Pair]:
@@ -149,8 +149,12 @@ class Site:
         self.W_fol = [[r, r] for _ in peers]
 
     def tick(self, k: int, q: Pair, qd: Pair, q_before: Pair, got: list[Message]) -> Pair:
-        alpha, law = self.alpha, self.law
-        K, B, r, beta = law["K"], law["B"], law["reserve_J"], law["beta"]
+        alpha = self.alpha
+        law = self.law
+        K = law["K"]
+        B = law["B"]
+        r = law["reserve_J"]
+        beta = law["beta"]
         peers = range(len(alpha))
         G = self.arm.gravity(q)
         Q = self.arm.inverse(q)
@@ -181,7 +185,9 @@ class Site:
             # 4. velocities that are paid for
             e = v * H - p[i]
             price = max((K * e / 2.0 - c) * e, 0.0)
-            paid_v, rest, left = [], [], []
+            paid_v = []
+            rest = []
+            left = []
             for j in peers:
                 F_j = alpha[j] * F
                 self.sent_F[j][i] = F_j
@@ -230,7 +236,9 @@ class Site:
                     self.U[j][i] += left[j] / A * F * w * H
                 self.W_fol[j][i] = got[j].E_led[i] + r - self.U[j][i]
             self.goal[i] += H * V
-            self.F[i], self.S[i], self.P[i] = F, S, F * V * H
+            self.F[i] = F
+            self.S[i] = S
+            self.P[i] = F * V * H
             F_now[i] = F
             # 8. accounts of the leader
             for j in peers:
@@ -268,7 +276,8 @@ class Site:
             for j in peers:
                 self.Fl[j][i] = T[j][i] if felt == X else T[j][i] * X / felt
             tau[i] = G[i] + (F_now[i] - X) / beta
-        self.G, self.tau = G, tau
+        self.G = G
+        self.tau = tau
         return tau
 
 
@@ -361,7 +370,7 @@ def simulate_page(log: Any, alpha: Any, gains: dict[str, float], ticks: int) -> 
             sent[route].append(message)
         for name, site in sites.items():
             before[name] = q[name]
-            q[name], qd[name] = advance(
+            q[name], qd[name] = advance_arm(
                 site.arm, HANDS[name], k * H, q[name], qd[name], tau[name]
             )
     return {
@@ -381,7 +390,7 @@ def test_the_page_alone_gives_the_run(name: str) -> None:
         site: {"q0_rad": START, "hands": [HANDS[site].table()] if HANDS[site] else []}
         for site in alpha
     }
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         sites,
         {"law": "tdpa", **LAW, **gains},
         arm={**LINKS, "g_m_s2": GRAVITY},

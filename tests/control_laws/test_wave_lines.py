@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.energy_runs import CONSTANT, JITTER, pair, ticked
-from tests.unit_arm import CLAMP, hand, unit_scenario
-from tests.virtual_runs import trajectories
+from tests.energy_runs import CONSTANT, JITTER, make_energy_pair, sample_every_tick
+from tests.execution.builders import make_trajectories
+from tests.unit_arm import CLAMP, make_spring_hand, make_unit_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.wave import Wave
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
 
-b, h = 10.0, 1e-3
+b = 10.0
+h = 1e-3
 c = math.sqrt(2.0 * b)
 T = 0.2 + 0.5 * h
 """Of a line with one end that answers a tick later, by what its arm did: half of its round trip, s."""
@@ -25,7 +26,7 @@ CUT = {**CONSTANT, "outages_s": [[1.8, 2.8]]}
 WAVE = {"law": "wave"}
 
 
-def comparing(reception: str) -> dict[str, Any]:
+def make_line_law(reception: str) -> dict[str, Any]:
     """Runs the class itself, as no scenario can choose `hold`."""
     none = [0.0, 0.0]
     gains = {
@@ -40,28 +41,35 @@ def comparing(reception: str) -> dict[str, Any]:
     return {"law": "trilat_net.laws.wave:Wave", **gains, "reception": reception}
 
 
-def received(
+def make_line_scenario(
     reception: str,
     link: dict[str, Any],
     duration_s: float = 20.0,
     env: Any = (),
     push: Any = None,
 ) -> Scenario:
-    law = comparing(reception)
+    law = make_line_law(reception)
     slave = {**law, "K": [100.0, 100.0], "B": [b, b]}
-    sites = {"m": {"hands": [push or hand(0.3)]}, "s": {"hands": list(env), "control": slave}}
-    return unit_scenario(sites, law, duration_s=duration_s, link=link)
+    sites = {
+        "m": {"hands": [push or make_spring_hand(0.3)]},
+        "s": {"hands": list(env), "control": slave},
+    }
+    return make_unit_scenario(sites, law, duration_s=duration_s, link=link)
 
 
-def stored(run: dict[str, Any]) -> tuple[Any, Any]:
+def measure_stored_energy(run: dict[str, Any]) -> tuple[Any, Any]:
     """Returns the energy in the line of joint 1, tick by tick: by its waves, and by the work at
     its ports.
 
     Energy on hand at the master's end counts as input; its arm gave -tau times its steps.
     """
-    m, s = run["m"], run["s"]
-    u_m, u_s, force_s = m.sent[0].u[:, 0], s.sent[0].u[:, 0], s.tau[:, 0]
-    v_m, v_s = (m.tau[:, 0] + b * m.qd[:, 0]) / c, u_s + c / b * force_s
+    m = run["m"]
+    s = run["s"]
+    u_m = m.sent[0].u[:, 0]
+    u_s = s.sent[0].u[:, 0]
+    force_s = s.tau[:, 0]
+    v_m = (m.tau[:, 0] + b * m.qd[:, 0]) / c
+    v_s = u_s + c / b * force_s
     waves = np.cumsum(0.5 * h * (u_m**2 - v_s**2 + u_s**2 - v_m**2))
     work = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
     reserve = Wave.reserve_J
@@ -70,8 +78,9 @@ def stored(run: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def test_a_free_slave_reaches_its_master() -> None:
-    run = ticked(pair(WAVE, clamped=False, duration_s=20.0), every=4)
-    m, s = run["m"], run["s"]
+    run = sample_every_tick(make_energy_pair(WAVE, clamped=False, duration_s=20.0), every=4)
+    m = run["m"]
+    s = run["s"]
     assert m.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
     assert s.q[-1, 0] == pytest.approx(0.3, abs=5e-7)
     distance = np.abs(m.q - s.q)[:, 0].max()  # of qd h at 1 kHz .0476, of continuous time .0477
@@ -80,16 +89,19 @@ def test_a_free_slave_reaches_its_master() -> None:
 
 
 def test_a_line_stores_the_energy_of_its_ports() -> None:
-    waves, ports = stored(ticked(pair(WAVE, clamped=False, duration_s=5.0)))
+    waves, ports = measure_stored_energy(
+        sample_every_tick(make_energy_pair(WAVE, clamped=False, duration_s=5.0))
+    )
     assert np.abs(waves - ports).max() < 1e-12 * waves.max()
     assert waves.min() >= 0.0
     assert waves.max() == pytest.approx(0.149, rel=5e-3)
 
 
 def test_a_clamped_line_is_a_spring() -> None:
-    """Of stiffness b / T, in series with the follower's K and the clamp."""
-    run = ticked(pair(WAVE, clamped=True, duration_s=30.0), every=30000)
-    m, s = run["m"], run["s"]
+    """The spring has the stiffness b / T, in series with the follower's K and the clamp."""
+    run = sample_every_tick(make_energy_pair(WAVE, clamped=True, duration_s=30.0), every=30000)
+    m = run["m"]
+    s = run["s"]
     felt = 1.0 / (T / b + 0.01 + 0.001)
     master = 15.0 / (50.0 + felt)
     assert m.q[-1, 0] == pytest.approx(master, abs=5e-7)
@@ -116,7 +128,9 @@ def test_a_line_has_its_published_impedance(
     periods = 3 if frequency_hz < 0.1 else 6
     push = {"kind": "multisine", "amplitude_nm": [0.2, 0.1], "frequencies_hz": [frequency_hz]}
     env = [{**CLAMP, "stiffness_nm_rad": clamp_nm_rad}] if clamp_nm_rad else []
-    run = ticked(received("replay", CONSTANT, periods / frequency_hz, env, push), every=20)["m"]
+    run = sample_every_tick(
+        make_line_scenario("replay", CONSTANT, periods / frequency_hz, env, push), every=20
+    )["m"]
     last = round(50.0 / frequency_hz)  # rows of the last period
     turn = np.exp(-2j * np.pi * np.arange(last) / last)
     felt = abs(run.tau_x[-last:, 0] @ turn) / abs(run.qd[-last:, 0] @ turn)
@@ -127,11 +141,11 @@ def test_a_line_has_its_published_impedance(
     ("reception", "end"), [("hold", 0.4214), ("zero", 0.1496), ("replay", 0.3)]
 )
 def test_outages_leave_offsets_only_with_held_waves(reception: str, end: float) -> None:
-    slave = ticked(received(reception, CUT), every=20000)["s"]
+    slave = sample_every_tick(make_line_scenario(reception, CUT), every=20000)["s"]
     assert slave.q[-1, 0] == pytest.approx(end, rel=2e-3)
 
 
-def varying(period_s: float = 2.0) -> dict[str, Any]:
+def make_varying_link(period_s: float = 2.0) -> dict[str, Any]:
     """Returns T(t) = 0.2 + 0.15 sin(pi t) at the time t of receipt, as a trace by stamps."""
     t = np.arange(0.0, 12.0, 1e-3)
     sent = t - 0.2 - 0.15 * np.sin(2.0 * np.pi * t / period_s)
@@ -145,9 +159,11 @@ def varying(period_s: float = 2.0) -> dict[str, Any]:
     ("reception", "least"), [("hold", -0.3345), ("scaled", 0.0), ("replay", 0.0)]
 )
 def test_varying_delay_makes_energy_from_held_waves(reception: str, least: float) -> None:
-    push = {**hand(0.3, damping=0.0), "move_end_s": 1.5}
+    push = {**make_spring_hand(0.3, damping=0.0), "move_end_s": 1.5}
     env = [{**CLAMP, "stiffness_nm_rad": 200.0}]
-    waves, _ = stored(ticked(received(reception, varying(), 4.0, env, push)))
+    waves, _ = measure_stored_energy(
+        sample_every_tick(make_line_scenario(reception, make_varying_link(), 4.0, env, push))
+    )
     assert waves.min() == pytest.approx(least, rel=4e-3, abs=1e-12)
 
 
@@ -163,7 +179,9 @@ LOSSY = [
 def held_torque(link: dict[str, Any], push: dict[str, Any], duration_s: float) -> Any:
     """Returns the master's torque, a row a tick, in contact with 700 N m/rad and 3 N m s/rad."""
     clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
-    return ticked(received("replay", link, duration_s, [clamp], push))["m"].tau[:, 0]
+    return sample_every_tick(make_line_scenario("replay", link, duration_s, [clamp], push))[
+        "m"
+    ].tau[:, 0]
 
 
 @pytest.mark.parametrize(("link", "duration_s"), LOSSY)
@@ -178,7 +196,7 @@ def test_constant_force_plays_at_ticks_without_wave(
 
 @pytest.mark.parametrize(("link", "duration_s"), LOSSY)
 def test_contact_under_loss_keeps_its_force(link: dict[str, Any], duration_s: float) -> None:
-    tau = np.abs(held_torque(link, hand(0.0682, 40.0, 6.0), duration_s))
+    tau = np.abs(held_torque(link, make_spring_hand(0.0682, 40.0, 6.0), duration_s))
     assert tau[-1000:].mean() == pytest.approx(tau[9000:10000].mean(), rel=1e-3)
     assert np.abs(np.diff(tau[10000:])).max() < 0.03
 
@@ -188,16 +206,16 @@ def test_contact_under_loss_keeps_its_force(link: dict[str, Any], duration_s: fl
     [
         (JITTER, 0.01),
         *(
-            pytest.param(*one, marks=pytest.mark.long)
-            for one in ((JITTER, 0.0), (CONSTANT, 0.01))
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in ((JITTER, 0.0), (CONSTANT, 0.01))
         ),
     ],
 )
 def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
-    """Under varying delays without damping: two ends, two joints, a reserve in H and one in W."""
+    """Under varying delays without damping, the energy grows by the reserves of two ends and two joints only."""
     control = {"law": "wave", "K": 0.0, "B": 0.0, "reserve_J": reserve_J}
     sites = {"m": {"qd0_rad_s": [1e-6, 5e-7]}, "s": {}}
-    run = ticked(unit_scenario(sites, control, duration_s=20.0, link=link))
+    run = sample_every_tick(make_unit_scenario(sites, control, duration_s=20.0, link=link))
     M = np.array([[5.0 / 6.0, 1.0 / 3.0], [1.0 / 3.0, 1.0 / 3.0]])
     kinetic_J = sum(
         0.5 * np.einsum("ki,ij,kj->k", site.qd, M, site.qd) for site in run.values()
@@ -210,7 +228,9 @@ def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: flo
 def test_play_out_makes_jitter_a_constant_delay() -> None:
     jitter = {**JITTER, "loss": 0.0, "playout_ms": 400.0}
     a, other = (
-        ticked(pair(WAVE, clamped=False, duration_s=5.0, link=link), every=5000)
+        sample_every_tick(
+            make_energy_pair(WAVE, clamped=False, duration_s=5.0, link=link), every=5000
+        )
         for link in (jitter, {**CONSTANT, "delay_ms": 400.0})
     )
     assert np.array_equal(a["s"].q, other["s"].q)
@@ -223,9 +243,13 @@ SHARES = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 
 @pytest.mark.long
 def test_three_sites_are_springs_b_over_t() -> None:
     law = {"law": "wave", "lines": MESH}
-    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
-    scenario = unit_scenario(sites, law, duration_s=40.0, dominance=SHARES)
-    run = ticked(scenario, every=40000)
+    sites = {
+        "m1": {"hands": [make_spring_hand(0.3)]},
+        "m2": {"hands": [make_spring_hand(-0.3)]},
+        "s": {},
+    }
+    scenario = make_unit_scenario(sites, law, duration_s=40.0, dominance=SHARES)
+    run = sample_every_tick(scenario, every=40000)
     lines = np.array([[20.0, -2.0, -18.0], [-2.0, 6.0, -4.0], [-18.0, -4.0, 22.0]])
     rest = np.linalg.solve(lines / (0.2 + h) + np.diag([50.0, 50.0, 0.0]), [15.0, -15.0, 0.0])
     for name, q, known in zip(run, rest, (0.14602, -0.14602, 0.09292), strict=True):
@@ -241,7 +265,7 @@ def test_weights_share_the_felt_torques() -> None:
     Nothing but the hand damps: with waves of qd h this loop diverges from 60 s on.
     """
     sites = {
-        "m1": {"hands": [hand(0.0)], "control": {"law": "wave", "beta": 1.0}},
+        "m1": {"hands": [make_spring_hand(0.0)], "control": {"law": "wave", "beta": 1.0}},
         "m2": {"control": {"law": "wave", "beta": 0.5}},
         "s": {
             "hands": [{"kind": "recorded", "points": [[0.0, 5.0, 2.5], [1e4, 5.0, 2.5]]}],
@@ -249,7 +273,9 @@ def test_weights_share_the_felt_torques() -> None:
         },
     }
     law = {"law": "wave", "lines": MESH}
-    run = ticked(unit_scenario(sites, law, duration_s=400.0, dominance=SHARES), every=1000)
+    run = sample_every_tick(
+        make_unit_scenario(sites, law, duration_s=400.0, dominance=SHARES), every=1000
+    )
     for t_s in (60, 400):
         assert abs(run["m1"].tau_x[t_s - 1, 0]) == pytest.approx(7.5, rel=3e-3)
     assert min(float(site.to_all.H.min()) for site in run.values()) >= -1e-9
@@ -259,8 +285,8 @@ def test_own_law_gives_the_same_last_digits(monkeypatch: pytest.MonkeyPatch) -> 
     """examples/wave_law.py."""
     monkeypatch.chdir(Path(__file__).parents[2] / "examples")
     ours, theirs = (
-        trajectories(
-            pair(
+        make_trajectories(
+            make_energy_pair(
                 {"law": law}, clamped=False, duration_s=1.3, link={**CONSTANT, "delay_ms": 50.0}
             )
         )
@@ -273,8 +299,8 @@ def test_own_law_gives_the_same_last_digits(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_line_ends_share_one_rate() -> None:
     with pytest.raises(ScenarioError, match="all sites"):
-        unit_scenario({"m": {"control": WAVE}, "s": {"control": {"law": "p_d"}}}, WAVE)
+        make_unit_scenario({"m": {"control": WAVE}, "s": {"control": {"law": "p_d"}}}, WAVE)
     with pytest.raises(ScenarioError, match="the same at all sites"):
-        unit_scenario({"m": {}, "s": {"rate_hz": 500}}, WAVE)
+        make_unit_scenario({"m": {}, "s": {"rate_hz": 500}}, WAVE)
     with pytest.raises(ScenarioError, match="m-x"):
-        unit_scenario({"m": {}, "s": {}}, {**WAVE, "lines": {"m-x": 1.0}})
+        make_unit_scenario({"m": {}, "s": {}}, {**WAVE, "lines": {"m-x": 1.0}})

@@ -91,11 +91,17 @@ def to_chain(entry: dict) -> UrdfChain:
             _rows(joint["rotation"]),
             tuple(joint["origin_m"]),
             tuple(joint["inertia"]),
-            *(-math.inf, math.inf, math.inf, math.inf, 0.0, 0.0),
+            -math.inf,
+            math.inf,
+            math.inf,
+            math.inf,
+            0.0,
+            0.0,
         )
         for joint in entry["joints"]
     ]
-    tip_rotation, tip_origin_m = _rows(entry["tip_rotation"]), tuple(entry["tip_origin_m"])
+    tip_rotation = _rows(entry["tip_rotation"])
+    tip_origin_m = tuple(entry["tip_origin_m"])
     return UrdfChain("base", "tip", tuple(joints), tip_rotation, tip_origin_m, ())
 
 
@@ -110,8 +116,8 @@ class Arm(NamedTuple):
     theta: Array
 
 
-def moving(arm: Arm, state: ChainState, v: Array) -> None:
-    """Places the rows in a state, and propagates its motion with v."""
+def propagate_state(arm: Arm, state: ChainState, v: Array) -> None:
+    """Places the rows of an arm in a state, and propagates the motion with v."""
     place_joints(arm.rows, state.q)
     propagate_motion(arm.rows, state.gravity, state.qd, v, state.a)
 
@@ -129,3 +135,8 @@ def full_matrix(arm: Arm) -> Array:
     n = len(arm.rows)
     lower = np.tril(arm.rows["M"][:, :n])
     return lower + np.tril(lower, -1).T
+
+
+def find_largest_difference(actual: Array, expected: Array) -> float:
+    """Returns the largest difference, relative to the largest expected number above 1."""
+    return float(np.abs(actual - expected).max() / max(1.0, np.abs(expected).max()))

@@ -1,15 +1,14 @@
 """Two arms under the rule `glide`: their limits, orders at ticks, and the reasons in a log."""
 
 import functools
-import io
 from typing import Any
 
 import numpy as np
 
+from tests.log.builders import open_bytes, simulate_bytes
 from trilat_net.core.step.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
-from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
-from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import RESTING_MODES
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
@@ -66,7 +65,7 @@ def adaptive_text() -> str:
     return text.replace('law = "pd_d"', 'law = "adaptive"')
 
 
-def guarded(
+def make_guarded_scenario(
     limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object
 ) -> Scenario:
     """Returns the scenario of the rule, with limits of all sites or of one."""
@@ -74,7 +73,9 @@ def guarded(
     return allow_own_code(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
 
 
-def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:
+def make_ordered_log(
+    scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0
+) -> Log:
     """Returns a virtual run in which sites are given orders at ticks."""
 
     def change(site: str, tick: int, order: str) -> CoreChange:
@@ -86,13 +87,10 @@ def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 
         site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
         for site, of_site in orders.items()
     }
-    stream = io.BytesIO()
-    virtual.write_virtual_log(scenario, stream, commands=commands)
-    stream.seek(0)
-    return open_log(stream)
+    return open_bytes(simulate_bytes(scenario, commands=commands))
 
 
-def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
+def list_reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
     """Returns the modes of a site in order, each with its reason."""
     modes: list[tuple[str, LifeReason]] = []
     for state in log[site].states:
@@ -103,12 +101,14 @@ def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
 
 
 @functools.cache
-def stopped_log(text: str = TEXT, enabled: int = 3500) -> Log:
+def make_stopped_log(text: str = TEXT, enabled: int = 3500) -> Log:
     """Returns the log of a slave that is stopped at 2 s, while it moves, and enabled at a tick."""
-    return ordered(guarded(text=text), {"s": {2000: "stop", enabled: "enable"}})
+    return make_ordered_log(
+        make_guarded_scenario(text=text), {"s": {2000: "stop", enabled: "enable"}}
+    )
 
 
-def largest_step(log: Log, site: str, first: int = 0) -> float:
+def find_largest_step(log: Log, site: str, first: int = 0) -> float:
     """Returns the largest change of a joint's torque between ticks; the torque before tick 0 is
     zero.
 

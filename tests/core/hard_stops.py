@@ -69,12 +69,14 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [
     ("unlike_arms", "", {}),
     ("play", "", {}),
 ]
-"""Scenario, law (none: its own) and settings."""
+"""Scenarios with a law and settings; an empty law stands for the scenario's law."""
 RATES_NM_S = (100.0, 300.0, 1000.0)
-MOST_ENERGY, MOST_SPEED = 1.05, 1.1
+MOST_ENERGY = 1.05
+MOST_SPEED = 1.1
 LEAST_ENERGY_J = 0.0125
-"""Of the arms of `free` whose joints move at 0.05 rad/s."""
-FIRST_S, LONGEST_S = 0.5, 8.0
+"""The kinetic energy of the arms of `free` at joint speeds of 0.05 rad/s."""
+FIRST_S = 0.5
+LONGEST_S = 8.0
 _DURATION_S = 1.2
 
 
@@ -113,7 +115,7 @@ class Stop(NamedTuple):
 
 
 @cache
-def make_scenario(number: int, rate_nm_s: float) -> Scenario:
+def make_fast_scenario(number: int, rate_nm_s: float) -> Scenario:
     name, law, settings = CASES[number]
     keys = {
         "duration_s": _DURATION_S,
@@ -127,28 +129,30 @@ def make_scenario(number: int, rate_nm_s: float) -> Scenario:
 
 
 @lru_cache(maxsize=len(CASES))
-def make_run(number: int) -> Log:
+def simulate_fast_arms(number: int) -> Log:
     """Returns a run of a case, from which stops of any rate of the torque begin."""
-    return trilat_net.simulate(make_scenario(number, RATES_NM_S[1]))
+    return trilat_net.simulate(make_fast_scenario(number, RATES_NM_S[1]))
 
 
 @cache
 def state_bound(number: int, rate_nm_s: float, site: str) -> float:
-    return find_rest_bounds(make_scenario(number, rate_nm_s), site).rest_s
+    return find_rest_bounds(make_fast_scenario(number, rate_nm_s), site).rest_s
 
 
-def draw_state(
+def draw_records(
     log: Log, site: str, rng: np.random.Generator, *, synthetic: bool, too_fast: bool
 ) -> tuple[TickRecord, TickRecord]:
     """Draws two successive records of a site that follows its peers; a stop starts from these."""
-    part, scenario = log[site], log.scenario
+    part = log[site]
+    scenario = log.scenario
     follows = np.isin(part.mode, ("return", "run"))
     rows = np.flatnonzero(follows[1:] & follows[:-1]) + 1
     at = int(rng.choice(rows))
     before, last = (read_output(part.states[row], part.peers) for row in (at - 1, at))
     if not synthetic:
         return before, last
-    spec, setup = scenario.sites[site], scenario.setup(site)
+    spec = scenario.sites[site]
+    setup = scenario.setup(site)
     joints = len(spec.q0_rad)
     q = rng.uniform(-np.pi, np.pi, joints)
     if spec.arm.urdf:
@@ -192,9 +196,11 @@ def measure_stop(
     last: TickRecord,
     records: list[TickRecord],
 ) -> Stop:
-    """Measures a stop by its records and the record before them."""
+    """Returns the measured stop, from its records and the record before them."""
     setup = scenario.setup(site)
-    rows, arm, h_s = build_arm_rows(scenario, site), scenario.arms[site], 1.0 / setup.rate_hz
+    rows = build_arm_rows(scenario, site)
+    arm = scenario.arms[site]
+    h_s = 1.0 / setup.rate_hz
     q = np.array([record.q for record in records])
     qd = np.array([record.qd for record in records])
     still = np.zeros_like(q)
@@ -235,11 +241,11 @@ def draw_stops(seed: int, count: int, *, faults: bool = False) -> Iterator[Stop]
         rng = np.random.default_rng((seed, n, int(faults)))
         number = n % len(CASES)
         rate_nm_s = float(rng.choice(RATES_NM_S))
-        scenario = make_scenario(number, rate_nm_s)
-        log = make_run(number)
+        scenario = make_fast_scenario(number, rate_nm_s)
+        log = simulate_fast_arms(number)
         site = str(rng.choice(scenario.names))
         synthetic = faults or bool(rng.random() < 0.5)
-        before, last = draw_state(log, site, rng, synthetic=synthetic, too_fast=faults)
+        before, last = draw_records(log, site, rng, synthetic=synthetic, too_fast=faults)
         records = run_stop(scenario, site, before, last)
         name, law, _ = CASES[number]
         case = f"{name} {law} {rate_nm_s:g} N m/s {site} {'drawn' if synthetic else 'run'} {n}"
@@ -247,7 +253,7 @@ def draw_stops(seed: int, count: int, *, faults: bool = False) -> Iterator[Stop]
         yield measure_stop(scenario, site, stated_s, case, last, records)
 
 
-def print_worst(title: str, stops: list[Stop]) -> None:
+def print_worst_stops(title: str, stops: list[Stop]) -> None:
     print(f"{title}: {len(stops)}, {sum(not stop.holds for stop in stops)} beyond a bound")
     for key in ("energy", "speed", "gained_j", "risen", "rest_s"):
         worst = max(stops, key=lambda stop: float(getattr(stop, key)))
@@ -263,11 +269,11 @@ if __name__ == "__main__":
     parser.add_argument("--stops", type=int, default=3000)
     parser.add_argument("--faults", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
-    asked = parser.parse_args()
-    for title, count in (("stops", asked.stops), ("faults", asked.faults)):
+    arguments = parser.parse_args()
+    for title, count in (("stops", arguments.stops), ("faults", arguments.faults)):
         judged: list[Stop] = []
-        for stop in draw_stops(asked.seed, count, faults=title == "faults"):
+        for stop in draw_stops(arguments.seed, count, faults=title == "faults"):
             judged.append(stop)
             if len(judged) % 100 == 0:
                 print(f"{title}: {len(judged)} of {count}", file=sys.stderr, flush=True)
-        print_worst(title, judged)
+        print_worst_stops(title, judged)

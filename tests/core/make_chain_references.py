@@ -35,7 +35,7 @@ def build_model(chain: UrdfChain) -> pin.Model:
     return model
 
 
-def parameters(chain: UrdfChain) -> Array:
+def read_parameters(chain: UrdfChain) -> Array:
     return np.concatenate([joint.inertia for joint in chain.joints])
 
 
@@ -52,18 +52,22 @@ def regressor(model: pin.Model, q: Array, qd: Array, v: Array, a: Array) -> Arra
     return Y(still, a) + 0.25 * (Y(qd + v, still) - Y(qd - v, still))
 
 
-def answer(model: pin.Model, chain: UrdfChain, state: dict[str, Array]) -> dict[str, Array]:
+def compute_answer(
+    model: pin.Model, chain: UrdfChain, state: dict[str, Array]
+) -> dict[str, Array]:
     """Returns Pinocchio's results for a state."""
     model.gravity.linear = state["gravity"]
     data = model.createData()
-    q, qd, tip = state["q"], state["qd"], model.nframes - 1
+    q = state["q"]
+    qd = state["qd"]
+    tip = model.nframes - 1
     Y = regressor(model, q, qd, state["v"], state["a"])
     inertia = np.triu(pin.crba(model, data, q).reshape(model.nv, model.nv))
     jacobian = pin.computeFrameJacobian(model, data, q, tip, pin.LOCAL_WORLD_ALIGNED)
     pin.framesForwardKinematics(model, data, q)
     pose = data.oMf[tip].copy()
     return {
-        "inverse_dynamics": Y @ parameters(chain),
+        "inverse_dynamics": Y @ read_parameters(chain),
         "regressor_transpose_r": Y.T @ state["r"],
         "forward_dynamics": pin.aba(model, model.createData(), q, qd, state["tau"]).copy(),
         "inertia": inertia + np.triu(inertia, 1).T,
@@ -80,10 +84,8 @@ def random_rotation(random: np.random.Generator) -> Array:
 
 def random_body(random: np.random.Generator) -> Array:
     """Returns ten parameters of eight point masses, which are physical for any draw."""
-    masses, places = (
-        random.uniform(0.05, 0.5, 8),
-        random.normal(0.0, 0.15, (8, 3)) + random.normal(0.0, 0.2, 3),
-    )
+    masses = random.uniform(0.05, 0.5, 8)
+    places = random.normal(0.0, 0.15, (8, 3)) + random.normal(0.0, 0.2, 3)
     x, y, z = places.T
     moments = (y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y)
     return np.array(
@@ -148,7 +150,7 @@ def main() -> None:
         entry["states"] = []
         for i in range(STATES):
             state = random_state(random, model.nv, weight=i == 0)
-            whole = state | answer(model, chain, state)
+            whole = state | compute_answer(model, chain, state)
             entry["states"].append({key: value.tolist() for key, value in whole.items()})
     references = {
         "source": f"Pinocchio {pin.__version__}, tests/core/make_chain_references.py",

@@ -32,13 +32,15 @@ def vectors(entry: st.SearchStrategy[float]) -> st.SearchStrategy[Array]:
     return st.tuples(entry, entry).map(np.array)
 
 
-angles, speeds = vectors(angle), vectors(speed)
+angles = vectors(angle)
+speeds = vectors(speed)
 STEP = 1e-30
 
 
 def centres(a: ArmLinks, q: NDArray) -> list[NDArray]:
     """Returns the centres of mass, in the vertical plane; q may be complex."""
-    first, both = q[0], q[0] + q[1]
+    first = q[0]
+    both = q[0] + q[1]
     elbow = a.l1_m * np.array([np.cos(first), np.sin(first)])
     first_centre = a.lc1_m * np.array([np.cos(first), np.sin(first)])
     return [first_centre, elbow + a.lc2_m * np.array([np.cos(both), np.sin(both)])]
@@ -46,14 +48,14 @@ def centres(a: ArmLinks, q: NDArray) -> list[NDArray]:
 
 def kinetic(a: ArmLinks, q: Array, qd: Array) -> float:
     """Returns the energy of the moving masses; their velocities by complex step along qd."""
-    one, two = (centre.imag / STEP for centre in centres(a, q + 1j * STEP * qd))
+    first, two = (centre.imag / STEP for centre in centres(a, q + 1j * STEP * qd))
     spin = a.I1_kg_m2 * qd[0] ** 2 + a.I2_kg_m2 * (qd[0] + qd[1]) ** 2
-    return float(0.5 * (a.m1_kg * one @ one + a.m2_kg * two @ two + spin))
+    return float(0.5 * (a.m1_kg * first @ first + a.m2_kg * two @ two + spin))
 
 
 def potential(a: ArmLinks, g: float, q: NDArray) -> NDArray:
-    one, two = centres(a, q)
-    return g * (a.m1_kg * one[1] + a.m2_kg * two[1])
+    first, two = centres(a, q)
+    return g * (a.m1_kg * first[1] + a.m2_kg * two[1])
 
 
 def gravity(a: ArmLinks, g: float, q: Array) -> Array:
@@ -63,8 +65,10 @@ def gravity(a: ArmLinks, g: float, q: Array) -> Array:
 
 def inertia(a: ArmLinks, q: NDArray) -> NDArray:
     """Returns the sum of m J'J and I, with the Jacobians of the centres of mass; q may be complex."""
-    s1, c1 = np.sin(q[0]), np.cos(q[0])
-    s12, c12 = np.sin(q[0] + q[1]), np.cos(q[0] + q[1])
+    s1 = np.sin(q[0])
+    c1 = np.cos(q[0])
+    s12 = np.sin(q[0] + q[1])
+    c12 = np.cos(q[0] + q[1])
     J1 = a.lc1_m * np.array([[-s1, 0 * s1], [c1, 0 * s1]])
     J2 = np.array(
         [

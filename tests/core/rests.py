@@ -1,4 +1,4 @@
-"""The equations of `resting` over the rows of a log, written again."""
+"""An independent version of the equations of `resting`, over the rows of a log."""
 
 import numpy as np
 
@@ -14,14 +14,17 @@ def gravity_of(theta: Array, q: Array) -> Array:
     return 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
 
 
-def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
+def compute_reference(
+    gains: RestGains, part: SiteLog, first: int, rows: int
+) -> tuple[Array, Array]:
     """Returns q_ref and qd_ref of an arm that comes to rest from record `first` on, with no
     torque at its limit.
 
     Eq. (1) of docs/theory/coming-to-rest.md, joint by joint; q_ref is the integral of qd_ref.
     """
     h_s = 1.0 / part.rate_hz
-    q_ref, qd_ref = [part.q[first].copy()], [part.qd[first].copy()]
+    q_ref = [part.q[first].copy()]
+    qd_ref = [part.qd[first].copy()]
     for n in range(1, rows):
         left_s = max(
             LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max())
@@ -35,7 +38,7 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
     return np.array(q_ref), np.array(qd_ref)
 
 
-def rest_torque(
+def compute_rest_torque(
     gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array
 ) -> tuple[Array, Array]:
     """Returns law + w - B s from a record on, and w, of a slow arm whose law does not learn.
@@ -44,12 +47,14 @@ def rest_torque(
     value at the start of a tick.
     """
     rows = slice(first, first + len(law))
-    q_ref, qd_ref = reference(gains, part, first, len(law))
-    B, qd = np.array(gains.damping), part.qd[rows]
+    q_ref, qd_ref = compute_reference(gains, part, first, len(law))
+    B = np.array(gains.damping)
+    qd = part.qd[rows]
     slip = qd - qd_ref + REST_RATE_1_S * (part.q[rows] - q_ref)
     haste = float((B * np.abs(qd[0]) / limit).max())
     w = (1.0 - haste) * (part.tau[first - 1] - law[0])
-    begun, taken = [], []
+    begun = []
+    taken = []
     for n in range(len(law)):
         begun.append(w)
         if n < LEAST_STOP_S * part.rate_hz or qd_ref[n].any():
@@ -60,7 +65,7 @@ def rest_torque(
     return np.array(taken), np.array(begun)
 
 
-def integrals(part: SiteLog, rows: slice) -> Array:
+def read_integrals(part: SiteLog, rows: slice) -> Array:
     """Returns w of the records after a given one, read from the torque at rest in `mem`."""
     first = 2 * (part.layout.shared + 1) + len(part.peers)
     return np.array(

@@ -6,9 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.channels import channel, due
-from tests.core.kinds import KINDS, POINTS
-from tests.core.sites import linked, sample, stepped
+from tests.core.builders import (
+    KINDS,
+    POINTS,
+    compute_due_ns,
+    make_arrival,
+    make_channel,
+    make_site_with_link,
+    step_site,
+)
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import DelayKind, LinkModel
 from trilat_net.core.step.site_step import Site
@@ -29,14 +35,14 @@ every_kind = pytest.mark.parametrize(
 quick = settings(max_examples=12)
 
 
-def behind(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
-    return linked(rate_hz, peer_rate_hz, [KINDS[name]], POINTS)
+def make_site_behind_link(name: str, rate_hz: int = 1000, peer_rate_hz: int = 1000) -> Site:
+    return make_site_with_link(rate_hz, peer_rate_hz, [KINDS[name]], POINTS)
 
 
-def releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
+def list_releases(name: str, count: int, rate_hz: int, peer_rate_hz: int) -> list[int]:
     """Returns the first tick of the receiver that may use each sample, or LOST, from a channel alone."""
-    release_times = due(
-        channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count
+    release_times = compute_due_ns(
+        make_channel([KINDS[name]], rate_hz=peer_rate_hz, points=POINTS), count
     ).tolist()
     return [
         LOST if ns == LOST else first_tick_at(max(ns, tick_ns(m, peer_rate_hz) + 1), rate_hz)
@@ -54,21 +60,21 @@ def test_the_newest_due_arrived_sample_is_used(
     name: str, came: list[list[int]], rates: tuple[int, int]
 ) -> None:
     """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
-    release = releases(name, 251, *rates)
-    site = behind(name, *rates)
+    release = list_releases(name, 251, *rates)
+    site = make_site_behind_link(name, *rates)
     arrived: set[int] = set()
     before = -1
     for k in range(TICKS):
         now = came[k] if k < len(came) else []
         arrived.update(now)
-        output = site.step(TickInput(k, [sample(m) for m in now]))
+        output = site.step(TickInput(k, [make_arrival(m) for m in now]))
         assert output.used == [max((m for m in arrived if LOST < release[m] <= k), default=-1)]
         assert output.used[0] >= before
         before = output.used[0]
         if before >= 0:
             assert (output.q_des, output.qd_des) == (
-                list(sample(before).q),
-                list(sample(before).qd),
+                list(make_arrival(before).q),
+                list(make_arrival(before).qd),
             )
 
 
@@ -77,12 +83,12 @@ def test_the_newest_due_arrived_sample_is_used(
 @given(came=arrivals)
 def test_every_arrival_is_accounted_for(name: str, came: list[list[int]]) -> None:
     """Accepted = refused + duplicate + lost + superseded + used, once no sample waits any more."""
-    site = behind(name)
-    release = releases(name, 251, 1000, 1000)
+    site = make_site_behind_link(name)
+    release = list_releases(name, 251, 1000, 1000)
     used: set[int] = set()
     for k in range(max(release) + len(came) + 1):
         now = came[k] if k < len(came) else []
-        used.add(site.step(TickInput(k, [sample(m) for m in now])).used[0])
+        used.add(site.step(TickInput(k, [make_arrival(m) for m in now])).used[0])
     counts = site.counts()[0]
     gone = counts.refused + counts.duplicate + counts.lost + counts.superseded
     assert counts.accepted == sum(map(len, came)) == gone + len(used - {-1})
@@ -114,10 +120,12 @@ def test_the_order_of_arrival_changes_no_bit(
     """Samples that come before they are due, in any order, some twice, in one batch or many."""
 
     def run_with(schedule: dict[int, list[int]]) -> list[TickRecord]:
-        ticks = [TickInput(k, [sample(m) for m in schedule.get(k, [])]) for k in range(450)]
+        ticks = [
+            TickInput(k, [make_arrival(m) for m in schedule.get(k, [])]) for k in range(450)
+        ]
         return [
             output._replace(rx_crc=0)
-            for output in stepped(behind(name, 1000, peer_rate_hz), ticks)
+            for output in step_site(make_site_behind_link(name, 1000, peer_rate_hz), ticks)
         ]
 
     scattered: dict[int, list[int]] = {}
@@ -132,27 +140,30 @@ def test_reused_sites_have_the_same_future(name: str, k: int) -> None:
     """A fresh site, or one used for something else before: the memory of a channel follows from
     the beginning.
     """
-    ticks = [TickInput(n, [sample(n - 1)] if n else []) for n in range(TICKS)]
-    whole = stepped(behind(name), ticks)
-    before, last = whole[max(0, k - 2)], whole[k - 1]
-    in_use = [sample(last.used[0]) if last.used[0] >= 0 else None]
-    waiting = [sample(m) for m in range(last.used[0] + 1, k - 1)]
-    worn = behind(name)
-    stepped(worn, ticks[: k + 100])
-    for site in (behind(name), worn):
+    ticks = [TickInput(n, [make_arrival(n - 1)] if n else []) for n in range(TICKS)]
+    whole = step_site(make_site_behind_link(name), ticks)
+    before = whole[max(0, k - 2)]
+    last = whole[k - 1]
+    in_use = [make_arrival(last.used[0]) if last.used[0] >= 0 else None]
+    waiting = [make_arrival(m) for m in range(last.used[0] + 1, k - 1)]
+    worn = make_site_behind_link(name)
+    step_site(worn, ticks[: k + 100])
+    for site in (make_site_behind_link(name), worn):
         site.restore_links(k, in_use, waiting)
         site.restore_state(before, last)
-        assert stepped(site, ticks[k:]) == whole[k:]
+        assert step_site(site, ticks[k:]) == whole[k:]
 
 
 @every_kind
 def test_a_long_silence_changes_nothing_afterwards(name: str) -> None:
     """The channel advances by index while no sample comes."""
-    silent = stepped(
-        behind(name), [TickInput(k, [sample(k - 1)] if k > 600 else []) for k in range(900)]
+    silent = step_site(
+        make_site_behind_link(name),
+        [TickInput(k, [make_arrival(k - 1)] if k > 600 else []) for k in range(900)],
     )
-    heard = stepped(
-        behind(name), [TickInput(k, [sample(k - 1)] if k else []) for k in range(900)]
+    heard = step_site(
+        make_site_behind_link(name),
+        [TickInput(k, [make_arrival(k - 1)] if k else []) for k in range(900)],
     )
     settled = next(k for k in range(601, 900) if silent[k].used[0] >= 600)
     assert [o.used for o in silent[settled:]] == [o.used for o in heard[settled:]]
@@ -172,7 +183,7 @@ hostile = st.one_of(
 @given(came=st.lists(st.lists(hostile, max_size=5), max_size=6))
 def test_work_is_bounded_for_any_sample_number(name: str, came: list[list[int]]) -> None:
     """A channel looks no further ahead than ten seconds, and no other peer's samples suffer."""
-    site = behind(name)
+    site = make_site_behind_link(name)
     for k, now in enumerate(came):
         output = site.step(TickInput(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
         assert site._links["scheduled"][0] <= k + 10_000
@@ -182,16 +193,18 @@ def test_work_is_bounded_for_any_sample_number(name: str, came: list[list[int]])
     assert counts.refused == sum(
         not 0 <= m <= k + 10_000 for k, now in enumerate(came) for m in now
     )
-    assert site.release_tick(0, 200) == behind(name).release_tick(0, 200)
+    assert site.release_tick(0, 200) == make_site_behind_link(name).release_tick(0, 200)
 
 
 @pytest.mark.parametrize("name", ["constant", "uniform", "measured", "in order"])
 def test_an_ancient_sample_counts_as_lost(name: str) -> None:
     """The page of the calendar has been reused; at 1 Hz there are 32 pages."""
-    site = behind(name, 1, 1)
-    stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(60)])
+    site = make_site_behind_link(name, 1, 1)
+    step_site(site, [TickInput(k, [make_arrival(k - 1)] if k else []) for k in range(60)])
     before = site.counts()[0]
-    output = site.step(TickInput(60, [sample(59), sample(3), sample(27), sample(40)]))
+    output = site.step(
+        TickInput(60, [make_arrival(59), make_arrival(3), make_arrival(27), make_arrival(40)])
+    )
     after = site.counts()[0]
     assert output.used == [59]
     assert after.lost - before.lost == 2
@@ -210,7 +223,7 @@ def test_measured_samples_are_used_from_arrival(
     came: list[int], rates: tuple[int, int]
 ) -> None:
     """But not at their own stamp: a sample from a clock that is ahead waits for the first later tick."""
-    site = linked(*rates, [LinkModel(kind=DelayKind.MEASURED)])
+    site = make_site_with_link(*rates, [LinkModel(kind=DelayKind.MEASURED)])
     for k in range(80):
         now = [m for m, at in enumerate(came) if at == k]
         usable = [
@@ -218,7 +231,7 @@ def test_measured_samples_are_used_from_arrival(
             for m, at in enumerate(came)
             if at <= k and tick_ns(m, rates[1]) < tick_ns(k, rates[0])
         ]
-        assert site.step(TickInput(k, [sample(m) for m in now])).used == [
+        assert site.step(TickInput(k, [make_arrival(m) for m in now])).used == [
             max(usable, default=-1)
         ]
     assert site.counts()[0].late == 0
@@ -227,13 +240,15 @@ def test_measured_samples_are_used_from_arrival(
 
 def test_measured_links_may_have_play_out_buffers() -> None:
     """Real jitter below the budget becomes a constant delay."""
-    site = linked(1000, 1000, [LinkModel(kind=DelayKind.MEASURED, playout_us=20_000)])
+    site = make_site_with_link(
+        1000, 1000, [LinkModel(kind=DelayKind.MEASURED, playout_us=20_000)]
+    )
     jitter = [1, 7, 3, 19, 12, 5, 20, 2]
     at: dict[int, list[int]] = {}
     for m in range(200):
         at.setdefault(m + jitter[m % 8], []).append(m)
-    outputs = stepped(
-        site, [TickInput(k, [sample(m) for m in at.get(k, [])]) for k in range(200)]
+    outputs = step_site(
+        site, [TickInput(k, [make_arrival(m) for m in at.get(k, [])]) for k in range(200)]
     )
     assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
 
@@ -241,10 +256,12 @@ def test_measured_links_may_have_play_out_buffers() -> None:
 def test_a_cut_link_ages_and_heals() -> None:
     """`used` stands still, never decreases, and is back to nominal with the first fresh sample."""
     model = LinkModel(location=20_000.0)
-    site = linked(1000, 1000, [model], outages=((100 * 10**6, 200 * 10**6),))
+    site = make_site_with_link(1000, 1000, [model], outages=((100 * 10**6, 200 * 10**6),))
     used = [
         o.used[0]
-        for o in stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(300)])
+        for o in step_site(
+            site, [TickInput(k, [make_arrival(k - 1)] if k else []) for k in range(300)]
+        )
     ]
     assert used[20:120] == list(range(100))
     assert used[120:220] == [99] * 100

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from tests.core.chain_references import Arm, chain_references, full_matrix, moving, torque_for
+from tests.core.chain_references import (
+    Arm,
+    chain_references,
+    find_largest_difference,
+    full_matrix,
+    propagate_state,
+    torque_for,
+)
 from trilat_net.core.arms.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
@@ -21,7 +28,7 @@ EPS = np.finfo(float).eps
 each = pytest.mark.parametrize("name", REFERENCES)
 
 
-def build(name: str, **drive: float) -> Arm:
+def build_arm(name: str, **drive: float) -> Arm:
     joints = REFERENCES[name].chain.joints
     fields = [
         ChainJoint(
@@ -34,34 +41,30 @@ def build(name: str, **drive: float) -> Arm:
     )
 
 
-def largest_difference(got: Array, wanted: Array) -> float:
-    return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
-
-
 @each
 def test_inverse_dynamics_and_gradient_are_those_of_pinocchio(name: str) -> None:
     """M a + C v + G with C by Christoffel symbols, Eq. (12), and Y' r, Eq. (15)."""
-    arm = build(name)
+    arm = build_arm(name)
     gradient = np.zeros(LINK_PARAMETERS * len(arm.rows))
     for state in REFERENCES[name].states:
-        moving(arm, state, state.v)
+        propagate_state(arm, state, state.v)
         assert (
-            largest_difference(torque_for(arm, state.v, state.a), state.inverse_dynamics)
+            find_largest_difference(torque_for(arm, state.v, state.a), state.inverse_dynamics)
             <= 1e-12
         )
         parameter_gradient(arm.rows, gradient)
-        assert largest_difference(gradient, state.regressor_transpose_r) <= 1e-12
+        assert find_largest_difference(gradient, state.regressor_transpose_r) <= 1e-12
 
 
 @each
 def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
     """M to 1e-12, and accelerations to 100 eps of its condition."""
-    arm = build(name)
+    arm = build_arm(name)
     qdd = np.zeros(len(arm.rows))
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         M = full_matrix(arm)
-        assert largest_difference(M, state.inertia) <= 1e-12
+        assert find_largest_difference(M, state.inertia) <= 1e-12
         find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
         wanted = state.forward_dynamics
         assert (
@@ -71,40 +74,42 @@ def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
 
 @each
 def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
-    arm, chain = build(name), REFERENCES[name].chain
+    arm = build_arm(name)
+    chain = REFERENCES[name].chain
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
         assert (
-            largest_difference(
+            find_largest_difference(
                 np.array(place_end_effector(arm.rows, chain.tip_origin_m)), state.tip_position
             )
             <= 1e-12
         )
         assert (
-            largest_difference(
+            find_largest_difference(
                 np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian
             )
             <= 1e-12
         )
         rotation = arm.rows["R_base"][-1] @ np.array(chain.tip_rotation)
-        assert largest_difference(rotation, state.tip_rotation) <= 1e-12
+        assert find_largest_difference(rotation, state.tip_rotation) <= 1e-12
 
 
 def test_friction_and_drives_enter_both_dynamics_alike() -> None:
     """The torque of inverse dynamics for a motion makes that motion, with armature and friction too."""
-    arm = build("arm7", armature_kg_m2=0.1, viscous=0.5, coulomb=1.5)
-    state, qdd = REFERENCES["arm7"].states[0], np.zeros(7)
-    moving(arm, state, state.qd)
+    arm = build_arm("arm7", armature_kg_m2=0.1, viscous=0.5, coulomb=1.5)
+    state = REFERENCES["arm7"].states[0]
+    qdd = np.zeros(7)
+    propagate_state(arm, state, state.qd)
     torque = torque_for(arm, state.qd, state.a)
     find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, torque, qdd)
-    assert largest_difference(qdd, state.a) <= 1e-11
+    assert find_largest_difference(qdd, state.a) <= 1e-11
 
 
 def stop_torque(q: list[float], qd: list[float]) -> Array:
     """Returns the generalised force of the stops of two joints, N m: their change of M qdd."""
     arms = (
-        build("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0),
-        build("random2"),
+        build_arm("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0),
+        build_arm("random2"),
     )
     qdds = np.zeros((2, 2))
     for arm, qdd in zip(arms, qdds, strict=True):

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from tests.core.chain_references import Arm, ChainState, chain_references, moving, torque_for
+from tests.core.chain_references import (
+    Arm,
+    ChainState,
+    chain_references,
+    propagate_state,
+    torque_for,
+)
 from trilat_net.core.arms.chain import ChainJoint
 from trilat_net.core.arms.chain_stages import place_chain, update_errors, update_torque
 from trilat_net.core.step.site_arrays import SiteArrays
@@ -15,7 +21,7 @@ each = pytest.mark.parametrize("name", ["arm6", "arm7", "random3"])
 LAMBDA = 2.0
 
 
-def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
+def build_arrays(name: str, state: ChainState, **gains: object) -> SiteArrays:
     """Returns a site with the chain in a state; with its reference, v and a are those of the state."""
     chain = REFERENCES[name].chain
     joints = tuple(
@@ -45,16 +51,15 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
         pages=8,
     )
     site = arrays.site[0]
-    site["q_des"][:n], site["qd_des"][:n] = (
-        state.q + state.v / LAMBDA,
-        state.qd + state.a / LAMBDA,
-    )
+    site["q_des"][:n] = state.q + state.v / LAMBDA
+    site["qd_des"][:n] = state.qd + state.a / LAMBDA
     return arrays
 
 
 def find_torque(arrays: SiteArrays) -> Array:
     """Returns the torque of the site's law in its tick, N m."""
-    site, chain = arrays.site[0], arrays.chain
+    site = arrays.site[0]
+    chain = arrays.chain
     place_chain(site, chain)
     update_errors(site, chain)
     update_torque(site, chain)
@@ -65,7 +70,7 @@ def find_torque(arrays: SiteArrays) -> Array:
 def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
     """Eq. (13): Y theta - Kp r - Kd ed, and Y' r of Eq. (15)."""
     for state in REFERENCES[name].states:
-        arrays = build(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
+        arrays = build_arrays(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
         wanted = state.inverse_dynamics - 3.0 * (state.qd - state.v) + 5.0 * state.a / LAMBDA
         np.testing.assert_allclose(find_torque(arrays), wanted, rtol=1e-9, atol=1e-9)
         transpose_rows = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
@@ -78,14 +83,14 @@ def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
 def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
     """G - K e - d qd - Kd ed, where G is the torque of inverse dynamics for the arm at rest."""
     for state in REFERENCES[name].states:
-        arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
+        arrays = build_arrays(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
         torque = find_torque(arrays)
         still = 0.0 * state.q
         arm = Arm(
             arrays.chain,
             np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints]),
         )
-        moving(arm, state._replace(qd=still, a=still), still)
+        propagate_state(arm, state._replace(qd=still, a=still), still)
         wanted = torque_for(arm, still, still)
         assert np.abs(wanted).max() > 1e-3
         wanted += 7.0 * state.v / LAMBDA - 2.0 * state.qd + 5.0 * state.a / LAMBDA

@@ -7,9 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.channels import SEEDS, Ints, channel, due, stamps
-from tests.core.compiled import run_program
-from tests.core.kinds import KINDS, POINTS, fates
+from tests.core.builders import (
+    KINDS,
+    POINTS,
+    SEEDS,
+    Ints,
+    compute_due_ns,
+    compute_fates,
+    compute_stamps_ns,
+    make_channel,
+)
+from tests.programs import run_python
 from trilat_net.core.links.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
@@ -36,10 +44,11 @@ LOSSES: list[LinkBase] = [
 ]
 
 
-def bursts(lost: np.ndarray) -> Ints:
+def list_burst_lengths(lost: np.ndarray) -> Ints:
     """Returns the lengths of runs of losses, without a run that the end truncates."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], lost]).astype(np.int8)))
-    begin, end = edges[::2], edges[1::2]
+    begin = edges[::2]
+    end = edges[1::2]
     return end - begin[: len(end)]
 
 
@@ -55,8 +64,9 @@ def test_loss_and_burst_follow_their_model(link: LinkBase, seed: int) -> None:
     geometric.
     """
     model = link.to_core_model()
-    lost = due(channel([model], seed), COUNT) == LOST
-    p, h = link.loss, link.loss_bad
+    lost = compute_due_ns(make_channel([model], seed), COUNT) == LOST
+    p = link.loss
+    h = link.loss_bad
     variance = p * (1 - p)
     if link.loss_burst:
         memory = 1 - model.enter - model.leave
@@ -64,7 +74,7 @@ def test_loss_and_burst_follow_their_model(link: LinkBase, seed: int) -> None:
         assert share * h == pytest.approx(p, rel=1e-12)
         variance += 2 * h * h * share * (1 - share) * memory / (1 - memory)
     assert abs(lost.mean() - p) <= SIGMAS * math.sqrt(variance / COUNT)
-    lengths = bursts(lost)
+    lengths = list_burst_lengths(lost)
     mean = link.loss_burst or 1 / (1 - p)
     allowed = SIGMAS / math.sqrt(len(lengths))
     assert abs(lengths.mean() - mean) <= allowed * math.sqrt(mean * (mean - 1))
@@ -79,14 +89,17 @@ def test_loss_and_burst_follow_their_model(link: LinkBase, seed: int) -> None:
 def test_first_samples_are_lost_with_stationary_probability(seed: int) -> None:
     """A chain begins in its stationary distribution, over links of one seed."""
     model = NoDelay(loss=0.4, loss_burst=50).to_core_model()
-    first = [due(channel([model], seed, f"a{n}->s"), 1)[0] == LOST for n in range(4000)]
+    first = [
+        compute_due_ns(make_channel([model], seed, f"a{n}->s"), 1)[0] == LOST
+        for n in range(4000)
+    ]
     assert abs(np.mean(first) - 0.4) <= SIGMAS * math.sqrt(0.24 / 4000)
 
 
 def test_directions_and_seeds_lose_independently() -> None:
     model = NoDelay(loss=0.5).to_core_model()
     series = [
-        due(channel([model], seed, name), 100_000) == LOST
+        compute_due_ns(make_channel([model], seed, name), 100_000) == LOST
         for seed, name in ((1, "m1->s"), (1, "s->m1"), (2, "m1->s"))
     ]
     for a, b in ((0, 1), (0, 2), (1, 2)):
@@ -94,11 +107,11 @@ def test_directions_and_seeds_lose_independently() -> None:
 
 
 def test_losses_are_independent_of_delays() -> None:
-    """So the delays of the samples that arrive are those of the link without loss."""
+    """The delays of the samples that arrive are those of the link without loss."""
     link = UniformDelay(delay_ms=100, half_width_ms=50)
-    whole = due(channel([link.to_core_model()]), 10_000)
-    holed = due(
-        channel(
+    whole = compute_due_ns(make_channel([link.to_core_model()]), 10_000)
+    holed = compute_due_ns(
+        make_channel(
             [
                 UniformDelay(
                     delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4
@@ -117,24 +130,24 @@ def test_losses_are_independent_of_delays() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_copies_have_their_share(seed: int) -> None:
-    link_channel = channel([NoDelay(duplicate=0.07).to_core_model()], seed)
-    due(link_channel, COUNT)
+    link_channel = make_channel([NoDelay(duplicate=0.07).to_core_model()], seed)
+    compute_due_ns(link_channel, COUNT)
     assert abs(int(link_channel.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(
         0.07 * 0.93 / COUNT
     )
 
 
 def test_the_earlier_of_sample_and_copy_counts() -> None:
-    """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
+    """A sample and its copy have separate delays, and the smaller of two uniform numbers has its mean at a third."""
     link = UniformDelay(delay_ms=100, half_width_ms=60)
-    single = due(channel([link.to_core_model()]), 100_000)
-    link_channel = channel(
+    single = compute_due_ns(make_channel([link.to_core_model()]), 100_000)
+    link_channel = make_channel(
         [UniformDelay(delay_ms=100, half_width_ms=60, duplicate=1.0).to_core_model()]
     )
-    doubled = due(link_channel, 100_000)
+    doubled = compute_due_ns(link_channel, 100_000)
     assert link_channel.row.copies == 100_000
     assert (doubled <= single).all()
-    smaller_ms = (doubled - stamps(100_000)) / 1e6
+    smaller_ms = (doubled - compute_stamps_ns(100_000)) / 1e6
     assert smaller_ms.mean() == pytest.approx(
         40 + 120 / 3, abs=SIGMAS * 120 / math.sqrt(18 * 100_000)
     )
@@ -148,15 +161,18 @@ def test_an_outage_takes_the_samples_stamped_within_it() -> None:
         [(10_000_000, 20_000_000), (15_000_000, 25_500_000), (40_000_000, 40_000_001)]
     )
     lost = np.flatnonzero(
-        due(channel([NoDelay().to_core_model()], points=cut, outages=3), 60) == LOST
+        compute_due_ns(make_channel([NoDelay().to_core_model()], points=cut, outages=3), 60)
+        == LOST
     )
     assert lost.tolist() == [*range(10, 26), 40]
 
 
 def test_in_order_no_sample_overtakes_an_older_one() -> None:
     keys = {"delay_ms": 50.0, "deviation_ms": 30.0, "loss": 0.1}
-    free = due(channel([GammaDelay(**keys).to_core_model()]), 20_000)
-    ordered = due(channel([GammaDelay(**keys, order="in_order").to_core_model()]), 20_000)
+    free = compute_due_ns(make_channel([GammaDelay(**keys).to_core_model()]), 20_000)
+    ordered = compute_due_ns(
+        make_channel([GammaDelay(**keys, order="in_order").to_core_model()]), 20_000
+    )
     kept = free != LOST
     assert ((ordered == LOST) == ~kept).all()
     assert (ordered[kept] == np.maximum.accumulate(free[kept])).all()
@@ -164,17 +180,22 @@ def test_in_order_no_sample_overtakes_an_older_one() -> None:
 
 
 def test_newly_ordered_links_hold_samples_back() -> None:
-    first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
-    due_ns = due(channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80)
+    first = ConstantDelay(delay_ms=50.0)
+    then = ConstantDelay(delay_ms=1.0, order="in_order")
+    due_ns = compute_due_ns(
+        make_channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80
+    )
     assert due_ns[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
     assert due_ns[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
 
 
 @given(playout_ms=st.floats(0, 300))
 def test_play_out_holds_samples_for_its_budget(playout_ms: float) -> None:
-    free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).to_core_model()]), 500)
-    due_ns = due(
-        channel(
+    free = compute_due_ns(
+        make_channel([UniformDelay(delay_ms=100, half_width_ms=100).to_core_model()]), 500
+    )
+    due_ns = compute_due_ns(
+        make_channel(
             [
                 UniformDelay(
                     delay_ms=100, half_width_ms=100, playout_ms=playout_ms
@@ -183,7 +204,9 @@ def test_play_out_holds_samples_for_its_budget(playout_ms: float) -> None:
         ),
         500,
     )
-    assert (due_ns == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
+    assert (
+        due_ns == np.maximum(free, compute_stamps_ns(500) + round(playout_ms * 1000) * 1000)
+    ).all()
 
 
 # Changes of model.
@@ -194,15 +217,15 @@ def test_a_model_holds_from_its_first_stamp_on() -> None:
         ConstantDelay(delay_ms=d).to_core_model(n)
         for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
     ]
-    delays = due(channel(models), 10) - stamps(10)
+    delays = compute_due_ns(make_channel(models), 10) - compute_stamps_ns(10)
     assert (delays // 10**6).tolist() == [5, 5, 5, 5, 9, 9, 9, 1, 1, 1]
 
 
 def test_delays_are_unaffected_by_changed_loss() -> None:
     keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
-    whole = due(channel([GammaDelay(**keys).to_core_model()]), 2000)
-    changed = due(
-        channel(
+    whole = compute_due_ns(make_channel([GammaDelay(**keys).to_core_model()]), 2000)
+    changed = compute_due_ns(
+        make_channel(
             [
                 GammaDelay(**keys).to_core_model(),
                 GammaDelay(**keys, loss=0.2).to_core_model(500 * 10**6),
@@ -226,9 +249,9 @@ def test_delays_are_unaffected_by_changed_loss() -> None:
     pages=st.sampled_from([64, 128, 8192]),
 )
 def test_fates_do_not_depend_on_steps(name: str, steps: list[int], pages: int) -> None:
-    link_channel = channel([KINDS[name]], points=POINTS, pages=pages)
-    parts = [due(link_channel, int(n)) for n in np.cumsum(steps)]
-    assert np.concatenate(parts).tolist() == fates(name, sum(steps)).tolist()
+    link_channel = make_channel([KINDS[name]], points=POINTS, pages=pages)
+    parts = [compute_due_ns(link_channel, int(n)) for n in np.cumsum(steps)]
+    assert np.concatenate(parts).tolist() == compute_fates(name, sum(steps)).tolist()
 
 
 GOLDEN = {
@@ -254,23 +277,23 @@ GOLDEN = {
 @pytest.mark.parametrize("name", KINDS)
 def test_golden_fates(name: str) -> None:
     """The due times of the first eight samples of m1->s with seed 1, us, or LOST."""
-    due_us = [LOST if ns == LOST else ns // 1000 for ns in fates(name, 8).tolist()]
+    due_us = [LOST if ns == LOST else ns // 1000 for ns in compute_fates(name, 8).tolist()]
     assert due_us == GOLDEN[name]
 
 
 _PROGRAM = """
-from tests.core.philox_reference import table
-from tests.core.kinds import fates, KINDS
+from tests.core.philox_reference import make_table
+from tests.core.builders import KINDS, compute_fates
 for kind, shape in ((0, 0.0), (1, 0.0), (2, 0.3), (2, 4.0)):
-    print(" ".join(number.hex() for number in table(300, kind, shape).tolist()))
+    print(" ".join(number.hex() for number in make_table(300, kind, shape).tolist()))
 for name in KINDS:
-    print(name, fates(name, 200).tolist())
+    print(name, compute_fates(name, 200).tolist())
 """
 
 
 @pytest.mark.long
 def test_uncompiled_draws_and_fates_have_equal_bits() -> None:
-    plain = run_program(_PROGRAM, compiled=False)
+    plain = run_python(_PROGRAM, compiled=False)
     assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)
     assert plain.count("[") == len(KINDS)
-    assert plain == run_program(_PROGRAM, compiled=True)
+    assert plain == run_python(_PROGRAM, compiled=True)

@@ -48,7 +48,8 @@ def test_torque(
 
 @given(limit=st.floats(0.1, 100.0), ed=speeds)
 def test_torque_is_held_within_its_limit(limit: float, ed: Array) -> None:
-    ones, none = np.ones(2), np.zeros(2)
+    ones = np.ones(2)
+    none = np.zeros(2)
     tau = control.adaptive_torque(
         ((0.0,) * 5,) * 2, np.zeros(5), ones, 7.0 * ones, none, ed, limit
     )

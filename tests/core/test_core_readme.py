@@ -16,8 +16,18 @@ from trilat_net.core.step.ticks import LinkCounts
 TEXT = README.read_text(encoding="utf-8")
 CHAIN = Layout(joints=6, shared=3, parameters=60, chain=True, task=True)
 STAGES = {
-    *("1 accept", "2 release", "3 reference", "4 errors", "5 estimate", "6 torque"),
-    *("7 emit", "8 advance", "fused run", "setup", "input", "scratch"),
+    "1 accept",
+    "2 release",
+    "3 reference",
+    "4 errors",
+    "5 estimate",
+    "6 torque",
+    "7 emit",
+    "8 advance",
+    "fused run",
+    "setup",
+    "input",
+    "scratch",
 }
 
 

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
+from tests.core.builders import (
+    LINK_NAME,
+    SEEDS,
+    Ints,
+    compute_due_ns,
+    draw_delays_us,
+    make_channel,
+)
 from tests.core.philox_reference import philox_in_integers
 from trilat_net.core.links.delay import (
     MAX_DELAY_US,
@@ -37,7 +44,7 @@ COUNT = 1_000_000
 SIGMAS = 4.0
 
 
-def truncated(link: NormalDelay) -> Any:
+def truncate_normal(link: NormalDelay) -> Any:
     return stats.truncnorm(
         -link.delay_ms / link.deviation_ms, np.inf, link.delay_ms, link.deviation_ms
     )
@@ -87,7 +94,7 @@ INDEPENDENT: list[tuple[LinkBase, Any]] = [
             ],
         ),
         (
-            truncated,
+            truncate_normal,
             [
                 NormalDelay(delay_ms=200, deviation_ms=30),
                 NormalDelay(delay_ms=10, deviation_ms=20),
@@ -127,11 +134,11 @@ CORRELATED = [
 ]
 
 
-def named(value: object) -> str | None:
+def name_case(value: object) -> str | None:
     return value.describe() if isinstance(value, LinkBase) else None
 
 
-def likely(delays_us: Ints, law: Any) -> bool:
+def is_likely(delays_us: Ints, law: Any) -> bool:
     """Applies Kolmogorov and Smirnov's test at the bounds between whole microseconds, where
     rounding has no effect.
     """
@@ -152,7 +159,8 @@ def holds_its_moments(
     mean_ms, deviation_ms = link.moments()
     variance = (1e3 * deviation_ms) ** 2 + 1 / 12
     centred = delays - 1e3 * mean_ms
-    second, fourth = np.mean(centred**2), np.mean(centred**4)
+    second = np.mean(centred**2)
+    fourth = np.mean(centred**4)
     count = len(delays)
     assert abs(centred.mean()) <= SIGMAS * math.sqrt(mean_factor * variance / count)
     error = math.sqrt(factor * (fourth - second**2) / (4 * second * count))
@@ -160,46 +168,49 @@ def holds_its_moments(
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
+@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=name_case)
 def test_mean_and_deviation_over_a_million_draws(link: LinkBase, law: Any, seed: int) -> None:  # noqa: ARG001
-    holds_its_moments(link, delays_us(link, seed, COUNT))
+    holds_its_moments(link, draw_delays_us(link, seed, COUNT))
 
 
 def test_a_uniform_delay_worked_out_by_hand() -> None:
-    """From the published generator to microseconds, in Python's integers: purpose 2, attempt 0."""
+    """Python's integers lead from the published generator to microseconds, with purpose 2 and attempt 0."""
     key = link_key(1, LINK_NAME)
     draws = [philox_in_integers((m, 0, 2, 0), (key & 0xFFFFFFFF, key >> 32)) for m in range(50)]
     units = [((high >> 6 << 26) + (low >> 6) + 0.5) / 2**52 for high, low, *_ in draws]
     expected = [math.floor(200_000 + 150_000 * (2 * u - 1) + 0.5) for u in units]
-    assert delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist() == expected
+    assert (
+        draw_delays_us(UniformDelay(delay_ms=200, half_width_ms=150), 1, 50).tolist()
+        == expected
+    )
 
 
-@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
+@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=name_case)
 def test_the_closed_forms_are_scipys(link: LinkBase, law: Any) -> None:
     assert link.moments() == pytest.approx((law.mean(), law.std()), rel=1e-9)
 
 
-@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=named)
+@pytest.mark.parametrize(("link", "law"), INDEPENDENT, ids=name_case)
 def test_the_distribution_is_the_stated_one(link: LinkBase, law: Any) -> None:
-    delays = delays_us(link, 5, 200_000)
-    assert likely(delays, law)
+    delays = draw_delays_us(link, 5, 200_000)
+    assert is_likely(delays, law)
     assert abs(np.corrcoef(delays[:-1], delays[1:])[0, 1]) < SIGMAS / math.sqrt(len(delays))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("link", CORRELATED, ids=named)
+@pytest.mark.parametrize("link", CORRELATED, ids=name_case)
 def test_correlated_delays_have_their_moments_and_correlations(
     link: CorrelatedDelay, seed: int
 ) -> None:
     """Variances of the estimates of an AR(1) sequence: Bartlett 1946."""
-    delays = delays_us(link, seed, COUNT)
+    delays = draw_delays_us(link, seed, COUNT)
     c = link.correlation
     holds_its_moments(link, delays, (1 + c) / (1 - c), (1 + c**2) / (1 - c**2))
     x = (delays - delays.mean()) / delays.std()
     for lag in range(1, 6):
         variance = (1 + c**2) * (1 - c ** (2 * lag)) / (1 - c**2) - 2 * lag * c ** (2 * lag)
         assert abs(np.mean(x[:-lag] * x[lag:]) - c**lag) <= SIGMAS * math.sqrt(variance / COUNT)
-    assert likely(delays[:: 200 if c else 1], stats.norm(link.delay_ms, link.deviation_ms))
+    assert is_likely(delays[:: 200 if c else 1], stats.norm(link.delay_ms, link.deviation_ms))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -208,7 +219,7 @@ def test_correlated_delays_cut_at_zero_have_their_moments(seed: int) -> None:
     before the cut.
     """
     link = CorrelatedDelay(delay_ms=10, deviation_ms=15, correlation=0.8)
-    delays = delays_us(link, seed, COUNT)
+    delays = draw_delays_us(link, seed, COUNT)
     assert np.mean(delays == 0) == pytest.approx(stats.norm.cdf(-10 / 15), abs=0.01)
     holds_its_moments(link, delays, 1.8 / 0.2, 1.64 / 0.36)
 
@@ -226,10 +237,10 @@ def test_the_moments_of_a_cut_normal_distribution(delay_ms: float, deviation_ms:
 
 
 def test_a_sine_over_whole_periods() -> None:
-    """Its mean, its deviation and its values, without any randomness."""
+    """The mean, the deviation and the values of a sine are exact, since it has no randomness."""
     link = SineDelay(delay_ms=120, amplitude_ms=80, period_s=2.5, phase_rad=0.4)
-    delays = delays_us(link, 1, COUNT)
-    assert (delays == delays_us(link, 2, COUNT)).all()
+    delays = draw_delays_us(link, 1, COUNT)
+    assert (delays == draw_delays_us(link, 2, COUNT)).all()
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, abs=5e-4)
     assert delays.std() / 1e3 == pytest.approx(link.moments().deviation_ms, abs=5e-4)
     t_s = np.arange(COUNT) / 1000
@@ -245,7 +256,7 @@ ROWS = [(0.0, 10.0), (0.5, 40.25), (0.75, 0.0), (1.0, 7.5)]
 @pytest.mark.long
 def test_looped_traces_have_moments_of_one_pass() -> None:
     link = TraceDelay(trace=format_trace(ROWS), at_end="loop")
-    delays = delays_us(link, 1, 1250 * 800)
+    delays = draw_delays_us(link, 1, 1250 * 800)
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, rel=1e-12)
     assert delays.std() / 1e3 == pytest.approx(link.moments().deviation_ms, rel=1e-12)
 
@@ -262,7 +273,7 @@ def test_a_trace_holds_its_last_points_delay(
     t_us = np.cumsum([0, *gaps_us])
     # others around it
     points = np.array([(7, 7), *zip(t_us, delays, strict=False), (9, 9)], dtype=np.int64)
-    rows = np.zeros(1, dtype=channel([LinkModel()]).models.dtype)
+    rows = np.zeros(1, dtype=make_channel([LinkModel()]).models.dtype)
     rows[0] = tuple(
         LinkModel(kind=DelayKind.TRACE, at_end=at_end, trace_first=1, trace_count=len(t_us))
     )
@@ -276,7 +287,9 @@ def test_a_trace_holds_its_last_points_delay(
 def test_a_trace_may_lose_samples() -> None:
     link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
     points = parse_trace(link.trace)
-    due_ns = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
+    due_ns = compute_due_ns(
+        make_channel([link.to_core_model()._replace(trace_count=3)], points=points), 8
+    )
     assert due_ns.tolist() == [
         5_000_000,
         6_000_000,

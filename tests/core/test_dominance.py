@@ -14,7 +14,7 @@ SMALLEST = 1e-6
 
 
 @st.composite
-def matrices(draw: st.DrawFn, zeros: bool = True) -> Array:
+def draw_matrix(draw: st.DrawFn, zeros: bool = True) -> Array:
     """Rows that sum to one, zero diagonal, other entries zero or at least 1e-6."""
     size = draw(st.integers(2, 6))
     share = st.one_of(st.floats(-6, 0).map(lambda x: 10**x), *([st.just(0.0)] if zeros else []))
@@ -36,7 +36,8 @@ def strongly_connected(a: Array) -> bool:
     """Walks from the first site along the edges and against them."""
 
     def reached(edges: Array) -> set[int]:
-        visited, new = {0}, [0]
+        visited = {0}
+        new = [0]
         while new:
             new = [
                 j
@@ -49,7 +50,7 @@ def strongly_connected(a: Array) -> bool:
     return len(reached(a)) == len(reached(a.T)) == len(a)
 
 
-@given(a=matrices())
+@given(a=draw_matrix())
 def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
     """beta'Upsilon = 0 after Eq. (20), to 1e-12 of each entry, and every entry is positive."""
     assume(strongly_connected(a))
@@ -59,12 +60,12 @@ def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
     assert beta @ a == pytest.approx(beta, rel=1e-12, abs=0.0)
 
 
-@given(a=matrices())
+@given(a=draw_matrix())
 def test_irreducible_matrices_have_strongly_connected_graphs(a: Array) -> None:
     assert is_irreducible(a) == strongly_connected(a)
 
 
-@given(a=matrices(zeros=False), closed=st.integers(2, 5))
+@given(a=draw_matrix(zeros=False), closed=st.integers(2, 5))
 def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
     """The first sites follow each other alone: all other sites have no weight."""
     assume(closed < len(a))
@@ -75,7 +76,7 @@ def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
         perron_vector(a)
 
 
-@given(a=matrices(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))
+@given(a=draw_matrix(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))
 def test_rows_sum_to_one_within_1e_9(a: Array, off: float, own: int) -> None:
     """Eq. (7)."""
     row = a[own].copy()

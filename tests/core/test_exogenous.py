@@ -29,7 +29,7 @@ pairs = st.tuples(number, number)
 stiff = st.tuples(st.floats(0, 50), st.floats(0, 50))
 
 
-def torque(
+def compute_torque(
     t_s: float,
     q: Array,
     qd: Array,
@@ -42,13 +42,13 @@ def torque(
     )
 
 
-def tip(q: Array) -> Array:
+def compute_tip(q: Array) -> Array:
     """Returns the position of the tip, by complex numbers."""
     z = LENGTHS[0] * np.exp(1j * q[0]) + LENGTHS[1] * np.exp(1j * (q[0] + q[1]))
     return np.array([z.real, z.imag])
 
 
-def downhill(potential, q: Array) -> Array:
+def differentiate_down(potential, q: Array) -> Array:
     """Returns minus the gradient of a potential, by central differences."""
     steps = np.eye(2) * STEP
     return np.array(
@@ -56,7 +56,7 @@ def downhill(potential, q: Array) -> Array:
     )
 
 
-def still(q: Array) -> Array:
+def zero_speed(q: Array) -> Array:
     return np.zeros_like(q)
 
 
@@ -64,7 +64,7 @@ def test_pulses_are_symmetric_and_zero_outside() -> None:
     pulse = TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0))
 
     def at(t_s: float) -> list[float]:
-        return torque(t_s, np.zeros(2), np.zeros(2), pulse).tolist()
+        return compute_torque(t_s, np.zeros(2), np.zeros(2), pulse).tolist()
 
     assert at(0.5) == at(1.0) == at(6.0) == at(7.0) == [0.0, 0.0]
     assert at(3.5) == pytest.approx([10.0, -4.0])
@@ -95,8 +95,8 @@ def test_external_torques_add_up(q: Array, qd: Array, t_s: float) -> None:
         TorqueSource(TorqueKind.VISCOUS, B=(2.0, 3.0)),
         TorqueSource(TorqueKind.WALL, K=(100.0, 0.0), a=(0.5, 0.0), b=(-1.0, 0.0)),
     )
-    torque_sum = sum(torque(t_s, q, qd, actor) for actor in actors)
-    assert torque(t_s, q, qd, *actors) == pytest.approx(torque_sum, abs=1e-9)
+    torque_sum = sum(compute_torque(t_s, q, qd, actor) for actor in actors)
+    assert compute_torque(t_s, q, qd, *actors) == pytest.approx(torque_sum, abs=1e-9)
 
 
 @given(q=angles, K=stiff, target=pairs)
@@ -107,7 +107,9 @@ def test_a_resting_hand_is_a_spring(q: Array, K: Pair, target: Pair) -> None:
     def potential(at: Array) -> float:
         return float(0.5 * np.array(K) @ (at - target) ** 2)
 
-    assert torque(1.0, q, still(q), hand) == pytest.approx(downhill(potential, q), abs=1e-5)
+    assert compute_torque(1.0, q, zero_speed(q), hand) == pytest.approx(
+        differentiate_down(potential, q), abs=1e-5
+    )
 
 
 @given(q=angles, K=stiff, target=pairs)
@@ -115,9 +117,11 @@ def test_hand_at_tip_is_spring_in_plane(q: Array, K: Pair, target: Pair) -> None
     hand = TorqueSource(TorqueKind.TASK_HAND, K=K, a=target, b=target)
 
     def potential(at: Array) -> float:
-        return float(0.5 * np.array(K) @ (tip(at) - target) ** 2)
+        return float(0.5 * np.array(K) @ (compute_tip(at) - target) ** 2)
 
-    assert torque(1.0, q, still(q), hand) == pytest.approx(downhill(potential, q), abs=1e-4)
+    assert compute_torque(1.0, q, zero_speed(q), hand) == pytest.approx(
+        differentiate_down(potential, q), abs=1e-4
+    )
 
 
 @given(q=angles, K=st.floats(0, 1000), point=pairs, direction=st.floats(-4, 4))
@@ -128,10 +132,10 @@ def test_a_wall_is_a_spring_on_one_side(
     wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=point, b=normal)
 
     def potential(at: Array) -> float:
-        return float(0.5 * K * max(0.0, (np.array(point) - tip(at)) @ normal) ** 2)
+        return float(0.5 * K * max(0.0, (np.array(point) - compute_tip(at)) @ normal) ** 2)
 
-    expected = downhill(potential, q)
-    assert torque(1.0, q, still(q), wall) == pytest.approx(
+    expected = differentiate_down(potential, q)
+    assert compute_torque(1.0, q, zero_speed(q), wall) == pytest.approx(
         expected, abs=1e-3 * (1 + np.abs(expected).max())
     )
 
@@ -142,27 +146,27 @@ def test_a_wall_is_a_spring_on_one_side(
 def test_a_wall_never_pulls(q: Array, qd: Array, K: float, B: float, direction: float) -> None:
     """Whatever its damping, the wall's force points along its normal, or is zero."""
     normal = np.array([math.cos(direction), math.sin(direction)])
-    pushed = torque(
+    pushed = compute_torque(
         1.0,
         q,
         qd,
         TorqueSource(TorqueKind.WALL, K=(K, 0.0), B=(B, 0.0), a=(0.3, 0.2), b=tuple(normal)),
     )
     # the torque of a force of 1 N along the normal
-    unit = downhill(lambda at: -float(tip(at) @ normal), q)
+    unit = differentiate_down(lambda at: -float(compute_tip(at) @ normal), q)
     assert pushed @ unit >= -1e-6 * (1 + np.abs(pushed).max())
 
 
 @given(q=angles, qd=speeds, B=stiff)
 def test_viscous_elements_dissipate_in_any_motion(q: Array, qd: Array, B: Pair) -> None:
-    assert torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(
+    assert compute_torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(
         -np.array(B) * qd
     )
 
 
 @given(start=st.floats(-5, 5), length=st.floats(0.01, 5), x=st.floats(0, 1))
 def test_a_move_has_minimum_jerk(start: float, length: float, x: float) -> None:
-    """It is the fifth-order polynomial that begins and ends at rest without acceleration, and its rate."""
+    """The motion is the polynomial of fifth order that begins and ends at rest without acceleration."""
     way = minimum_jerk(start + x * length, start, start + length)
     conditions = np.zeros((6, 6))
     for row, (at, derivative) in enumerate((at, d) for at in (0.0, 1.0) for d in range(3)):
@@ -187,8 +191,8 @@ def test_targets_stand_still_outside_their_move() -> None:
         move_end_s=2,
     )
     rest = np.zeros(2)
-    assert torque(0.5, rest, rest, hand).tolist() == [1.0, 2.0]
-    assert torque(2.5, rest, rest, hand).tolist() == [3.0, 5.0]
+    assert compute_torque(0.5, rest, rest, hand).tolist() == [1.0, 2.0]
+    assert compute_torque(2.5, rest, rest, hand).tolist() == [3.0, 5.0]
 
 
 @given(
@@ -204,7 +208,7 @@ def test_recorded_torque_is_linear_between_its_points(
     rows: list[tuple[float, ...]], t_s: float
 ) -> None:
     table = np.array(sorted(rows))
-    torques = torque(
+    torques = compute_torque(
         t_s, np.zeros(2), np.zeros(2), TorqueSource(TorqueKind.RECORDED, table=table)
     )
     nothing = {"left": 0.0, "right": 0.0}
@@ -216,19 +220,19 @@ def test_recorded_torque_is_linear_between_its_points(
 def test_chirps_sweep_their_frequencies_evenly_and_repeat(
     t_s: float, ends: tuple[float, float]
 ) -> None:
-    """By SciPy's chirp."""
+    """The torque equals SciPy's chirp, which repeats."""
     source = TorqueSource(TorqueKind.CHIRP, 2.0, 30.0, 2.0, 6.0, (3.0, -1.0), ends)
     sine = signal.chirp((t_s - 2.0) % 4.0, ends[0], 4.0, ends[1], phi=-90)
-    torques = torque(t_s, np.zeros(2), np.zeros(2), source)
+    torques = compute_torque(t_s, np.zeros(2), np.zeros(2), source)
     assert torques == pytest.approx([3.0 * sine, -sine], abs=1e-6)
 
 
 def test_a_multisine_has_only_its_lines() -> None:
-    """By its spectrum over a period; its peak is far below the sum of its amplitudes."""
+    """The spectrum over a period has only the given lines, and the peak is far below the sum of the amplitudes."""
     hz = (0.5, 0.75, 1.0, 2.5, 4.0, 7.0, 7.25, 9.0)
     source = Multisine(amplitude_nm=(2.0, 0.0), frequencies_hz=hz, start_s=1.0).actor
     t_s = 1.0 + np.arange(400) / 100.0
-    torques = np.array([torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
+    torques = np.array([compute_torque(t, np.zeros(2), np.zeros(2), source)[0] for t in t_s])
     amplitude = 2.0 * np.abs(np.fft.rfft(torques)) / len(torques)
     expected = np.where(np.isin(np.arange(201) / 4.0, hz), 2.0, 0.0)
     assert amplitude == pytest.approx(expected, abs=1e-9)
@@ -236,7 +240,7 @@ def test_a_multisine_has_only_its_lines() -> None:
     given_phases = Multisine(
         amplitude_nm=(1.0, 1.0), frequencies_hz=(2.0,), phases_rad=(0.5,)
     ).actor
-    assert torque(0.1, np.zeros(2), np.zeros(2), given_phases)[0] == pytest.approx(
+    assert compute_torque(0.1, np.zeros(2), np.zeros(2), given_phases)[0] == pytest.approx(
         math.sin(0.4 * math.pi + 0.5)
     )
 
@@ -245,8 +249,11 @@ def test_sampled_and_continuous_torques_are_separate() -> None:
     rest = np.zeros(2)
     torque_source = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(1.0, 1.0), sampled=True)
     other = TorqueSource(TorqueKind.PULSE, 0.0, 2.0, a=(5.0, 5.0))
-    assert torque(1.0, rest, rest, torque_source, other).tolist() == [5.0, 5.0]
-    assert torque(1.0, rest, rest, torque_source, other, sampled=True).tolist() == [1.0, 1.0]
+    assert compute_torque(1.0, rest, rest, torque_source, other).tolist() == [5.0, 5.0]
+    assert compute_torque(1.0, rest, rest, torque_source, other, sampled=True).tolist() == [
+        1.0,
+        1.0,
+    ]
 
 
 class ConstantEffort(OwnActor, frozen=True, tag="constant_effort"):
@@ -263,22 +270,26 @@ def test_no_torque_acts_outside_its_time(acts: TorqueKind) -> None:
     actor = TorqueSource(
         acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table, grip=1.0, model=model
     )
-    q, qd = np.array([0.1, 0.2]), np.array([0.3, -0.2])
+    q = np.array([0.1, 0.2])
+    qd = np.array([0.3, -0.2])
     for t_s in (1.9, 3.0, 4.0):
-        assert torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]
-    assert torque(2.5, q, qd, actor).any()
+        assert compute_torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]
+    assert compute_torque(2.5, q, qd, actor).any()
 
 
 @pytest.mark.parametrize(("acts", "like"), [("LIVE_TIP", "TASK_HAND"), ("LIVE_JOINT", "HAND")])
 def test_live_hands_are_springs_with_limits(acts: str, like: str) -> None:
     """The force is scaled by the grip; beyond the limit its direction stays and its size is the limit."""
-    q, qd = np.array([0.1, 0.2]), np.zeros(2)
+    q = np.array([0.1, 0.2])
+    qd = np.zeros(2)
     vectors = {"a": (1.2, 0.3), "b": (1.2, 0.3), "K": (50.0, 50.0), "B": (4.0, 4.0)}
-    spring = torque(1.0, q, qd, TorqueSource(TorqueKind[like], **vectors))
-    half = torque(1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=0.5))
+    spring = compute_torque(1.0, q, qd, TorqueSource(TorqueKind[like], **vectors))
+    half = compute_torque(1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=0.5))
     np.testing.assert_allclose(half, 0.5 * spring, rtol=1e-14)
-    limited = torque(1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=1.0, limit=2.0))
-    at = tip(q) if acts == "LIVE_TIP" else q
+    limited = compute_torque(
+        1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=1.0, limit=2.0)
+    )
+    at = compute_tip(q) if acts == "LIVE_TIP" else q
     np.testing.assert_allclose(
         limited, spring * 2.0 / (50.0 * np.hypot(*(vectors["a"] - at))), rtol=1e-12
     )

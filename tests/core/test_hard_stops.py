@@ -82,7 +82,8 @@ def test_a_fault_at_sixty_rad_s_loses_energy(law: tuple[str, float, float, float
             continue
         first = int(faults[0])
         rows = build_arm_rows(log.scenario, site)
-        q, qd = part.q[first:], part.qd[first:]
+        q = part.q[first:]
+        qd = part.qd[first:]
         kinetic_j = 0.5 * (qd * rows.multiply_inertia(q, qd)).sum(axis=1)
         bounds = find_rest_bounds(log.scenario, site)
         assert kinetic_j.max() <= kinetic_j[0] + bounds.blend_j

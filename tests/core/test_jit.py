@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.compiled import run_program
+from tests.programs import run_python
 
 SYMBOLS = """
 import numba, numpy as np
@@ -23,15 +23,15 @@ for n in {}:
 
 def test_symbols_of_leaves_separate_layouts() -> None:
     """With Numba's numbering, the first layouts of all processes would have equal symbols."""
-    one, other = (
+    first, other = (
         dict(
             line.split()
-            for line in run_program(SYMBOLS.format(order), compiled=True).splitlines()
+            for line in run_python(SYMBOLS.format(order), compiled=True).splitlines()
         )
         for order in ((6, 7), (7, 6))
     )
-    assert one == other
-    assert one["6"] != one["7"]
+    assert first == other
+    assert first["6"] != first["7"]
 
 
 CLOSURES = """

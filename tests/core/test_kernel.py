@@ -16,7 +16,7 @@ LENGTHS = np.array([1.0, 0.9])
 G = 9.81
 
 
-def carried(
+def advance_arm(
     q0: Array,
     qd0: Array,
     h_s: float,
@@ -24,21 +24,23 @@ def carried(
     u: Array,
     actors: tuple[TorqueSource, ...] = (),
 ) -> tuple[Array, Array]:
-    q, qd, who = (q0[0], q0[1]), (qd0[0], qd0[1]), torque_source_rows(actors)
+    q = (q0[0], q0[1])
+    qd = (qd0[0], qd0[1])
+    who = torque_source_rows(actors)
     for k in range(periods):
         q, qd = rk4_step(k * h_s, h_s, q, qd, u, theta_from_links(ARM), G, LENGTHS, *who)
     return np.array(q), np.array(qd)
 
 
-def energy(q: Array, qd: Array) -> float:
+def compute_energy(q: Array, qd: Array) -> float:
     return physics.kinetic(ARM, q, qd) + float(physics.potential(ARM, G, q))
 
 
 @settings(max_examples=30)
 @given(q=angles, qd=physics.vectors(physics.st.floats(-3, 3)))
 def test_an_arm_without_torque_keeps_its_energy(q: Array, qd: Array) -> None:
-    assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2))) == pytest.approx(
-        energy(q, qd), abs=1e-5
+    assert compute_energy(*advance_arm(q, qd, 1e-3, 500, np.zeros(2))) == pytest.approx(
+        compute_energy(q, qd), abs=1e-5
     )
 
 
@@ -50,7 +52,7 @@ HANDS = tuple(
 SPAN_S = 0.1
 
 
-def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
+def measure_errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
     """Returns the distance from a solution of Eq.
 
     (8) by another method, for each number of periods in the span.
@@ -68,7 +70,7 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
 
     start = np.concatenate([q, qd])
     exact = solve_ivp(rate, (0.0, SPAN_S), start, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    ends = [np.concatenate(carried(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
+    ends = [np.concatenate(advance_arm(q, qd, SPAN_S / n, n, u, HANDS)) for n in periods]
     return [
         float(np.abs(end_state - exact).max() / (1 + np.abs(exact).max())) for end_state in ends
     ]
@@ -77,16 +79,16 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
 @settings(max_examples=10)
 @given(q=angles, qd=speeds, u=physics.vectors(physics.st.floats(-50, 50)))
 def test_motion_solves_the_equation_of_motion(q: Array, qd: Array, u: Array) -> None:
-    assert errors(q, qd, u, 400)[0] < 1e-6
+    assert measure_errors(q, qd, u, 400)[0] < 1e-6
 
 
 @pytest.mark.push
 def test_the_integrators_order_is_four() -> None:
-    """In the median of many states: in a single one leading terms may cancel."""
+    """The order holds for the median of many states, since leading terms may cancel in a single state."""
     chance = np.random.default_rng(4)
     orders = []
     for _ in range(25):
-        coarse, fine = errors(
+        coarse, fine = measure_errors(
             chance.uniform(-3, 3, 2),
             chance.uniform(-6, 6, 2),
             chance.uniform(-50, 50, 2),

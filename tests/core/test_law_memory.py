@@ -30,21 +30,24 @@ class Holder:
         self.kept = kept
 
 
-def describe(value: Any) -> Any:
+def describe_value(value: Any) -> Any:
     """Returns the form of a value: its types, and the shapes of its arrays."""
     if isinstance(value, np.ndarray):
         return value.dtype, value.shape
     return (
-        [type(value), *map(describe, value)] if isinstance(value, list | tuple) else type(value)
+        [type(value), *map(describe_value, value)]
+        if isinstance(value, list | tuple)
+        else type(value)
     )
 
 
 @given(values)
 def test_memory_is_restored_in_its_own_form(kept: Any) -> None:
-    first, again = Holder(kept), Holder(kept)
+    first = Holder(kept)
+    again = Holder(kept)
     memory = read_memory(first)
     write_memory(again, memory)
-    assert describe(again.kept) == describe(kept)
+    assert describe_value(again.kept) == describe_value(kept)
     assert read_memory(again) == memory
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.core.sites import one_link, sample, stepped
-from tests.virtual_runs import run
+from tests.core.builders import make_arrival, make_site_with_delay, step_site
+from tests.execution.builders import make_shipped_trajectories
 from trilat_net.core.links.link import calendar_pages
 from trilat_net.core.step.ticks import TickInput
 
@@ -24,12 +24,15 @@ class SampleList:
     """L2 by brute force: of all due samples, the newest that has arrived."""
 
     def __init__(self, rate_hz: int, peer_rate_hz: int, delay_ns: int) -> None:
-        self.rate_hz, self.peer_rate_hz, self.delay_ns = rate_hz, peer_rate_hz, delay_ns
+        self.rate_hz = rate_hz
+        self.peer_rate_hz = peer_rate_hz
+        self.delay_ns = delay_ns
         self.come: dict[int, int] = {}
         self.accepted = self.late = self.duplicate = self.refused = 0
 
     def due(self, tick: int, k: int) -> bool:
-        now, stamp = stamp_ns(k, self.rate_hz), stamp_ns(tick, self.peer_rate_hz)
+        now = stamp_ns(k, self.rate_hz)
+        stamp = stamp_ns(tick, self.peer_rate_hz)
         return now >= stamp + self.delay_ns and now > stamp
 
     def take(self, k: int, tick: int) -> None:
@@ -55,7 +58,9 @@ class SampleList:
 def test_samples_are_released_when_due_after_stamp(
     rate_hz: int, peer_rate_hz: int, delay_us: int, tick: int
 ) -> None:
-    released = one_link(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(0, tick)
+    released = make_site_with_delay(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(
+        0, tick
+    )
     assert released is not None
     model = SampleList(rate_hz, peer_rate_hz, delay_us * 1000)
     assert model.due(tick, released)
@@ -73,18 +78,19 @@ def test_the_newest_due_sample_is_in_use(
 ) -> None:
     """Any order, late samples, duplicates, and stamps of the future, all against the list."""
     rates_and_delay = (rate_hz, peer_rate_hz, delay_us * 1000)
-    site, model = one_link(*rates_and_delay), SampleList(*rates_and_delay)
+    site = make_site_with_delay(*rates_and_delay)
+    model = SampleList(*rates_and_delay)
     arrivals = st.lists(st.integers(-1, 40), max_size=6)
     for k in range(25):
         arrival_list = data.draw(arrivals)
         for tick in arrival_list:
             model.take(k, tick)
-        output = site.step(TickInput(k, [sample(tick) for tick in arrival_list]))
+        output = site.step(TickInput(k, [make_arrival(tick) for tick in arrival_list]))
         used = model.used(k)
         assert output.used == [used]
         if used >= 0:
-            assert output.q_des == list(sample(used).q)
-            assert output.qd_des == list(sample(used).qd)
+            assert output.q_des == list(make_arrival(used).q)
+            assert output.qd_des == list(make_arrival(used).qd)
     counts = site.counts()[0]
     assert (counts.accepted, counts.late) == (model.accepted, model.late)
     assert (counts.duplicate, counts.refused) == (model.duplicate, model.refused)
@@ -92,9 +98,9 @@ def test_the_newest_due_sample_is_in_use(
 
 @pytest.mark.parametrize("peer_rate_hz", [1, 1000, 20_000])
 def test_stamps_ten_seconds_ahead_are_refused(peer_rate_hz: int) -> None:
-    site = one_link(1000, peer_rate_hz, 0)
+    site = make_site_with_delay(1000, peer_rate_hz, 0)
     limit = 10 * peer_rate_hz
-    site.step(TickInput(0, [sample(limit), sample(limit + 1)]))
+    site.step(TickInput(0, [make_arrival(limit), make_arrival(limit + 1)]))
     assert site.counts()[0].refused == 1
 
 
@@ -107,9 +113,9 @@ def test_calendars_have_pages_for_all_waiting_samples(rate_hz: int) -> None:
 
 
 def test_early_samples_leave_nearer_ones_alone() -> None:
-    site = one_link(1000, 1000, 10_000_000_000)
-    first = [sample(m) for m in range(0, 10_001, 50)]
-    outputs = stepped(site, [TickInput(0, first), *(TickInput(k) for k in range(1, 20_001))])
+    site = make_site_with_delay(1000, 1000, 10_000_000_000)
+    first = [make_arrival(m) for m in range(0, 10_001, 50)]
+    outputs = step_site(site, [TickInput(0, first), *(TickInput(k) for k in range(1, 20_001))])
     assert [o.used[0] for o in outputs] == [
         -1 if k < 10_000 else 50 * ((k - 10_000) // 50) for k in range(20_001)
     ]
@@ -126,7 +132,7 @@ def test_peers_are_used_once_due_after_stamps(delay_ms: float, ticks: int) -> No
     """Between two ticks the later one uses a sample that is due, and one without delay is used
     a period after its stamp.
     """
-    records = run("paper", {"link.delay_ms": delay_ms, "duration_s": 0.5})
+    records = make_shipped_trajectories("paper", {"link.delay_ms": delay_ms, "duration_s": 0.5})
     expected = np.maximum(np.arange(500) - ticks, -1)
     for name, site in records.sites.items():
         assert (site.used == expected[:, None]).all()
@@ -137,7 +143,7 @@ def test_peers_are_used_once_due_after_stamps(delay_ms: float, ticks: int) -> No
 
 
 def test_each_link_of_asymmetric_has_its_own_delay() -> None:
-    records = run("asymmetric", {"duration_s": 1.0})
+    records = make_shipped_trajectories("asymmetric", {"duration_s": 1.0})
     for name, site in records.sites.items():
         for j, peer in enumerate(records.scenario.peers(name)):
             slip = round(records.scenario.links[f"{peer}->{name}"].delay_ms)
@@ -148,7 +154,7 @@ def test_each_link_of_asymmetric_has_its_own_delay() -> None:
 
 
 def test_a_peer_first_rests_at_its_start() -> None:
-    records = run("free", {"duration_s": 1.0})
+    records = make_shipped_trajectories("free", {"duration_s": 1.0})
     starts = {name: np.array(spec.q0_rad) for name, spec in records.scenario.sites.items()}
     for name, site in records.sites.items():
         a, b = (starts[p] for p in records.scenario.peers(name))

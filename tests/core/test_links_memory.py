@@ -6,10 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.chains import six_joints
-from tests.core.kinds import KINDS
-from tests.core.sites import linked, one_link, sample, stepped
-from tests.task_arms import planar_task
+from tests.core.builders import (
+    KINDS,
+    make_arrival,
+    make_site_with_delay,
+    make_site_with_link,
+    step_site,
+)
+from tests.scenario.builders import planar_task_text, six_joint_text
 from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.links.link import AHEAD_LIMIT_S, calendar_pages
 from trilat_net.core.step.site_arrays import (
@@ -40,15 +44,15 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "gamma": ("paper", {"link.model": "gamma", "link.deviation_ms": 20.0}),
     "normal": ("paper", {"link.model": "normal", "link.deviation_ms": 20.0}),
     "uniform": ("paper", {"link.model": "uniform", "link.half_width_ms": 50.0}),
-    "six joints": (six_joints(1.0), {}),
-    "a place": (planar_task(1.0), {}),
+    "six joints": (six_joint_text(1.0), {}),
+    "a place": (planar_task_text(1.0), {}),
     "a law that sends": ("paper", {"control.law": "tests.channel_law:Talking"}),
 }
 
 
 @pytest.mark.parametrize("kind", SCENARIOS)
 def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
-    """At 1 kHz and at 4 kHz, whatever the arms, the laws and the distribution."""
+    """The limit holds at 1 kHz and 4 kHz for any arms, laws and distributions."""
     source, changes = SCENARIOS[kind]
     for rate_hz in (1000, 4000):
         scenario = load_scenario(
@@ -64,7 +68,7 @@ def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
 # Calendars that widen give what the widest give.
 
 
-def wide(site: Site, pages: int) -> Site:
+def make_wide_site(site: Site, pages: int) -> Site:
     site._arrays = widen_calendars(site._arrays, 0, pages)
     site._tick_arrays = (*site._arrays, *site._buffers)
     return site
@@ -83,11 +87,9 @@ ORDERS = st.one_of(
 @given(data=st.data())
 def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataObject) -> None:
     """Senders up to ten seconds ahead and late by as much, out of order and twice, delays that change."""
-    grown, widest = (
-        linked(*rates, [LinkModel(location=1_000.0)]),
-        linked(*rates, [LinkModel(location=1_000.0)]),
-    )
-    widest = wide(widest, calendar_pages(rates[0]))
+    grown = make_site_with_link(*rates, [LinkModel(location=1_000.0)])
+    widest = make_site_with_link(*rates, [LinkModel(location=1_000.0)])
+    widest = make_wide_site(widest, calendar_pages(rates[0]))
     first = grown._arrays.calendars.shape[1]
     now = 0
     arrival_ticks = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
@@ -103,24 +105,24 @@ def test_widening_links_keep_the_records(rates: tuple[int, int], data: st.DataOb
         if model is not None:
             from_ns = (now + rates[0] // 10) * 10**9 // rates[0]
             orders = [CoreChange("order", 0, model._replace(from_ns=from_ns))]
-        tick = TickInput(now, [sample(max(own_tick + m, 0)) for m in ahead], orders)
+        tick = TickInput(now, [make_arrival(max(own_tick + m, 0)) for m in ahead], orders)
         assert grown.step(tick) == widest.step(tick)
         idly = [TickInput(now + n) for n in range(1, idle)]
-        assert stepped(grown, idly) == stepped(widest, idly)
+        assert step_site(grown, idly) == step_site(widest, idly)
         assert grown.counts() == widest.counts()
         now += idle
     assert first <= grown._arrays.calendars.shape[1] <= calendar_pages(rates[0])
 
 
 def test_growing_delays_lose_no_sample() -> None:
-    """From 1 ms to ten seconds: every sent sample comes into use when it is due."""
-    site = one_link(1000, 1000, 1_000_000)
+    """While the delay grows from 1 ms to ten seconds, every sent sample comes into use when it is due."""
+    site = make_site_with_delay(1000, 1000, 1_000_000)
     order = CoreChange("longer", 0, LinkModel(from_ns=1_000_000_000, location=9_999_000.0))
     ticks = (
-        TickInput(k, [sample(k - 1)] if k else [], [order] if k == 800 else [])
+        TickInput(k, [make_arrival(k - 1)] if k else [], [order] if k == 800 else [])
         for k in range(13_000)
     )
-    used = [record.used[0] for record in stepped(site, ticks)]
+    used = [record.used[0] for record in step_site(site, ticks)]
     assert used[1000:10_999] == [999] * 9999
     assert used[10_999:] == list(range(1000, 3001))
     assert site.counts()[0].lost == site.counts()[0].refused == 0
@@ -132,14 +134,17 @@ def test_samples_on_their_way_survive_the_widening() -> None:
         "paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"}
     )
     setups = [scenario.setup("m1")] * 2
-    small, large = Site(setups[0]), wide(Site(setups[1]), 1 << 15)
+    small = Site(setups[0])
+    large = make_wide_site(Site(setups[1]), 1 << 15)
     for k in range(400):
         arrivals = [
-            sample(k - 1, peer)._replace(tau_x=(0.1 * k, 0.0), ch=(0.1 * k + peer, 1.0, 2.0))
+            make_arrival(k - 1, peer)._replace(
+                tau_x=(0.1 * k, 0.0), ch=(0.1 * k + peer, 1.0, 2.0)
+            )
             for peer in (0, 1)
         ]
         if k == 50:
-            arrivals.append(sample(5000)._replace(tau_x=(9.0, 9.0), ch=(1.0, 2.0, 3.0)))
+            arrivals.append(make_arrival(5000)._replace(tau_x=(9.0, 9.0), ch=(1.0, 2.0, 3.0)))
         tick = TickInput(k, arrivals if k else [])
         assert small.step(tick) == large.step(tick)
     assert small._arrays.calendars.shape[1] == 8192
@@ -148,7 +153,7 @@ def test_samples_on_their_way_survive_the_widening() -> None:
 # One limit.
 
 
-def many(count: int, rate_hz: int, delay_ms: float) -> str:
+def many_sites_text(count: int, rate_hz: int, delay_ms: float) -> str:
     """Returns the text of so many sites, each of which follows the site before it."""
     names = [f"a{n}" for n in range(count)]
     sites = "".join(f"[sites.{name}]\n" for name in names)
@@ -162,13 +167,13 @@ def many(count: int, rate_hz: int, delay_ms: float) -> str:
     ("count", "rate_hz"), [(3, 4000), (8, 1000), (12, 1000), (12, 4000), (32, 1000)]
 )
 def test_the_recorder_takes_virtual_runs(count: int, rate_hz: int) -> None:
-    scenario = parse_scenario(many(count, rate_hz, 100.0))
+    scenario = parse_scenario(many_sites_text(count, rate_hz, 100.0))
     assert parse_embedded(scenario.text).names == scenario.names
     assert count_link_bytes(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
 
 
 def test_limit_has_equal_words_in_all_scenarios() -> None:
-    text = many(12, 20_000, 9000.0)
+    text = many_sites_text(12, 20_000, 9000.0)
     problems = []
     for read in (parse_scenario, parse_embedded):
         with pytest.raises(
@@ -182,7 +187,7 @@ def test_limit_has_equal_words_in_all_scenarios() -> None:
 
 
 def test_changes_beyond_the_limit_are_refused() -> None:
-    scenario = parse_scenario(many(12, 20_000, 1.0))
+    scenario = parse_scenario(many_sites_text(12, 20_000, 1.0))
     present = LinkTables(scenario.links, ())
     change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
     assert resolve_change(scenario, present, change, 10**9).link == "a1->a0"
@@ -194,13 +199,14 @@ def test_limited_links_count_what_they_refuse() -> None:
     """A site with less memory refuses stamps from further ahead; all others come into use."""
     setup = load_scenario("paper").setup("m1")
     assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
-    free, tight = one_link(1000, 1000, 1_000_000), one_link(1000, 1000, 1_000_000)
+    free = make_site_with_delay(1000, 1000, 1_000_000)
+    tight = make_site_with_delay(1000, 1000, 1_000_000)
     tight._sizer.most_pages = 1024
-    ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
+    ahead = TickInput(0, [make_arrival(m) for m in (0, 500, 900, 1100, 5000)])
     for site in (free, tight):
         used = [
             record.used[0]
-            for record in stepped(site, [ahead, *(TickInput(k) for k in range(1, 1000))])
+            for record in step_site(site, [ahead, *(TickInput(k) for k in range(1, 1000))])
         ]
         assert used[-1] == 900
     assert free.counts()[0].refused == 0
@@ -209,8 +215,8 @@ def test_limited_links_count_what_they_refuse() -> None:
 
 
 def test_the_most_pages_are_within_the_limit() -> None:
-    """For a limit below twenty seconds."""
-    setup = parse_scenario(many(12, 4000, 100.0)).setup("a0")
+    """The number of pages is bounded for every limit below twenty seconds."""
+    setup = parse_scenario(many_sites_text(12, 4000, 100.0)).setup("a0")
     pages = CalendarSizer(setup).most_pages
     assert needed_pages(setup) < pages < calendar_pages(4000)
     assert links_bytes(setup, pages) <= MAX_LINKS_BYTES < links_bytes(setup, 2 * pages)

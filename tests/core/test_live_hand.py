@@ -33,11 +33,12 @@ RULES = HandRules(size=2, rate_hz=1000, speed_limit=1.5)
 ARM = (1.0, 0.5)
 
 
-def run(
+def advance_ticks(
     messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES
 ) -> list[HandStep]:
     """Returns the hand's state in each tick, with the given messages before some ticks."""
-    memory, steps = HandMemory(), []
+    memory = HandMemory()
+    steps = []
     for k in range(ticks):
         step = advance_hand(
             rules, memory, k * 10**9 // rules.rate_hz, messages.get(k, ()), lambda: ARM
@@ -47,7 +48,7 @@ def run(
     return steps
 
 
-def hands(steps: list[HandStep]) -> list[HandInForce]:
+def list_hands(steps: list[HandStep]) -> list[HandInForce]:
     """Returns the message in force in each tick."""
     return [HandInForce.read(step.vector) for step in steps]
 
@@ -67,8 +68,8 @@ def message_at(
 
 
 def test_holds_begin_without_force_and_grow() -> None:
-    steps = run(message_at(10, (1.2, 0.5)), 150)
-    before, first, *rest = hands(steps)[9:]
+    steps = advance_ticks(message_at(10, (1.2, 0.5)), 150)
+    before, first, *rest = list_hands(steps)[9:]
     assert before == HandInForce.read(empty_hand_vector(2))
     assert first.target == ARM
     assert first.grip == 0.0
@@ -86,22 +87,22 @@ def test_the_target_glides_linearly_between_messages() -> None:
     for n in range(60):
         k = round(n * 1000 / 60)
         messages |= message_at(k, (1.0 + 0.6 * k / 1000, 0.5))
-    moved = np.array([hand.target[0] for hand in hands(run(messages, 1000))])
+    moved = np.array([hand.target[0] for hand in list_hands(advance_ticks(messages, 1000))])
     speed = np.diff(moved)[200:] * 1000
     assert speed == pytest.approx(0.6, abs=0.05)
     assert moved[-1] == pytest.approx(1.0 + 0.6 * 0.99, abs=0.02)
 
 
 def test_the_speed_of_the_target_is_limited() -> None:
-    steps = hands(run(message_at(0, (50.0, 0.5)), 180))
+    steps = list_hands(advance_ticks(message_at(0, (50.0, 0.5)), 180))
     rates = [math.hypot(*hand.rate) for hand in steps]
     assert max(rates) == pytest.approx(1.5)
     assert steps[-1].target[0] == pytest.approx(1.0 + 1.5 * 0.179)
 
 
 def test_a_silent_hand_lets_go_and_fades() -> None:
-    steps = run(message_at(0, (1.1, 0.5)) | message_at(150, (1.1, 0.5), n=0), 500)
-    held = hands(steps)
+    steps = advance_ticks(message_at(0, (1.1, 0.5)) | message_at(150, (1.1, 0.5), n=0), 500)
+    held = list_hands(steps)
     changes = {k: step.changes for k, step in enumerate(steps) if step.changes}
     last_ns = SILENCE_NS + 150_000_000
     assert changes == {0: ((7, TAKEN),), last_ns // 10**6 + 1: ((7, SILENT),)}
@@ -118,11 +119,11 @@ def test_the_next_holder_follows_a_release() -> None:
         40: [HandCommand(9, 0, True, (2.0, 2.0), 0)],
         160: [HandCommand(9, 1, True, (1.0, 0.6), 0)],
     }
-    steps = run(message_at(0, (1.1, 0.5)) | release | second, 200)
+    steps = advance_ticks(message_at(0, (1.1, 0.5)) | release | second, 200)
     assert steps[40].refused == (ANOTHER_HOLDS,)
     assert steps[50].changes == ((7, RELEASED),)
     assert steps[160].changes == ((9, TAKEN),)
-    again = hands(steps)[160]
+    again = list_hands(steps)[160]
     assert again.target == ARM
     assert again.grip == 0.0
 
@@ -133,7 +134,7 @@ def test_a_new_holder_continues_a_fading_grip(source: int, starts_at_arm: bool) 
     """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
     rules = RULES._replace(starts_at_arm=starts_at_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
-    steps = run(
+    steps = advance_ticks(
         message_at(0, (1.1, 0.5))
         | message_at(150, (1.1, 0.5), n=0)
         | message_at(199, (), grip=False)
@@ -142,7 +143,7 @@ def test_a_new_holder_continues_a_fading_grip(source: int, starts_at_arm: bool) 
         rules,
     )
     assert [steps[k].changes for k in (199, 220)] == [((7, RELEASED),), ((source, TAKEN),)]
-    held = hands(steps)
+    held = list_hands(steps)
     assert held[220].grip == pytest.approx(0.79)
     assert held[220].target == held[219].target
     grips = [hand.grip for hand in held]
@@ -157,19 +158,21 @@ def test_an_overtaken_message_changes_nothing() -> None:
         30: [HandCommand(7, 5, True, (9.0, 9.0), 0)],
         70: [HandCommand(7, 49, True, (9.0, 9.0), 0)],
     }
-    steps = run(message_at(10, (1.1, 0.5)) | message_at(50, (), n=50, grip=False) | late, 200)
+    steps = advance_ticks(
+        message_at(10, (1.1, 0.5)) | message_at(50, (), n=50, grip=False) | late, 200
+    )
     assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
     assert steps[-1].vector == empty_hand_vector(2)
 
 
 def test_a_silent_hand_resumes_its_goal() -> None:
-    steps = run(message_at(0, (1.1, 0.5)) | message_at(400, (1.1, 0.5), n=0), 402)
+    steps = advance_ticks(message_at(0, (1.1, 0.5)) | message_at(400, (1.1, 0.5), n=0), 402)
     assert [change for step in steps for _, change in step.changes] == [TAKEN, SILENT, TAKEN]
 
 
 def test_a_force_begins_at_zero() -> None:
     rules = HandRules(size=2, rate_hz=1000, starts_at_arm=False)
-    steps = hands(run(message_at(0, (8.0, 0.0)), 120, rules))
+    steps = list_hands(advance_ticks(message_at(0, (8.0, 0.0)), 120, rules))
     assert steps[0].target == (0.0, 0.0)
     assert steps[-1].target == pytest.approx((8.0, 0.0))
 
@@ -187,7 +190,7 @@ COMMANDS = st.builds(
 @settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
 def test_grips_are_continuous_and_targets_limited(messages: Any) -> None:
-    steps = hands(run(messages, 500))
+    steps = list_hands(advance_ticks(messages, 500))
     most = 1e6 / GRIP_NS + 1e-12
     for before, now in pairwise(steps):
         assert abs(now.grip - before.grip) <= most
@@ -227,8 +230,8 @@ def test_stopping_distance_matches_stopping_speed(
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
 def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
-    """Also for messages that let go, fall silent, or take over a fading grip."""
-    steps = hands(run(messages, 600, LIMITED))
+    """The limits hold also for messages that let go, fall silent, or take over a fading grip."""
+    steps = list_hands(advance_ticks(messages, 600, LIMITED))
     assert all(math.hypot(*now.rate) <= 1.5 + 1e-9 for now in steps)
     for before, now in pairwise(steps):
         if now.grip > 0.0 and before.grip > 0.0:
@@ -247,7 +250,7 @@ def test_targets_reach_still_goals_without_overshoot(
     distance = math.hypot(*way)
     # a hand repeats its last message while nothing changes
     messages = {k: message_at(k, goal, n=0)[k] for k in range(0, 3000, 50)}
-    steps = hands(run(messages, 3000, rules))
+    steps = list_hands(advance_ticks(messages, 3000, rules))
     for now in steps:
         moved = [x - start for x, start in zip(now.target, ARM, strict=True)]
         along = sum(a * b for a, b in zip(moved, way, strict=True)) / max(distance, 1e-9)
@@ -264,7 +267,7 @@ def test_targets_overshoot_returning_goals_by_stopping_distance() -> None:
         | message_at(200, (1.1, 0.5))
     )
     messages |= {k: message_at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
-    steps = hands(run(messages, 2000, LIMITED))
+    steps = list_hands(advance_ticks(messages, 2000, LIMITED))
     way = max(now.target[0] for now in steps) - steps[200].target[0]
     assert 0.0 < way <= 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
     assert min(now.target[0] for now in steps[400:]) >= 1.1 - 1e-9
@@ -274,7 +277,8 @@ def test_targets_overshoot_returning_goals_by_stopping_distance() -> None:
 @pytest.mark.parametrize("gap", [10, 25, 60, 150])
 def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
     """A hand at 0.3 m/s whose states come in bursts: its spring and damper change by 0.85 N in a tick."""
-    stiffness_n_m, damping_n_s_m = 300.0, 20.0
+    stiffness_n_m = 300.0
+    damping_n_s_m = 20.0
     messages: dict[int, Any] = {}
     for k in range(0, 3000, 10):
         tip_m = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
@@ -282,7 +286,7 @@ def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
         arrives = k + gap if (k // 100) % 2 else k
         messages.setdefault(arrives - arrives % gap, []).extend(message_at(k, tip_m)[k])
     for limits, least, most in ((LIMITED, 0.0, 0.85), (RULES, 0.0 if gap == 10 else 2.0, 40.0)):
-        steps = hands(run(messages, 3000, limits))
+        steps = list_hands(advance_ticks(messages, 3000, limits))
         force = [
             stiffness_n_m * now.target[0] + damping_n_s_m * now.rate[0]
             for now in steps
@@ -309,6 +313,6 @@ def test_goals_beyond_reach_move_to_nearest_place() -> None:
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=2), max_size=30))
 def test_targets_leave_reach_by_stopping_distance_only(messages: Any) -> None:
     rules = LIMITED._replace(reach=HandReach((0.0, 0.0), 0.0, 2.0))
-    steps = hands(run(messages, 500, rules))
+    steps = list_hands(advance_ticks(messages, 500, rules))
     stopping_m = 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
     assert all(math.hypot(*now.target) <= 2.0 + stopping_m for now in steps)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.core.guarded_runs import reasons
-from tests.virtual_runs import sampled, trajectories
+from tests.core.guarded_runs import list_reasons
+from tests.execution.builders import make_trajectories, sample_records
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
@@ -29,7 +29,7 @@ RULE = {
 }
 
 
-def scenario(*cuts: str, **more: Any) -> Scenario:
+def make_cut_scenario(*cuts: str, **more: Any) -> Scenario:
     """Returns the paper's scenario with a delay of 100 ms; cut links lose samples stamped from
     3 s to 4 s.
     """
@@ -40,16 +40,17 @@ def scenario(*cuts: str, **more: Any) -> Scenario:
 
 
 @functools.cache
-def master_lost() -> Log:
+def make_master_lost_log() -> Log:
     """Returns a run in which no site hears m1 for a second."""
-    return trilat_net.simulate(scenario("m1->s", "m1->m2"))
+    return trilat_net.simulate(make_cut_scenario("m1->s", "m1->m2"))
 
 
 def test_lost_masters_shares_go_over_and_return() -> None:
     """The last sample before the cut comes into use at 3.099 s, the first after it at 4.1 s."""
-    log = master_lost()
-    part, other = log["s"], log["m2"]
-    modes = reasons(log, "s")[-4:]
+    log = make_master_lost_log()
+    part = log["s"]
+    other = log["m2"]
+    modes = list_reasons(log, "s")[-4:]
     assert modes == [
         ("return", LifeReason.DROPPED),
         ("run", LifeReason.ALIGNED),
@@ -68,7 +69,8 @@ def test_lost_masters_shares_go_over_and_return() -> None:
 
 
 def test_losing_a_master_never_jumps_the_reference() -> None:
-    part, h_s = master_lost()["s"], 1e-3
+    part = make_master_lost_log()["s"]
+    h_s = 1e-3
     stale = slice(3099, 3120)  # what is in use stays meanwhile, and so does its rate
     steps = np.diff(part.q_des, axis=0) - 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
     steps[stale] = 0.0
@@ -78,11 +80,12 @@ def test_losing_a_master_never_jumps_the_reference() -> None:
 
 @pytest.mark.long
 def test_degraded_runs_verify_and_close_their_energies() -> None:
-    log = master_lost()
+    log = make_master_lost_log()
     assert verify(log).identical == 18_000
     assert compare_with_virtual(log).fed.identical == 18_000
-    plan = scenario("m1->s", "m1->m2")
-    ticks, fused = trajectories(plan), sampled(plan, (6.0,))[:, 0]
+    plan = make_cut_scenario("m1->s", "m1->m2")
+    ticks = make_trajectories(plan)
+    fused = sample_records(plan, (6.0,))[:, 0]
     columns = plan.layout("s").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(
@@ -103,7 +106,7 @@ def test_degraded_runs_verify_and_close_their_energies() -> None:
 
 def test_the_last_master_and_slave_are_awaited() -> None:
     for cuts in (("m1->s", "m2->s"), ("s->m1", "s->m2")):
-        log = trilat_net.simulate(scenario(*cuts, duration_s=5.0))
+        log = trilat_net.simulate(make_cut_scenario(*cuts, duration_s=5.0))
         for site in {cut.partition(">")[2] for cut in cuts}:
             held = log[site].mode == "hold"
             assert held[3120:4100].all()
@@ -114,7 +117,7 @@ def test_the_last_master_and_slave_are_awaited() -> None:
 def test_indispensable_peers_are_never_dropped() -> None:
     """m2 follows m1 alone: without m1 it would follow nobody, and an arm that stands still would lead s."""
     chain = {"dominance.m2": {"m1": 1.0}, "dominance.m1": {"m2": 0.5, "s": 0.5}}
-    log = trilat_net.simulate(scenario("m1->s", duration_s=5.0, **chain))
+    log = trilat_net.simulate(make_cut_scenario("m1->s", duration_s=5.0, **chain))
     assert (log["s"].mode[3120:4100] == "hold").all()
     assert list_losses(log) == []
 

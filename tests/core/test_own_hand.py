@@ -14,7 +14,9 @@ from trilat_net.core.life.live_hand import HandInForce, HandRules
 from trilat_net.core.life.own_hand import PROGRAM, OwnHand
 
 PLACE = (0.5, -0.25)
-EVERY, DELAY, TICKS = 20, 30, 400
+EVERY = 20
+DELAY = 30
+TICKS = 400
 
 
 def make_hand(delay: int = DELAY, *, starts_at_arm: bool = True) -> OwnHand:
@@ -22,20 +24,20 @@ def make_hand(delay: int = DELAY, *, starts_at_arm: bool = True) -> OwnHand:
     return OwnHand(rules, EVERY, delay, lambda _: PLACE)
 
 
-def acted(hand: OwnHand, k: int) -> HandInForce:
+def advance_tick(hand: OwnHand, k: int) -> HandInForce:
     return HandInForce.read(hand.advance_to(k, lambda: PLACE).vector)
 
 
-def run(
+def advance_ticks(
     decisions: dict[int, tuple[int, Sequence[float] | None]], delay: int = DELAY
 ) -> list[HandInForce]:
     """Returns the hand's state at every tick, for decisions by the tick at which they come."""
     hand = make_hand(delay)
     hand_states = []
     for k in range(TICKS):
-        for asked, goal in (one for at, one in decisions.items() if at == k):
-            hand.accept_decision(asked, goal)
-        hand_states.append(acted(hand, k))
+        for sent_tick, goal in (decision for at, decision in decisions.items() if at == k):
+            hand.accept_decision(sent_tick, goal)
+        hand_states.append(advance_tick(hand, k))
     return hand_states
 
 
@@ -43,14 +45,16 @@ def run(
 def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
     """Each decision takes another computing time, no longer than the hand's delay."""
     goals = {EVERY * n: (0.5 + 0.01 * n, -0.25) for n in range(5)}
-    prompt = run({asked: (asked, goal) for asked, goal in goals.items()})
+    prompt = advance_ticks({sent_tick: (sent_tick, goal) for sent_tick, goal in goals.items()})
     pairs = zip(goals.items(), thinks, strict=True)
-    arrivals = sorted((asked + took, asked, goal) for (asked, goal), took in pairs)
+    arrivals = sorted((sent_tick + took, sent_tick, goal) for (sent_tick, goal), took in pairs)
     in_order: dict[int, tuple[int, Sequence[float] | None]] = {}
-    for came, asked, goal in arrivals:
-        if came not in in_order and all(asked > other for other, _ in in_order.values()):
-            in_order[came] = asked, goal
-    later = run(in_order)
+    for arrival_tick, sent_tick, goal in arrivals:
+        if arrival_tick not in in_order and all(
+            sent_tick > other for other, _ in in_order.values()
+        ):
+            in_order[arrival_tick] = sent_tick, goal
+    later = advance_ticks(in_order)
     first = min(in_order)
     assert [state.number for state in later[:first]] == [-1] * first
     if len(in_order) == len(goals):
@@ -58,24 +62,26 @@ def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
 
 
 def test_hands_take_hold_after_their_delay() -> None:
-    hand_states = run({0: (0, (0.6, -0.25))})
+    hand_states = advance_ticks({0: (0, (0.6, -0.25))})
     held = [k for k, state in enumerate(hand_states) if state.source == PROGRAM]
     assert held[0] == DELAY
     assert hand_states[DELAY].target == PLACE
 
 
 def test_a_decision_that_is_late_acts_at_once() -> None:
-    hand_states = run({DELAY + 7: (0, (0.6, -0.25))})
+    hand_states = advance_ticks({DELAY + 7: (0, (0.6, -0.25))})
     assert [state.source for state in hand_states[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
 
 
 def test_an_older_decision_is_ignored() -> None:
-    both = run({25: (20, (0.6, -0.25)), 26: (0, (9.0, 9.0))})
-    assert both == run({25: (20, (0.6, -0.25))})
+    both = advance_ticks({25: (20, (0.6, -0.25)), 26: (0, (9.0, 9.0))})
+    assert both == advance_ticks({25: (20, (0.6, -0.25))})
 
 
 def test_without_decision_the_grip_fades() -> None:
-    hand_states = run({n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)})
+    hand_states = advance_ticks(
+        {n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)}
+    )
     assert hand_states[200 + DELAY].source == 0
     assert 0.0 < hand_states[200 + DELAY].grip <= 1.0
     assert hand_states[200 + DELAY + 101].grip == 0.0
@@ -102,7 +108,7 @@ def test_an_invalid_goal_is_refused(goal: tuple[float, ...], problem: str) -> No
     hand = make_hand()
     with pytest.raises(ValueError, match=problem):
         hand.accept_decision(0, goal)
-    assert acted(hand, 0).source == 0
+    assert advance_tick(hand, 0).source == 0
 
 
 @given(
@@ -136,7 +142,8 @@ def test_compiled_spans_equal_ticks_bit_for_bit(
         if k % EVERY == 0 and k // EVERY < len(goals):
             by_tick.accept_decision(k, goals[k // EVERY])
         singles.append(by_tick.advance_to(k, lambda: PLACE).vector)
-    k, spans = 0, []
+    k = 0
+    spans = []
     while k < len(singles):
         if k % EVERY == 0 and k // EVERY < len(goals):
             by_span.accept_decision(k, goals[k // EVERY])

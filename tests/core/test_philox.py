@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from tests.core.philox_reference import U32, philox_in_integers, table
+from tests.core.philox_reference import U32, make_table, philox_in_integers
 from trilat_net.core.links.philox import link_key, philox, uniforms, unit_interval
 
-words = st.integers(0, U32)
+u32 = st.integers(0, U32)
 
 
 def draw_words(counter: tuple[int, ...], key: tuple[int, int]) -> list[int]:
@@ -37,7 +37,7 @@ def test_the_known_answers_of_random123(
     assert philox_in_integers(counter, key) == list(answer)
 
 
-@given(counter=st.tuples(words, words, words, words), key=st.tuples(words, words))
+@given(counter=st.tuples(u32, u32, u32, u32), key=st.tuples(u32, u32))
 def test_any_counter_and_key_as_defined(counter: tuple[int, ...], key: tuple[int, int]) -> None:
     assert draw_words(counter, key) == philox_in_integers(counter, key)
 
@@ -45,7 +45,7 @@ def test_any_counter_and_key_as_defined(counter: tuple[int, ...], key: tuple[int
 @given(
     key=st.integers(0, 2**64 - 1),
     sample=st.integers(0, 2**40),
-    purpose=words,
+    purpose=u32,
     attempt=st.integers(0, 63),
 )
 def test_uniforms_follow_from_their_place(
@@ -76,22 +76,22 @@ def test_links_and_seeds_have_keys_of_their_own() -> None:
     assert all(0 <= key < 2**64 for key in keys)
 
 
-def likely(numbers: NDArray[np.float64], distribution: stats.rv_continuous) -> bool:
+def is_likely(numbers: NDArray[np.float64], distribution: stats.rv_continuous) -> bool:
     return bool(stats.kstest(numbers, distribution.cdf).pvalue > 1e-4)
 
 
 def test_uniforms_are_uniform_and_their_pairs_independent() -> None:
-    u = table(200_000, 0)
-    assert likely(u, stats.uniform())
-    assert likely((u[:200_000] + u[200_000:]) % 1.0, stats.uniform())
+    u = make_table(200_000, 0)
+    assert is_likely(u, stats.uniform())
+    assert is_likely((u[:200_000] + u[200_000:]) % 1.0, stats.uniform())
     assert abs(np.corrcoef(u[:-1], u[1:])[0, 1]) < 4 / np.sqrt(len(u))
     assert abs(np.corrcoef(u[:200_000], u[200_000:])[0, 1]) < 4 / np.sqrt(200_000)
 
 
 def test_normal_numbers_are_normal() -> None:
-    assert likely(table(200_000, 1), stats.norm())
+    assert is_likely(make_table(200_000, 1), stats.norm())
 
 
 @pytest.mark.parametrize("shape", [0.01, 0.3, 0.999, 1.0, 1.5, 4.0, 1e6])
 def test_gamma_numbers_are_gamma(shape: float) -> None:
-    assert likely(table(200_000, 2, shape), stats.gamma(shape))
+    assert is_likely(make_table(200_000, 2, shape), stats.gamma(shape))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.virtual_runs import Run, run, trajectories
+from tests.execution.builders import Trajectories, make_shipped_trajectories, make_trajectories
 from trilat_net.core.step.ticks import TickRecord
 from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
@@ -34,7 +34,7 @@ BELOW: dict[str, dict[str, Any]] = {
 FIELDS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat", "used")
 
 
-def same_bits(a: Run, b: Run) -> bool:
+def same_bits(a: Trajectories, b: Trajectories) -> bool:
     return all(a.stack(field).tobytes() == b.stack(field).tobytes() for field in FIELDS)
 
 
@@ -56,14 +56,14 @@ def test_jitter_below_budget_is_constant_bit_for_bit(name: str) -> None:
     assert max(max(record.used) for record in buffered) == 1000 - 1 - 200
 
 
-def trajectory(scenario: str, overrides: dict[str, Any]) -> Run:
-    return trajectories(load_scenario(scenario, overrides))
+def trajectory(scenario: str, overrides: dict[str, Any]) -> Trajectories:
+    return make_trajectories(load_scenario(scenario, overrides))
 
 
 @pytest.mark.long
 def test_play_out_holds_throughout_the_paper() -> None:
     link = {"model": "gamma", "delay_ms": 60.0, "deviation_ms": 10.0, "playout_ms": BUDGET_MS}
-    assert same_bits(trajectory("paper", {"link": link}), run("paper"))
+    assert same_bits(trajectory("paper", {"link": link}), make_shipped_trajectories("paper"))
 
 
 def test_jitter_above_budget_varies() -> None:
@@ -74,6 +74,8 @@ def test_jitter_above_budget_varies() -> None:
         "playout_ms": BUDGET_MS,
     }
     buffered = trajectory("free", {"link": link, "duration_s": 2.0})
-    constant = run("free", {"duration_s": 2.0, "link.delay_ms": BUDGET_MS})
+    constant = make_shipped_trajectories(
+        "free", {"duration_s": 2.0, "link.delay_ms": BUDGET_MS}
+    )
     assert not same_bits(buffered, constant)
     assert (np.diff(buffered.stack("used"), axis=1) >= 0).all()

@@ -13,19 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net
+from tests.execution.builders import run_fused
 from trilat_net.core.plug.law_channel import LawChannel, SentVector, join_received
 from trilat_net.core.plug.user_law import LawVector
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 
 ROOT = Path(__file__).parents[2]
 TICKS = 60
 
 
-def linked(law: str, name: str = "asymmetric", **more: Any) -> Scenario:
+def make_law_scenario(law: str, name: str = "asymmetric", **more: Any) -> Scenario:
     return load_scenario(name, {"link.delay_ms": 5.0, "control.law": law, **more})
 
 
@@ -47,7 +47,8 @@ def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRe
 
 def test_compiled_laws_give_the_plain_bits() -> None:
     a, b = (
-        run_by_hand(linked(f"tests.plugged_laws:{law}")) for law in ("Line", "CompiledLine")
+        run_by_hand(make_law_scenario(f"tests.plugged_laws:{law}"))
+        for law in ("Line", "CompiledLine")
     )
     assert a == b
     last = a["s"][-1]
@@ -73,12 +74,13 @@ class Watching:
 
 def test_laws_see_peers_external_torque_and_past() -> None:
     pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
-    scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
+    scenario = make_law_scenario("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
     laws: list[Watching] = []
     setup = scenario.setup("m1")._replace(
         law_factory=lambda facts: laws.append(Watching(facts)) or laws[-1]
     )
-    site, records = Site(setup), []
+    site = Site(setup)
+    records = []
     for k in range(20):
         arrived = (
             [Arrival(1, k - 1, (0.1 * k, 0.2), (0.3, 0.4), 0, (0.5, -0.6))]
@@ -101,10 +103,12 @@ def test_laws_see_peers_external_torque_and_past() -> None:
     assert any(now.tau_x != [0.0, 0.0] for now in laws[0].seen)
     now = laws[0].seen[7]
     th1, th2, th3, th4, th5 = setup.theta
-    c2, s2 = math.cos(now.q[1]), math.sin(now.q[1])
+    c2 = math.cos(now.q[1])
+    s2 = math.sin(now.q[1])
     outer = setup.g_m_s2 * th5 * math.cos(now.q[0] + now.q[1])
     gravity = [setup.g_m_s2 * th4 * math.cos(now.q[0]) + outer, outer]
-    h, (v, w) = th2 * s2, now.qd
+    h = th2 * s2
+    v, w = now.qd
     np.testing.assert_allclose(now.gravity, gravity, rtol=1e-12)
     np.testing.assert_allclose(
         now.inertia, [[th1 + 2 * th2 * c2, th3 + th2 * c2], [th3 + th2 * c2, th3]]
@@ -201,7 +205,7 @@ REFUSED = {
 @pytest.mark.parametrize("law", REFUSED)
 def test_code_unsuitable_for_numba_is_refused(law: str) -> None:
     with pytest.raises(ScenarioError, match=REFUSED[law]) as caught:
-        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+        Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
     assert caught.value.path == "sites.s.control.law"
 
 
@@ -223,7 +227,7 @@ def test_a_law_with_memory_is_recognised(law: str) -> None:
     with pytest.raises(
         ScenarioError, match=rf"{law} writes self.sums: .* remembers = \('sums',\)"
     ):
-        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+        Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
 
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3)
@@ -235,18 +239,18 @@ def test_arithmetic_of_vectors_is_that_of_arrays(
 ) -> None:
     for operate in (operator.add, operator.sub, operator.mul):
         expected = operate(np.array(a), np.array(b))
-        for one, other in ((LawVector(a), LawVector(b)), (LawVector(a), b), (a, LawVector(b))):
-            if LawVector in (type(one), type(other)) and (type(one), operate) != (
+        for left, other in ((LawVector(a), LawVector(b)), (LawVector(a), b), (a, LawVector(b))):
+            if LawVector in (type(left), type(other)) and (type(left), operate) != (
                 list,
                 operator.mul,
             ):
-                assert operate(one, other) == expected.tolist()
+                assert operate(left, other) == expected.tolist()
         assert np.array_equal(operate(LawVector(a), np.array(b)), expected)
         assert np.array_equal(operate(np.array(a), LawVector(b)), expected)
         assert operate(LawVector(a), x) == operate(np.array(a), x).tolist()
         assert operate(x, LawVector(a)) == operate(x, np.array(a)).tolist()
     assert LawVector(a) / x == (np.array(a) / x).tolist()
-    assert -LawVector(a) == [-one for one in a]
+    assert -LawVector(a) == [-number for number in a]
     total = LawVector(a)
     total += b
     total *= 2
@@ -272,10 +276,8 @@ FAILING = {
 
 @pytest.mark.parametrize("law", FAILING)
 def test_failing_compiled_laws_name_their_tick(law: str) -> None:
-    site, (tick, problem) = (
-        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s")),
-        FAILING[law],
-    )
+    site = Site(make_law_scenario(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+    tick, problem = FAILING[law]
     for k in range(tick):
         site.step(TickInput(k))
     with pytest.raises(LawFailed, match=f"{law} of s failed at tick {tick}: {problem}"):
@@ -286,14 +288,14 @@ def test_failing_compiled_laws_name_their_tick(law: str) -> None:
 def test_chain_laws_have_equal_bits_everywhere() -> None:
     """The law uses inertia, bias and gravity."""
     scenarios = [
-        linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")
+        make_law_scenario(f"tests.plugged_laws:{law}", "six_joints")
+        for law in ("Line", "CompiledLine")
     ]
     # soon after that the arms diverge
     a, b = (run_by_hand(scenario, 30) for scenario in scenarios)
     assert a == b
     for scenario in scenarios:
-        fused = FusedRun(scenario)
-        fused.advance_to(0.03)
+        fused = run_fused(scenario, 0.03)
         for name, row in zip(scenario.names, fused.records, strict=True):
             fields = scenario.layout(name).columns()
             assert row.tolist() == [

@@ -14,13 +14,13 @@ from tests.core.guarded_runs import (
     RATE_NM_S,
     TEXT,
     adaptive_text,
-    guarded,
-    largest_step,
-    ordered,
-    stopped_log,
+    find_largest_step,
+    make_guarded_scenario,
+    make_ordered_log,
+    make_stopped_log,
 )
 from tests.core.hard_stops import CHAINS, RULE, THREE, TWO
-from tests.core.rests import gravity_of, integrals, reference, rest_torque
+from tests.core.rests import compute_reference, compute_rest_torque, gravity_of, read_integrals
 from trilat_net.analysis.arm_rows import PlanarArmRows, build_arm_rows
 from trilat_net.core.life.resting import limit_torque_rate
 from trilat_net.core.plug.user_law import LawContext, LawInput
@@ -35,7 +35,8 @@ from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS
 
-AT_REST_RAD_S, REST_WITHIN_S = 0.05, 1.5
+AT_REST_RAD_S = 0.05
+REST_WITHIN_S = 1.5
 
 
 @pytest.mark.parametrize("law", ["adaptive", "pd_d"])
@@ -44,11 +45,12 @@ def test_references_rest_from_their_own_motion(law: str) -> None:
 
     (1) of docs/theory/coming-to-rest.md; never faster than the joint, and in its direction.
     """
-    log = stopped_log(adaptive_text() if law == "adaptive" else TEXT)
-    part, gains = log["s"], log.scenario.setup("s").rest
+    log = make_stopped_log(adaptive_text() if law == "adaptive" else TEXT)
+    part = log["s"]
+    gains = log.scenario.setup("s").rest
     assert set(part.mode[2000:3500]) == {"stopped"}
     assert np.abs(part.qd[2000]).max() > 0.05
-    wanted = reference(gains, part, 2000, 1500)
+    wanted = compute_reference(gains, part, 2000, 1500)
     assert np.abs(part.q_des[2000:3500] - wanted[0]).max() <= 1e-12
     assert np.abs(part.qd_des[2000:3500] - wanted[1]).max() <= 1e-12
     ahead = part.qd[2000:3500] * part.qd_des[2000:3500] - part.qd_des[2000:3500] ** 2
@@ -61,17 +63,20 @@ def test_stopping_torque_is_law_plus_rest() -> None:
 
     (2) to (4) of docs/theory/coming-to-rest.md.
     """
-    log = stopped_log(TEXT)
-    part, rows = log["s"], slice(2000, 3500)
-    q, qd = part.q[rows], part.qd[rows]
-    e, ed = q - part.q_des[rows], qd - part.qd_des[rows]
+    log = make_stopped_log(TEXT)
+    part = log["s"]
+    rows = slice(2000, 3500)
+    q = part.q[rows]
+    qd = part.qd[rows]
+    e = q - part.q_des[rows]
+    ed = qd - part.qd_des[rows]
     law = gravity_of(log.scenario.arms["s"].theta, q) - 60.0 * e - 12.0 * qd - 4.0 * ed
     setup = log.scenario.setup("s")
     limit = np.broadcast_to(setup.tau_limit_nm, 2)
-    wanted, w = rest_torque(setup.rest, part, law, 2000, limit)
+    wanted, w = compute_rest_torque(setup.rest, part, law, 2000, limit)
     assert np.abs(part.tau[rows] - wanted).max() <= 1e-9
-    assert np.abs(integrals(part, rows)[:-1] - w[1:]).max() <= 1e-9
-    assert largest_step(log, "s", 2000) <= RATE_NM_S / 1000.0 + 1e-9
+    assert np.abs(read_integrals(part, rows)[:-1] - w[1:]).max() <= 1e-9
+    assert find_largest_step(log, "s", 2000) <= RATE_NM_S / 1000.0 + 1e-9
     assert part.mode[3500] == "return"  # its peers are there
     assert part.mode[-1] == "run"
 
@@ -88,15 +93,23 @@ def test_storage_falls_by_its_dissipation(how: str) -> None:
     )
     text = adaptive_text().replace("[[sites.m.hands]]", "[[sites.s.hands]]")
     limits = {**LIMITS, "tau_rate_limit_nm_s": 1e6}  # no limit acts
-    log = ordered(guarded(limits, text, **keys), {} if how == "cut" else {"m": {1500: "stop"}})
-    part, theta = log["m"], log.scenario.arms["m"].theta
+    log = make_ordered_log(
+        make_guarded_scenario(limits, text, **keys),
+        {} if how == "cut" else {"m": {1500: "stop"}},
+    )
+    part = log["m"]
+    theta = log.scenario.arms["m"].theta
     first = int(np.argmax(part.mode == ("hold" if how == "cut" else "stopped")))
     gains = log.scenario.setup("m").rest
     still = int(np.argmax((part.qd_des == 0.0).all(axis=1) & (np.arange(len(part)) > first)))
     rows = slice(still, 5900)
-    q, qd = part.q[rows], part.qd[rows]
-    e, off = q - part.q_des[rows], part.theta_hat[rows] - theta
-    r, B, w = qd + 2.0 * e, np.array(gains.damping), integrals(part, slice(still - 1, 5899))
+    q = part.q[rows]
+    qd = part.qd[rows]
+    e = q - part.q_des[rows]
+    off = part.theta_hat[rows] - theta
+    r = qd + 2.0 * e
+    B = np.array(gains.damping)
+    w = read_integrals(part, slice(still - 1, 5899))
     V = 0.5 * (
         (r * PlanarArmRows(theta, 0.0, (1.0, 1.0)).multiply_inertia(q, r)).sum(axis=1)
         + 2.0 * 5.0 * (e**2).sum(axis=1)
@@ -128,7 +141,7 @@ def test_arms_with_failed_laws_are_held() -> None:
     text = TEXT.replace(
         'law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:Broken"'
     )
-    log = trilat_net.simulate(guarded({}, text, duration_s=4.0))
+    log = trilat_net.simulate(make_guarded_scenario({}, text, duration_s=4.0))
     part = log["s"]
     assert set(part.mode[2000:]) == {"fault"}
     assert np.abs(part.q[2000:] - part.q[2000]).max() <= 0.02
@@ -149,10 +162,14 @@ def test_rate_limits_never_hold_back_braking(
     rate: float, before: float, wanted: float, speed: float
 ) -> None:
     """Against its motion a torque reaches B |qd| farther; along it, and in RUN, as far as the rate."""
-    arrays = SiteArrays.build(guarded().setup("s"))
+    arrays = SiteArrays.build(make_guarded_scenario().setup("s"))
     s = arrays.site[0]
     for mode in (Mode.RUN, Mode.STOPPED, Mode.HOLD):
-        s.mode, s.tau_rate, s.tau_before, s.tau, s.qd = mode, rate, before, wanted, speed
+        s.mode = mode
+        s.tau_rate = rate
+        s.tau_before = before
+        s.tau = wanted
+        s.qd = speed
         limit_torque_rate(s)
         most = rate / 1000.0
         brake = s.damping[0] * abs(speed) if mode is not Mode.RUN else 0.0
@@ -192,7 +209,7 @@ HARNESS = {
 @pytest.mark.parametrize("at", [530, 1200])
 def test_one_stop_stops_a_learning_arm(at: int) -> None:
     """Damping and a frozen estimate took it from 0.61 rad/s to 5.12, over 1.92 rad."""
-    log = ordered(load_scenario("free", HARNESS), {"m1": {at: "stop"}})
+    log = make_ordered_log(load_scenario("free", HARNESS), {"m1": {at: "stop"}})
     part = log["m1"]
     speed = np.abs(part.qd[at:]).max(axis=1)
     assert speed[0] > 0.5
@@ -202,9 +219,7 @@ def test_one_stop_stops_a_learning_arm(at: int) -> None:
 
 
 class Stop(NamedTuple):
-    """One stop of one site: speed at the order, the largest speed afterwards, time of rest, and
-    distance.
-    """
+    """A stop of a site: the speed at the order, the largest speed afterwards, the time to rest, and the distance."""
 
     at: int
     site: str
@@ -230,19 +245,17 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
             site.step(TickInput(k, commands=order if k == at else ()))
             for k in range(at, at + ticks)
         ]
-        qd, q = (
-            np.array([record.qd for record in stops]),
-            np.array([record.q for record in stops]),
-        )
+        qd = np.array([record.qd for record in stops])
+        q = np.array([record.q for record in stops])
         speed = np.abs(qd).max(axis=1)
         pushed = np.array([record.tau_x for record in stops])
-        given = yielding(log.scenario.setup(part.name).rest, pushed, part.rate_hz)
-        moving = np.flatnonzero((np.abs(qd) > AT_REST_RAD_S + np.abs(given)).any(axis=1))
+        yielded = compute_yielding(log.scenario.setup(part.name).rest, pushed, part.rate_hz)
+        moving = np.flatnonzero((np.abs(qd) > AT_REST_RAD_S + np.abs(yielded)).any(axis=1))
         rest_s = float(moving[-1] + 1) / part.rate_hz if len(moving) else 0.0
         yield Stop(at, part.name, speed[0], speed.max(), rest_s, float(np.abs(q - q[0]).max()))
 
 
-def yielding(gains: RestGains, tau_x: Array, rate_hz: int) -> Array:
+def compute_yielding(gains: RestGains, tau_x: Array, rate_hz: int) -> Array:
     """Returns the speed at which joints yield to a hand whose torque changes, rad/s, rows of
     ticks.
 
@@ -259,7 +272,8 @@ def yielding(gains: RestGains, tau_x: Array, rate_hz: int) -> Array:
 
 def largest_fall(scenario: Scenario, site: str) -> tuple[float, float]:
     """Returns the largest |M^-1 G| of an arm over two hundred poses, rad/s^2, and the largest |G|, N m."""
-    arm, rows = scenario.arms[site], build_arm_rows(scenario, site)
+    arm = scenario.arms[site]
+    rows = build_arm_rows(scenario, site)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, arm.counts.joints))
     still = np.zeros_like(q)
     G = rows.law_torque(
@@ -293,22 +307,23 @@ def assert_stops(log: Log, count: int) -> None:
     """
     gives = {site: gravity_gives(log.scenario, site) for site in log.scenario.names}
     for stop in stop_at_instants(log, count):
-        part, still = log[stop.site], log.scenario.setup(stop.site).rest
+        part = log[stop.site]
+        still = log.scenario.setup(stop.site).rest
         torque = (
             np.abs(part.qd[stop.at] - part.qd[stop.at - 1]).max() * part.rate_hz * still.time_s
         )
-        given = max(gives[stop.site][stop.at < 100], torque)
-        assert stop.most_rad_s <= max(1.1 * stop.begin_rad_s + given, AT_REST_RAD_S), stop
+        allowance = max(gives[stop.site][stop.at < 100], torque)
+        assert stop.most_rad_s <= max(1.1 * stop.begin_rad_s + allowance, AT_REST_RAD_S), stop
         assert stop.rest_s <= REST_WITHIN_S, stop
 
 
-def run_of(name: str, law: str, settings: dict[str, Any], duration_s: float = 6.0) -> Log:
+def simulate_law(name: str, law: str, settings: dict[str, Any], duration_s: float = 6.0) -> Log:
     keys = {"duration_s": duration_s, "control.law": law, **RULE, **settings}
     return trilat_net.simulate(load_scenario(name, keys))
 
 
 def test_ten_stops_end_in_rest() -> None:
-    assert_stops(run_of("free", "adaptive", {}, 2.0), 10)
+    assert_stops(simulate_law("free", "adaptive", {}, 2.0), 10)
 
 
 RUNS = [
@@ -331,7 +346,7 @@ def test_every_law_is_stopped_in_some_run() -> None:
     ("name", "law", "settings"), RUNS, ids=lambda value: value if isinstance(value, str) else ""
 )
 def test_two_hundred_stops_end_in_rest(name: str, law: str, settings: dict[str, Any]) -> None:
-    assert_stops(run_of(name, law, settings), 200)
+    assert_stops(simulate_law(name, law, settings), 200)
 
 
 @pytest.mark.parametrize("space", ["joints", "position"])
@@ -357,6 +372,6 @@ def test_forces_on_a_peer_move_no_resting_arm(space: str) -> None:
             **laws,
         },
     )
-    stopped = ordered(scenario, {"m": {2000: "stop"}})["m"]
+    stopped = make_ordered_log(scenario, {"m": {2000: "stop"}})["m"]
     assert set(stopped.mode[2500:]) == {"stopped"}
     assert np.abs(stopped.qd[3000:]).max() < 1e-6

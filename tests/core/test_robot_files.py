@@ -11,17 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.chains import robot_files
 from tests.core.chain_references import (
     Arm,
     Array,
     ChainState,
     chain_references,
     full_matrix,
-    moving,
+    propagate_state,
     to_chain,
     torque_for,
 )
+from tests.scenario.builders import find_robot_files
 from trilat_net.core.arms.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
@@ -41,8 +41,8 @@ pin = pytest.importorskip(
 )
 
 from tests.core.make_chain_references import (  # noqa: E402 - needs Pinocchio
-    answer,
     build_model,
+    compute_answer,
     random_chain,
     random_state,
 )
@@ -148,7 +148,8 @@ ROBOTS = Path(__file__).parents[1] / "scenario/robots"
 
 
 def parse_chains() -> list[tuple[str, str, str, int]]:
-    chains, file = [], ""
+    chains = []
+    file = ""
     for word in CHAINS.split():
         if word.endswith(".urdf"):
             file = word
@@ -163,7 +164,7 @@ def read_robot(file: str) -> str:
     """Returns the text of a file; a joint with the name of a link is renamed, as Pinocchio has
     one list of frames.
     """
-    root = ElementTree.parse(robot_files()[file]).getroot()
+    root = ElementTree.parse(find_robot_files()[file]).getroot()
     links = {link.get("name") for link in root.findall("link")}
     for joint in root.findall("joint"):
         for element, key in (
@@ -185,7 +186,7 @@ def parsed_model(text: str, chain: UrdfChain) -> pin.Model:
 
 def test_every_file_is_in_the_list() -> None:
     listed = {file for file, *_ in parse_chains()} | REFUSED.keys() | NO_CHAIN_OF_TWO
-    assert listed == robot_files().keys()
+    assert listed == find_robot_files().keys()
 
 
 @pytest.mark.parametrize(
@@ -193,7 +194,7 @@ def test_every_file_is_in_the_list() -> None:
 )
 def test_files_without_chain_are_refused(file: str, tip: str, reason: str) -> None:
     with pytest.raises(ScenarioError) as caught:
-        read_urdf(robot_files()[file].read_text(), tip=tip)
+        read_urdf(find_robot_files()[file].read_text(), tip=tip)
     assert reason in str(caught.value)
 
 
@@ -208,7 +209,7 @@ def test_chains_equal_pinocchios(file: str, base: str, tip: str, n: int) -> None
     check_dynamics(text, chain)
 
 
-def mend(text: str, link: str, link_inertia: LinkInertia) -> str:
+def replace_inertia(text: str, link: str, link_inertia: LinkInertia) -> str:
     """Returns a file with a mass and an inertia of a link written into its XML."""
     root = ElementTree.fromstring(text)
     element = next(match for match in root.findall("link") if match.get("name") == link)
@@ -234,7 +235,8 @@ def mend(text: str, link: str, link_inertia: LinkInertia) -> str:
 HEAVY = LinkInertia(
     mass_kg=1.5, com_m=(0.02, -0.01, 0.1), inertia_kg_m2=(0.02, 1e-3, 0.03, -2e-3, 5e-4, 0.025)
 )
-PANDA, SO_ARM = "panda_description/urdf/panda.urdf", "so_arm_description/urdf/so101.urdf"
+PANDA = "panda_description/urdf/panda.urdf"
+SO_ARM = "so_arm_description/urdf/so101.urdf"
 GIVEN = [
     (PANDA, "panda_hand_tcp", {"panda_link4": HEAVY, "panda_hand": LinkInertia(mass_kg=0.4)}),
     (
@@ -259,15 +261,17 @@ def test_given_inertias_equal_the_mended_file(
     text = file.read_text() if isinstance(file, Path) else read_robot(file)
     mended = text
     for link, inertia in links.items():
-        mended = mend(mended, link, inertia)
+        mended = replace_inertia(mended, link, inertia)
     check_dynamics(mended, read_urdf(text, tip=tip, links=links))
 
 
 def test_balanced_fingers_equal_the_mended_file() -> None:
     text = (ROBOTS / "finger_inertia.urdf").read_text()
     nearest = LinkInertia(inertia_kg_m2=(1.35e-6, 0.0, 2.65e-6, 0.0, 0.0, 4e-6))
-    check_dynamics(mend(text, "finger", nearest), read_urdf(text, balance=True))
-    check_dynamics(mend(text, "finger", nearest), read_urdf(text, tip="lower", balance=True))
+    check_dynamics(replace_inertia(text, "finger", nearest), read_urdf(text, balance=True))
+    check_dynamics(
+        replace_inertia(text, "finger", nearest), read_urdf(text, tip="lower", balance=True)
+    )
 
 
 def check_dynamics(text: str, chain: UrdfChain) -> None:
@@ -279,40 +283,42 @@ def check_dynamics(text: str, chain: UrdfChain) -> None:
     check_joints(chain, model)
     rebuilt = build_model(chain)
     data = model.createData()
-    frame, foot = model.getFrameId(chain.tip), model.getFrameId(chain.base)
+    frame = model.getFrameId(chain.tip)
+    foot = model.getFrameId(chain.base)
     random = np.random.default_rng(n)
     for first in (True, False):
         state = random_state(random, n, first)
         q = pin.integrate(model, pin.neutral(model), state["q"])
         pin.framesForwardKinematics(model, data, q)
-        base_pose, tip_pose = data.oMf[foot].copy(), data.oMf[frame].copy()
+        base_pose = data.oMf[foot].copy()
+        tip_pose = data.oMf[frame].copy()
         R = base_pose.rotation
-        ours = answer(rebuilt, chain, state | {"v": state["qd"]})
+        ours = compute_answer(rebuilt, chain, state | {"v": state["qd"]})
         relative = base_pose.inverse() * tip_pose
-        assert near(ours["tip_position"], relative.translation, 1e-12)
-        assert near(ours["tip_rotation"], relative.rotation, 1e-12)
+        assert is_near(ours["tip_position"], relative.translation, 1e-12)
+        assert is_near(ours["tip_rotation"], relative.rotation, 1e-12)
         jacobian = pin.computeFrameJacobian(
             model, data, q, frame, pin.LOCAL_WORLD_ALIGNED
         ).reshape(6, n)
-        assert near(
+        assert is_near(
             ours["jacobian"], np.vstack([R.T @ jacobian[:3], R.T @ jacobian[3:]]), 1e-12
         )
         model.gravity.linear = R @ state["gravity"]
         torque = pin.rnea(model, data, q, state["qd"], state["a"])
-        assert near(ours["inverse_dynamics"], torque, 1e-12)
+        assert is_near(ours["inverse_dynamics"], torque, 1e-12)
         inertia = np.triu(pin.crba(model, data, q).reshape(n, n))
         inertia += np.triu(inertia, 1).T
-        assert near(ours["inertia"], inertia, 1e-12)
+        assert is_near(ours["inertia"], inertia, 1e-12)
         acceleration = pin.aba(model, data, q, state["qd"], state["tau"])
         bound = 100 * np.finfo(float).eps * np.linalg.cond(inertia)
-        assert near(ours["forward_dynamics"], acceleration, max(bound, 1e-12))
-        check_core(chain, ChainState(**state | answer(rebuilt, chain, state)))
+        assert is_near(ours["forward_dynamics"], acceleration, max(bound, 1e-12))
+        check_core(chain, ChainState(**state | compute_answer(rebuilt, chain, state)))
 
 
 def check_joints(chain: UrdfChain, model: pin.Model) -> None:
     for i, joint in enumerate(chain.joints):
         body = model.inertias[i + 1].toDynamicParameters()
-        assert near(joint.inertia, body, 1e-12), joint.name
+        assert is_near(joint.inertia, body, 1e-12), joint.name
         if "RUB" not in model.joints[i + 1].shortname():  # a continuous one has no limits
             at = model.joints[i + 1].idx_q
             limits = model.lowerPositionLimit[at], model.upperPositionLimit[at]
@@ -339,13 +345,14 @@ def check_core(chain: UrdfChain, state: ChainState) -> None:
         build_chain(joints, MAX_JOINTS),
         np.concatenate([joint.inertia for joint in chain.joints]),
     )
-    moving(arm, state, state.v)
-    assert near(torque_for(arm, state.v, state.a), state.inverse_dynamics, 1e-12)
-    gradient, qdd = np.zeros(LINK_PARAMETERS * n), np.zeros(n)
+    propagate_state(arm, state, state.v)
+    assert is_near(torque_for(arm, state.v, state.a), state.inverse_dynamics, 1e-12)
+    gradient = np.zeros(LINK_PARAMETERS * n)
+    qdd = np.zeros(n)
     parameter_gradient(arm.rows, gradient)
-    assert near(gradient, state.regressor_transpose_r, 1e-12)
+    assert is_near(gradient, state.regressor_transpose_r, 1e-12)
     place_joints(arm.rows, state.q)
-    assert near(full_matrix(arm), state.inertia, 1e-12)
+    assert is_near(full_matrix(arm), state.inertia, 1e-12)
     find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
     # where it cancels tau, qdd is their difference
     bias = state.tau - state.inertia @ state.forward_dynamics
@@ -355,8 +362,8 @@ def check_core(chain: UrdfChain, state: ChainState) -> None:
     bound = 100 * np.finfo(float).eps * np.linalg.cond(state.inertia)
     assert np.abs(qdd - state.forward_dynamics).max() <= bound * size
     place_joints(arm.rows, state.q)
-    assert near(place_end_effector(arm.rows, chain.tip_origin_m), state.tip_position, 1e-12)
-    assert near(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian, 1e-12)
+    assert is_near(place_end_effector(arm.rows, chain.tip_origin_m), state.tip_position, 1e-12)
+    assert is_near(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian, 1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1), sliders=st.lists(st.booleans(), min_size=1, max_size=12))
@@ -368,12 +375,13 @@ def test_the_core_agrees_on_random_chains(seed: int, sliders: list[bool]) -> Non
     entry = random_chain(random, n, tuple(i for i in range(n) if sliders[i]))
     chain = to_chain(entry)
     state = random_state(random, n, weight=False)
-    check_core(chain, ChainState(**state | answer(build_model(chain), chain, state)))
+    check_core(chain, ChainState(**state | compute_answer(build_model(chain), chain, state)))
 
 
-def near(a: object, b: object, tolerance: float) -> bool:
+def is_near(a: object, b: object, tolerance: float) -> bool:
     """Asserts equality relative to the largest entry."""
-    a, b = np.asarray(a), np.asarray(b)
+    a = np.asarray(a)
+    b = np.asarray(b)
     return bool(np.abs(a - b).max() <= tolerance * max(np.abs(b).max(), 1e-3))
 
 
@@ -382,14 +390,15 @@ def test_stored_references_are_pinocchios() -> None:
     for chain, states in chain_references().values():
         model = build_model(chain)
         for state in states:
-            for key, value in answer(model, chain, state._asdict()).items():
-                assert near(value, getattr(state, key), 1e-12), key
+            for key, value in compute_answer(model, chain, state._asdict()).items():
+                assert is_near(value, getattr(state, key), 1e-12), key
 
 
 def test_two_velocity_torque_uses_christoffel_symbols() -> None:
     """Linear in v, equal to Pinocchio's where v is qd, and dM/dt = C + C'."""
     for chain, (state, *_) in chain_references().values():
-        model, n = build_model(chain), len(chain.joints)
+        model = build_model(chain)
+        n = len(chain.joints)
         resting = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
 
         def C(
@@ -398,13 +407,13 @@ def test_two_velocity_torque_uses_christoffel_symbols() -> None:
             chain: UrdfChain = chain,
             still: dict[str, Array] = resting,
         ) -> Array:
-            return answer(model, chain, still | {"v": v})["inverse_dynamics"]
+            return compute_answer(model, chain, still | {"v": v})["inverse_dynamics"]
 
         matrix = np.stack([C(axis) for axis in np.eye(n)], axis=1)
-        assert near(matrix @ state.v, C(state.v), 1e-12)
+        assert is_near(matrix @ state.v, C(state.v), 1e-12)
         h = 1e-6
         ends = [
-            answer(model, chain, resting | {"q": state.q + s * h * state.qd})["inertia"]
+            compute_answer(model, chain, resting | {"q": state.q + s * h * state.qd})["inertia"]
             for s in (1, -1)
         ]
-        assert near(matrix + matrix.T, (ends[0] - ends[1]) / (2 * h), 1e-7)
+        assert is_near(matrix + matrix.T, (ends[0] - ends[1]) / (2 * h), 1e-7)

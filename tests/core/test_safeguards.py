@@ -11,13 +11,13 @@ from tests.core.guarded_runs import (
     RATE_NM_S,
     TEXT,
     adaptive_text,
-    guarded,
-    largest_step,
-    ordered,
-    reasons,
-    stopped_log,
+    find_largest_step,
+    list_reasons,
+    make_guarded_scenario,
+    make_ordered_log,
+    make_stopped_log,
 )
-from tests.core.rests import gravity_of, rest_torque
+from tests.core.rests import compute_rest_torque, gravity_of
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
@@ -36,7 +36,7 @@ from trilat_net.scenario.run_changes import make_site_order
 
 @pytest.mark.long
 def test_logs_with_orders_verify_in_every_way() -> None:
-    log = stopped_log()
+    log = make_stopped_log()
     assert verify(log).identical == 12_000
     assert compare_with_virtual(log).fed.identical == 12_000
     again = rerun(log, ["s"])
@@ -44,7 +44,7 @@ def test_logs_with_orders_verify_in_every_way() -> None:
 
 
 def test_stopped_sites_go_on_learning() -> None:
-    log = stopped_log(adaptive_text(), 3000)
+    log = make_stopped_log(adaptive_text(), 3000)
     theta_hat = log["s"].theta_hat
     assert np.ptp(theta_hat[2000:3000], axis=0).max() > 1e-3
     assert verify(log).identical == 12_000
@@ -62,9 +62,11 @@ def test_stopped_sites_go_on_learning() -> None:
 def test_a_passed_limit_is_a_lasting_fault(
     limits: dict[str, object], reason: LifeReason
 ) -> None:
-    scenario = guarded(limits, where="sites.s.")
-    log = ordered(scenario, {"m": {4500: "enable"}, "s": {4500: "stop", 5000: "reset"}})
-    modes = reasons(log, "s")
+    scenario = make_guarded_scenario(limits, where="sites.s.")
+    log = make_ordered_log(
+        scenario, {"m": {4500: "enable"}, "s": {4500: "stop", 5000: "reset"}}
+    )
+    modes = list_reasons(log, "s")
     assert ("fault", reason) in modes
     at = list(log["s"].mode).index("fault")
     assert set(log["s"].mode[at:5000]) == {"fault"}  # no other order ends it
@@ -84,10 +86,11 @@ def test_rate_limits_keep_reference_jumps_out() -> None:
     text = text.replace("align_speed_rad_s = {speed}\nalign_limit_rad = {limit}\n", "")
     keys = {key: LIMITS[key] for key in ("tau_rate_limit_nm_s", "qd_des_limit_rad_s")}
     free, held = (
-        trilat_net.simulate(guarded(limits, text, duration_s=1.0)) for limits in ({}, keys)
+        trilat_net.simulate(make_guarded_scenario(limits, text, duration_s=1.0))
+        for limits in ({}, keys)
     )
-    assert largest_step(free, "s") > 50.0
-    assert largest_step(held, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
+    assert find_largest_step(free, "s") > 50.0
+    assert find_largest_step(held, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
     steps = np.abs(np.diff(held["s"].q_des, axis=0))
     assert steps.max() <= 6.0e-3 * (1.0 + 1e-9)
     assert np.abs(held["s"].qd_des).max() == 6.0
@@ -105,7 +108,7 @@ def test_rate_limits_keep_reference_jumps_out() -> None:
 )
 def test_impossible_limits_are_refused(limits: dict[str, object], phrase: str) -> None:
     with pytest.raises(ScenarioError, match=phrase):
-        guarded(limits)
+        make_guarded_scenario(limits)
 
 
 def test_position_limits_need_a_rule() -> None:
@@ -130,13 +133,13 @@ def test_missed_ticks_are_held_or_a_fault(missed: int, mode: str) -> None:
 
     The log is whole, and is executed again without the missed ticks.
     """
-    scenario = guarded(text=adaptive_text(), duration_s=4.0)
+    scenario = make_guarded_scenario(text=adaptive_text(), duration_s=4.0)
     at = 2000 + missed
-    log = ordered(scenario, {"s": {at: "overrun"}}, ticks=missed)
+    log = make_ordered_log(scenario, {"s": {at: "overrun"}}, ticks=missed)
     part = log["s"]
     assert part.tick.tolist() == [*range(2000), *range(at, 4000)]
     assert part.mode[2000] == mode
-    assert largest_step(log, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
+    assert find_largest_step(log, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
     theta_hat = part.theta_hat
     assert (
         np.abs(theta_hat[2001] - theta_hat[1999]).max() <= 0.01 * np.abs(theta_hat[1999]).max()
@@ -163,12 +166,12 @@ def test_stops_and_returns_add_no_steps() -> None:
     """Arms that begin 3 rad apart, without a limit of the torque's rate."""
     text = adaptive_text().replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]")
     text = text.replace("q0_rad = [0.1, 0.4]", "q0_rad = [-0.1, 1.9]")
-    scenario = guarded({}, text, duration_s=8.0)
+    scenario = make_guarded_scenario({}, text, duration_s=8.0)
     orders = {"s": {5000: "stop", 6000: "enable"}, "m": {6500: "stop", 6540: "enable"}}
-    log = ordered(scenario, orders)
+    log = make_ordered_log(scenario, orders)
     free = trilat_net.simulate(scenario)
     for site in log.sites:
-        assert largest_step(log, site, 100) <= 1.1 * largest_step(free, site, 100)
+        assert find_largest_step(log, site, 100) <= 1.1 * find_largest_step(free, site, 100)
     (jump,) = np.flatnonzero(
         (log["s"].mode[1:] == "return") & (log["s"].mode[:-1] == "stopped")
     )
@@ -184,7 +187,8 @@ class Pull:
     remembers = ()
 
     def __init__(self, _facts: LawContext, K: float = 60.0, d: float = 12.0) -> None:
-        self.K, self.d = K, d
+        self.K = K
+        self.d = d
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
@@ -197,22 +201,28 @@ class PullHeld(Pull):
     holds = True
 
 
-def with_own_law(name: str) -> Log:
+def simulate_own_law(name: str) -> Log:
     text = TEXT.replace(
         'law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:{name}"'
     )
-    return trilat_net.simulate(guarded({}, text, outages_s="[[2.0, 2.6]]", duration_s=4.0))
+    return trilat_net.simulate(
+        make_guarded_scenario({}, text, outages_s="[[2.0, 2.6]]", duration_s=4.0)
+    )
 
 
 def test_own_laws_yield_to_gravity_while_holding() -> None:
     """The slave holds from 2.12 to 2.7 s."""
-    log = with_own_law("Pull")
+    log = simulate_own_law("Pull")
     part = log["s"]
-    q, qd, held = part.q, part.qd, slice(2120, 2700)
+    q = part.q
+    qd = part.qd
+    held = slice(2120, 2700)
     assert set(part.mode[held]) == {"hold"}
     gravity = gravity_of(log.scenario.arms["s"].theta, q)
     setup = log.scenario.setup("s")
-    wanted, _ = rest_torque(setup.rest, part, gravity[held], 2120, np.array(setup.tau_limit_nm))
+    wanted, _ = compute_rest_torque(
+        setup.rest, part, gravity[held], 2120, np.array(setup.tau_limit_nm)
+    )
     assert np.abs(part.tau[held] - wanted).max() <= 1e-9
     law = gravity - 12.0 * qd - 60.0 * (q - log["m"].q[np.maximum(np.arange(4000) - 100, 0)])
     share = np.minimum(np.arange(200) * 1e-3 / BLEND_S, 1.0)[:, None]
@@ -224,10 +234,11 @@ def test_own_laws_yield_to_gravity_while_holding() -> None:
 
 
 def test_a_holding_law_is_still_called() -> None:
-    log = with_own_law("PullHeld")
-    part, q = log["s"], log["s"].q[2120:2700]
+    log = simulate_own_law("PullHeld")
+    part = log["s"]
+    q = log["s"].q[2120:2700]
     gravity = gravity_of(log.scenario.arms["s"].theta, q)
     law = gravity - 12.0 * part.qd[2120:2700] - 60.0 * (q - log["m"].q[1999])
     setup = log.scenario.setup("s")
-    wanted, _ = rest_torque(setup.rest, part, law, 2120, np.array(setup.tau_limit_nm))
+    wanted, _ = compute_rest_torque(setup.rest, part, law, 2120, np.array(setup.tau_limit_nm))
     assert np.abs(part.tau[2120:2700] - wanted).max() <= 1e-9

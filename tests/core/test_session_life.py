@@ -9,7 +9,7 @@ import pytest
 
 import trilat_net
 from tests.core.guarded_runs import TEXT
-from tests.virtual_runs import sampled, trajectories
+from tests.execution.builders import make_trajectories, sample_records
 from trilat_net.core.life.session_life import MIN_ALIGN_NS
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import (
@@ -28,7 +28,7 @@ from trilat_net.scenario import Scenario, parse_scenario
 OUTAGE = "[[2.0, 2.6]]"
 
 
-def glide(
+def make_glide_scenario(
     duration_s: float = 5.0, rate_hz: int = 1000, outages_s: str = OUTAGE, **keys: float
 ) -> Scenario:
     keys = {"speed": 1.0, "limit": 1.5, **keys}
@@ -39,7 +39,7 @@ def glide(
 
 @pytest.fixture(scope="module")
 def log() -> Log:
-    return trilat_net.simulate(glide())
+    return trilat_net.simulate(make_glide_scenario())
 
 
 def test_sites_wait_then_align_then_follow(log: Log) -> None:
@@ -77,7 +77,8 @@ def test_the_reference_never_jumps(site: str, log: Log) -> None:
 
     Where the arm begins to rest, the reference changes from the peers' to its own pose.
     """
-    part, h_s = log[site], 1e-3
+    part = log[site]
+    h_s = 1e-3
     steps = np.diff(part.q_des, axis=0)
     means = 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
     # at the first tick without a new sample, what is in use stays, and so does qd_des
@@ -90,8 +91,9 @@ def test_the_reference_never_jumps(site: str, log: Log) -> None:
 
 @pytest.mark.parametrize("speed", [0.2, 1.0])
 def test_approaches_to_peers_keep_their_speed_limit(speed: float) -> None:
-    log = trilat_net.simulate(glide(12.0, outages_s="[]", speed=speed))
-    part, other = log["s"], log["m"]
+    log = trilat_net.simulate(make_glide_scenario(12.0, outages_s="[]", speed=speed))
+    part = log["s"]
+    other = log["m"]
     aligning = np.flatnonzero(part.mode == "return")
     way_rate = part.qd_des[aligning] - other.qd[aligning - 100]
     start = np.abs(way_rate[0]).max()
@@ -100,15 +102,16 @@ def test_approaches_to_peers_keep_their_speed_limit(speed: float) -> None:
 
 
 def test_sites_beyond_their_limit_wait_and_say_so() -> None:
-    log = trilat_net.simulate(glide(1.0, outages_s="[]", limit=0.1))
+    log = trilat_net.simulate(make_glide_scenario(1.0, outages_s="[]", limit=0.1))
     assert set(log["s"].mode) == {"waiting"}
     shared = 2
     assert log["s"].states[-1].mem[2 * shared + 1] == LifeReason.ALIGN_LIMIT
 
 
 def test_every_driver_gives_the_same_bits() -> None:
-    scenario = glide(3.0)
-    ticks, fused = trajectories(scenario), sampled(scenario, (3.0,))[:, 0]
+    scenario = make_glide_scenario(3.0)
+    ticks = make_trajectories(scenario)
+    fused = sample_records(scenario, (3.0,))[:, 0]
     columns = scenario.layout("m").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(
@@ -140,7 +143,7 @@ ORDERS = (LifeOrder.STOP, LifeOrder.RELEASED, LifeOrder.HELD, LifeOrder.ENABLE)
 @pytest.mark.parametrize("orders", list(product(ORDERS, repeat=3)))
 def test_released_arms_stay_braked_until_allowed(orders: tuple[LifeOrder, ...]) -> None:
     """After a release no further stop opens the brakes, and only `enable` ends a stop."""
-    site = Site(glide().setup("s"))
+    site = Site(make_glide_scenario().setup("s"))
     is_stopped = False
     is_released = False
     for tick, order in enumerate(orders):

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.core.channels import channel, due
-from tests.core.kinds import KINDS, POINTS
-from tests.core.sites import setup
+from tests.core.builders import KINDS, POINTS, compute_due_ns, make_channel, make_site_setup
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import MAX_DELAY_US, max_delay_us
 from trilat_net.core.links.link import calendar_pages
@@ -17,7 +15,7 @@ from trilat_net.scenario import load_scenario
 def test_no_sample_is_due_after_the_longest_delay(name: str) -> None:
     model = KINDS[name]
     traces = [POINTS if name == "trace" else None]
-    due_ns = due(channel([model], 3, points=POINTS), 5000)
+    due_ns = compute_due_ns(make_channel([model], 3, points=POINTS), 5000)
     kept = due_ns != LOST
     delay_us = (due_ns[kept] - np.arange(5000)[kept] * 1_000_000) / 1000
     longest = max_delay_us([model], traces)
@@ -28,7 +26,7 @@ def test_links_have_about_the_pages_they_need() -> None:
     """For a distribution without bound, the largest possible draw counts."""
 
     def pages(**changes: object) -> int:
-        setups = [setup(name, "free", **changes) for name in ("m1", "m2", "s")]
+        setups = [make_site_setup(name, "free", **changes) for name in ("m1", "m2", "s")]
         return SiteArrays.stack(setups).calendars.shape[2]
 
     assert pages(link__delay_ms=200.0) == 256

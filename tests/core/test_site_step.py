@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.compiled import run_program
-from tests.core.sites import VECTORS, bits, sample, setup, stepped
+from tests.core.builders import VECTORS, describe_bits, make_arrival, make_site_setup, step_site
+from tests.programs import run_python
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
@@ -17,7 +17,7 @@ from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
 
 
-def finite(output: TickRecord) -> bool:
+def is_finite(output: TickRecord) -> bool:
     return all(math.isfinite(v) for field in VECTORS for v in getattr(output, field))
 
 
@@ -35,13 +35,19 @@ arrivals = st.lists(
 
 @settings(max_examples=40)
 @given(
-    came=st.lists(arrivals, min_size=1, max_size=40),
+    arrivals_by_tick=st.lists(arrivals, min_size=1, max_size=40),
     scheme=st.sampled_from(["second_order", "digital"]),
 )
-def test_equal_ticks_give_equal_bits(came: list[list[Arrival]], scheme: str) -> None:
-    ticks = [TickInput(k, c) for k, c in enumerate(came)]
-    one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
-    assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
+def test_equal_ticks_give_equal_bits(
+    arrivals_by_tick: list[list[Arrival]], scheme: str
+) -> None:
+    ticks = [TickInput(k, c) for k, c in enumerate(arrivals_by_tick)]
+    first, other = (
+        Site(make_site_setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2)
+    )
+    assert [describe_bits(o) for o in step_site(first, ticks)] == [
+        describe_bits(o) for o in step_site(other, ticks)
+    ]
 
 
 def test_records_hold_their_ticks_state_and_inputs() -> None:
@@ -51,47 +57,56 @@ def test_records_hold_their_ticks_state_and_inputs() -> None:
     (8).
     """
     site = Site(
-        setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4])
+        make_site_setup(
+            "m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4]
+        )
     )
     first = site.step(TickInput(0))
     assert (first.q, first.qd, first.t_ns) == ([0.3, -0.1], [0.2, 0.4], 0)
-    outputs = stepped(site, [TickInput(k) for k in range(1, 3501)])
+    outputs = step_site(site, [TickInput(k) for k in range(1, 3501)])
     assert outputs[-1].tau_x == pytest.approx([-10.0, -10.0])
     assert outputs[10].tau_x == [0.0, 0.0]
     assert "-" not in str(outputs[10].tau_x)
 
 
 _PROGRAM = """
-from tests.core.sites import executed
+from tests.core.builders import execute_as_text
 for scheme in ("second_order", "digital"):
-    print("\\n".join(executed("asymmetric", scheme=scheme, duration_s=0.25, link__delay_ms=20,
-                              links={"m2->m1": {"delay_ms": 33.5}})))
+    keys = {"scheme": scheme, "duration_s": 0.25, "link__delay_ms": 20}
+    records = execute_as_text("asymmetric", links={"m2->m1": {"delay_ms": 33.5}}, **keys)
+    print("\\n".join(records))
 """
 
 
 @pytest.mark.push
 def test_uncompiled_runs_have_the_same_bits() -> None:
-    plain = run_program(_PROGRAM, compiled=False)
+    plain = run_python(_PROGRAM, compiled=False)
     assert plain.count("\n") == 2 * 3 * 250
-    assert plain == run_program(_PROGRAM, compiled=True)
+    assert plain == run_python(_PROGRAM, compiled=True)
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("k", [1, 2, 21, 150])
 def test_two_records_resume_the_same_bits(scheme: str, k: int) -> None:
     """Every record is a key-frame: records k-2 and k-1 and the waiting samples of the links."""
-    built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
+    built = make_site_setup("m1", "free", scheme=scheme, link__delay_ms=20)
     ticks = [
-        TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)
+        TickInput(n, [make_arrival(n - 1, peer) for peer in (0, 1)] if n else [])
+        for n in range(200)
     ]
-    whole = stepped(Site(built), ticks)
+    whole = step_site(Site(built), ticks)
     site = Site(built)
-    before, last = whole[max(0, k - 2)], whole[k - 1]
-    in_use = [sample(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
-    waiting = [sample(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)]
+    before = whole[max(0, k - 2)]
+    last = whole[k - 1]
+    in_use = [make_arrival(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
+    waiting = [
+        make_arrival(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)
+    ]
     site.restore_links(k, in_use, waiting)
     site.restore_state(before, last)
-    assert [bits(o) for o in stepped(site, ticks[k:])] == [bits(o) for o in whole[k:]]
+    assert [describe_bits(o) for o in step_site(site, ticks[k:])] == [
+        describe_bits(o) for o in whole[k:]
+    ]
 
 
 @pytest.mark.parametrize("name", ["asymmetric", "paper", "two_sites"])
@@ -139,15 +154,15 @@ def test_no_code_depends_on_three_sites() -> None:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 def test_the_torque_limit_is_applied(scheme: str) -> None:
-    site = Site(setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
-    torques = [o.tau for o in stepped(site, [TickInput(k) for k in range(400)])]
+    site = Site(make_site_setup("m1", "free", scheme=scheme, limits__tau_limit_nm=2.0))
+    torques = [o.tau for o in step_site(site, [TickInput(k) for k in range(400)])]
     assert max(abs(t) for tau in torques for t in tau) == 2.0
     assert site.step(TickInput(400)).mode is Mode.RUN
 
 
 def test_sites_beyond_their_speed_limit_diverge_once() -> None:
-    site = Site(setup("m1", "free", limits__qd_limit_rad_s=0.5))
-    outputs = stepped(site, [TickInput(k) for k in range(400)])
+    site = Site(make_site_setup("m1", "free", limits__qd_limit_rad_s=0.5))
+    outputs = step_site(site, [TickInput(k) for k in range(400)])
     k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert max(map(abs, outputs[k].qd)) > 0.5 >= max(map(abs, outputs[k - 1].qd))
     assert all(
@@ -168,20 +183,22 @@ extreme = st.sampled_from([1.7e308, -1.7e308, 1e200, -1e160, 5e-324, 0.0, 1.0])
 
 @settings(max_examples=60)
 @given(
-    came=st.lists(st.tuples(extreme, extreme, extreme, extreme), min_size=1, max_size=20),
+    arriving=st.lists(st.tuples(extreme, extreme, extreme, extreme), min_size=1, max_size=20),
     Lambda=st.sampled_from([1.0, 5.0, 1e9]),
     scheme=st.sampled_from(["second_order", "digital"]),
 )
 def test_no_record_is_ever_infinite(
-    came: list[tuple[float, float, float, float]], Lambda: float, scheme: str
+    arriving: list[tuple[float, float, float, float]], Lambda: float, scheme: str
 ) -> None:
-    """For any finite numbers of a peer, and any gains."""
-    site = Site(setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0))
-    for k, numbers in enumerate([None, *came, None, None]):
+    """Records are finite for any finite numbers of a peer and any gains."""
+    site = Site(
+        make_site_setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0)
+    )
+    for k, numbers in enumerate([None, *arriving, None, None]):
         numbers_of_tick = (
             [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
         )
-        assert finite(site.step(TickInput(k, numbers_of_tick)))
+        assert is_finite(site.step(TickInput(k, numbers_of_tick)))
 
 
 LARGEST = 1e9
@@ -202,14 +219,14 @@ def test_absurd_scenarios_are_refused_or_stop_finite(key: str, scheme: str) -> N
             load_scenario("paper", {key: LARGEST, "scheme": scheme, "duration_s": 0.3})
         )
     )
-    assert all(finite(r.output) for r in ran)
+    assert all(is_finite(r.output) for r in ran)
 
 
 def test_too_many_arrivals_in_a_tick_are_refused() -> None:
-    site = Site(setup())
-    site.step(TickInput(0, [sample(n) for n in range(MAX_ARRIVALS)]))
+    site = Site(make_site_setup())
+    site.step(TickInput(0, [make_arrival(n) for n in range(MAX_ARRIVALS)]))
     with pytest.raises(ValueError, match="4096"):
-        site.step(TickInput(1, [sample(n) for n in range(MAX_ARRIVALS + 1)]))
+        site.step(TickInput(1, [make_arrival(n) for n in range(MAX_ARRIVALS + 1)]))
 
 
 def test_arrival_checksums_cover_their_bytes() -> None:
@@ -222,4 +239,6 @@ def test_arrival_checksums_cover_their_bytes() -> None:
     packed = b"".join(
         struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in arrivals_made
     )
-    assert Site(setup()).step(TickInput(0, arrivals_made)).rx_crc == zlib.crc32(packed)
+    assert Site(make_site_setup()).step(TickInput(0, arrivals_made)).rx_crc == zlib.crc32(
+        packed
+    )

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.core.sites import setup, stepped
-from tests.virtual_runs import trajectories
+from tests.core.builders import make_site_setup, step_site
+from tests.execution.builders import make_trajectories
 from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.step.site_setup import LinkSetup, StaleAction, StaleRule
 from trilat_net.core.step.site_step import Site
@@ -19,7 +19,7 @@ MS = 1_000_000
 RULE = StaleRule(StaleAction.HOLD, 20 * MS, 30 * MS)
 
 
-def site(
+def make_stale_site(
     rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0
 ) -> Site:
     """Returns a site with two peers behind 5 ms; the samples of its peers come from `moving`."""
@@ -27,7 +27,9 @@ def site(
         LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(LinkModel(location=5_000.0),))
         for n, (name, share) in enumerate(zip("ab", shares, strict=True))
     )
-    return Site(setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s))
+    return Site(
+        make_site_setup()._replace(links=links, on_stale=rule, qd_limit_rad_s=qd_limit_rad_s)
+    )
 
 
 def peer_state(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -36,21 +38,28 @@ def peer_state(peer: int, tick: int) -> tuple[tuple[float, float], tuple[float, 
     return (0.4 * peer + speed[0] * tick / 1000, -0.3 + speed[1] * tick / 1000), speed
 
 
-def moving(peer: int, tick: int) -> Arrival:
+def make_moving_arrival(peer: int, tick: int) -> Arrival:
     return Arrival(peer, tick, *peer_state(peer, tick))
 
 
 def cut_ticks(count: int = 200) -> list[TickInput]:
     """Yields both peers at every tick, except peer 1 in samples from 50 to 90."""
     return [
-        TickInput(k, [moving(j, k - 1) for j in (0, 1) if k and not (j and 50 <= k - 1 < 90)])
+        TickInput(
+            k,
+            [
+                make_moving_arrival(j, k - 1)
+                for j in (0, 1)
+                if k and not (j and 50 <= k - 1 < 90)
+            ],
+        )
         for k in range(count)
     ]
 
 
-def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
+def run_cut_site(rule: StaleRule, count: int = 200) -> list[TickRecord]:
     """Returns the records of a site during that cut."""
-    return stepped(site(rule), cut_ticks(count))
+    return step_site(make_stale_site(rule), cut_ticks(count))
 
 
 def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
@@ -62,7 +71,7 @@ def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
     return [(outputs[k].mode, k) for k in edges]
 
 
-def followed(
+def compute_followed(
     output: TickRecord, shares: Sequence[float] = (0.5, 0.5)
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the reference of the peers, from the samples in use."""
@@ -80,17 +89,17 @@ def followed(
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_divergence_is_final_in_every_mode(action: StaleAction) -> None:
     """A diverged record holds no reference."""
-    stale_site = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
-    outputs = stepped(
+    stale_site = make_stale_site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
+    outputs = step_site(
         stale_site,
         [
-            TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else [])
+            TickInput(k, [make_moving_arrival(j, k - 1) for j in (0, 1)] if k > 60 else [])
             for k in range(120)
         ],
     )
     diverged = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert all(o.mode is Mode.DIVERGED and o.mem == [] for o in outputs[diverged:])
-    q, _ = followed(outputs[-1])
+    q, _ = compute_followed(outputs[-1])
     assert outputs[-1].q_des == pytest.approx(q, abs=1e-12)
 
 
@@ -99,7 +108,9 @@ arrivals = st.lists(
 ).map(lambda parts: [heard for a, b, n in parts for heard in [(a, b)] * n])
 
 
-BOTH, ONE, NONE = (True, True), (True, False), (False, False)
+BOTH = (True, True)
+ONE = (True, False)
+NONE = (False, False)
 CUT = [*[BOTH] * 51, *[ONE] * 40, *[BOTH] * 109]
 """The second peer's samples from 50 to 90 are lost: the last one in use comes at tick 54."""
 CUT_AGAIN = [*[BOTH] * 51, *[ONE] * 40, BOTH, *[ONE] * 108]
@@ -130,11 +141,14 @@ def test_modes_and_references_follow_the_law(
     shares: tuple[float, float],
 ) -> None:
     """For any pattern of arrivals: the edges of `Mode`, and the reference of each mode."""
-    stale_site = site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
-    mode, since, held, before = Mode.RUN, 0, np.zeros(2), np.zeros(2)
+    stale_site = make_stale_site(StaleRule(action, age_ms * MS, return_ms * MS), shares)
+    mode = Mode.RUN
+    since = 0
+    held = np.zeros(2)
+    before = np.zeros(2)
     for k, flags in enumerate(heard):
         output = stale_site.step(
-            TickInput(k, [moving(j, k - 1) for j in (0, 1) if flags[j] and k])
+            TickInput(k, [make_moving_arrival(j, k - 1) for j in (0, 1) if flags[j] and k])
         )
         ages = [k - max(used, 0) for used in output.used]
         stale = any(share > 0 and age > age_ms for share, age in zip(shares, ages, strict=True))
@@ -143,10 +157,11 @@ def test_modes_and_references_follow_the_law(
                 mode = Mode.HOLD if action is StaleAction.HOLD else Mode.BRAKE
                 held = before if action is StaleAction.HOLD else np.array(output.q)
             elif not stale and mode in (Mode.HOLD, Mode.BRAKE):
-                mode, since = Mode.RETURN, k
+                mode = Mode.RETURN
+                since = k
             if mode is Mode.RETURN and k - since >= return_ms:
                 mode = Mode.RUN
-        q, qd = followed(output, shares)
+        q, qd = compute_followed(output, shares)
         if mode is Mode.RETURN:
             x = (k - since) / return_ms
             q, qd = (
@@ -155,7 +170,8 @@ def test_modes_and_references_follow_the_law(
                 + (6 * x * (1 - x) / (return_ms / 1000)) * (q - held),
             )
         elif mode is not Mode.RUN:
-            q, qd = held, np.zeros(2)
+            q = held
+            qd = np.zeros(2)
         assert output.mode is mode
         assert output.q_des == pytest.approx(q, abs=1e-12)
         assert output.qd_des == pytest.approx(qd, abs=1e-9)
@@ -172,7 +188,7 @@ def test_modes_and_references_follow_the_law(
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
 def test_returning_references_have_no_step(action: StaleAction) -> None:
     """Central differences of the reference from the last tick of holding to well within RUN."""
-    outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 700)
+    outputs = run_cut_site(StaleRule(action, 20 * MS, 400 * MS), 700)
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
     assert runs_of(outputs)[2:] == [(Mode.RETURN, 95), (Mode.RUN, 495)]
     assert (q[95] == q[94]).all()
@@ -187,19 +203,19 @@ def test_returning_references_have_no_step(action: StaleAction) -> None:
 def test_stale_sites_resume_the_same_bits(action: StaleAction, k: int) -> None:
     """In any mode, because the records hold the site's memory."""
     rule = RULE._replace(action=action)
-    whole = cut(rule)
-    stale_site = site(rule)
+    whole = run_cut_site(rule)
+    stale_site = make_stale_site(rule)
     last = whole[k - 1]
-    in_use = [moving(j, m) for j, m in enumerate(last.used)]
+    in_use = [make_moving_arrival(j, m) for j, m in enumerate(last.used)]
     heard = [
         (j, m)
         for j in (0, 1)
         for m in range(last.used[j] + 1, k - 1)
         if not (j and 50 <= m < 90)
     ]
-    stale_site.restore_links(k, in_use, [moving(j, m) for j, m in heard])
+    stale_site.restore_links(k, in_use, [make_moving_arrival(j, m) for j, m in heard])
     stale_site.restore_state(whole[k - 2], last)
-    assert stepped(stale_site, cut_ticks()[k:]) == whole[k:]
+    assert step_site(stale_site, cut_ticks()[k:]) == whole[k:]
 
 
 # What it is good for.
@@ -210,7 +226,7 @@ def test_ramped_returns_remove_kicks_after_outages() -> None:
     """Scenario `outage`: the slave is cut off while its master moves, and all samples arrive at once."""
 
     def kick(action: str) -> float:
-        runs_made = trajectories(load_scenario("outage", {"on_stale.action": action}))
+        runs_made = make_trajectories(load_scenario("outage", {"on_stale.action": action}))
         healed = runs_made.sites["s"].t_s >= runs_made.scenario.links["m1->s"].outages_s[0][1]
         return float(np.abs(runs_made.sites["s"].qd[healed]).max())
 

@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.core.task_sites import PLACE, POSE, build
+from tests.core.builders import PLACE, POSE, make_task_arrays
 from trilat_net.core.arms.chain import place_joints
 from trilat_net.core.arms.rotation import (
     angular_velocity,
@@ -31,15 +31,16 @@ tasks = pytest.mark.parametrize("task", [PLACE, POSE], ids=["place", "pose"])
 def place_row(arrays: SiteArrays, q: Array, qd: Array) -> Row:
     """Returns the site's row with its end effector placed in a state."""
     s: Row = arrays.site[0]
-    s.q, s.qd = q, qd
+    s.q = q
+    s.qd = qd
     place_joints(arrays.chain, s.q)
     update_pose(s, arrays.chain)
     return s
 
 
-def draw(seed: int) -> tuple[SiteArrays, Array, Array]:
+def draw_state(seed: int) -> tuple[SiteArrays, Array, Array]:
     rng = np.random.default_rng(seed)
-    arrays = build(POSE if seed % 2 else PLACE)
+    arrays = make_task_arrays(POSE if seed % 2 else PLACE)
     q = arrays.site[0].q + rng.normal(0.0, 0.2, 7)
     return arrays, q, rng.normal(0.0, 0.5, 7)
 
@@ -80,8 +81,9 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 
 @given(seed=seeds)
 def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
-    arrays, q, qd = draw(seed)
-    h, m = 1e-6, arrays.site[0].shared
+    arrays, q, qd = draw_state(seed)
+    h = 1e-6
+    m = arrays.site[0].shared
     before, after = (
         np.array(place_row(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0)
     )
@@ -98,7 +100,7 @@ def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
 @given(seed=seeds)
 def test_r_follows_the_task_in_any_posture(seed: int) -> None:
     """J r = x' + Lambda e wherever no axis is damped."""
-    arrays, q, qd = draw(seed)
+    arrays, q, qd = draw_state(seed)
     s = place_row(arrays, q, qd)
     s.q_des = np.array(s.x) + 0.01
     s.qd_des = 0.02
@@ -111,15 +113,17 @@ def test_reference_acceleration_differentiates_reference_velocity(
     task: TaskSetup,
 ) -> None:
     """Along a motion whose reference stands still: v shortly before and after, and a between them."""
-    arrays = build(task)
-    q, h = np.array(arrays.site[0].q), 1e-6
+    arrays = make_task_arrays(task)
+    q = np.array(arrays.site[0].q)
+    h = 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
     x = np.array(place_row(arrays, q, qd).x)
     x[:3] += 0.05
     errors = []
     for sign in (-1.0, 0.0, 1.0):
         s = place_row(arrays, q + sign * h * qd, qd)
-        s.q_des, s.qd_des = x, 0.0
+        s.q_des = x
+        s.qd_des = 0.0
         update_task_errors(s)
         errors.append((np.array(s.v), np.array(s.a)))
     rate = (errors[2][0] - errors[0][0]) / (2 * h)
@@ -130,11 +134,12 @@ def test_reference_acceleration_differentiates_reference_velocity(
 
 
 def test_damping_begins_below_its_singular_value() -> None:
-    arrays = build(PLACE._replace(singular_value=1e-6))
-    straight = build(PLACE._replace(singular_value=0.5))
-    q, qd = np.array(arrays.site[0].q), np.zeros(7)
-    for one, damped in ((arrays, False), (straight, True)):
-        s = place_row(one, q, qd)
+    arrays = make_task_arrays(PLACE._replace(singular_value=1e-6))
+    straight = make_task_arrays(PLACE._replace(singular_value=0.5))
+    q = np.array(arrays.site[0].q)
+    qd = np.zeros(7)
+    for posed, damped in ((arrays, False), (straight, True)):
+        s = place_row(posed, q, qd)
         s.q_des = np.array(s.x) - 0.1
         update_task_errors(s)
         left = np.abs(s.J @ s.v + s.Lambda * s.e).max()
@@ -143,7 +148,7 @@ def test_damping_begins_below_its_singular_value() -> None:
 
 @given(seed=seeds)
 def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
-    arrays, q, qd = draw(seed)
+    arrays, q, qd = draw_state(seed)
     s = place_row(arrays, q, qd)
     s.q_des = s.x
     update_task_errors(s)
@@ -154,7 +159,7 @@ def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
 
 
 def test_free_axes_get_no_torque() -> None:
-    arrays = build(PLACE._replace(axes=(1.0, 0.0, 1.0)))
+    arrays = make_task_arrays(PLACE._replace(axes=(1.0, 0.0, 1.0)))
     s = place_row(arrays, np.array(arrays.site[0].q), np.zeros(7))
     s.q_des = np.array(s.x) + np.array([0.0, 0.3, 0.0])
     update_task_errors(s)

@@ -32,18 +32,19 @@ def Y_of(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
     return np.array(two_link_arm.regressor(g, q, qd, v, a))
 
 
-def near(a: Array, b: Array, scale: float) -> bool:
+def is_near(a: Array, b: Array, scale: float) -> bool:
     return bool(np.abs(np.asarray(a) - b).max() <= 1e-13 * (1.0 + scale))
 
 
-def size(a: ArmLinks) -> float:
+def measure_size(a: ArmLinks) -> float:
     """Returns an upper bound of the entries of theta."""
     return float(np.abs(theta_from_links(a)).sum())
 
 
 def test_theta_of_the_two_readings() -> None:
     """Eq. (24): point masses at the link ends, and uniform rods."""
-    point, third = ArmLinks(1, 1, 1, 0, 1, 1, 1, 0), 1 / 12
+    point = ArmLinks(1, 1, 1, 0, 1, 1, 1, 0)
+    third = 1 / 12
     rods = ArmLinks(1, 1, 0.5, third, 1, 1, 0.5, third)
     assert theta_from_links(point).tolist() == [3, 1, 1, 2, 1]
     assert theta_from_links(rods) == pytest.approx([5 / 3, 1 / 2, 1 / 3, 3 / 2, 1 / 2])
@@ -70,20 +71,24 @@ def test_the_inertia_is_symmetric_and_positive_definite(a: ArmLinks, q: Array) -
 def test_the_inertia_gives_the_masses_energy(a: ArmLinks, q: Array, qd: Array) -> None:
     M = M_of(theta_from_links(a), q)
     energy = physics.kinetic(a, q, qd)
-    assert 0.5 * qd @ M @ qd == pytest.approx(energy, rel=1e-11, abs=1e-12 * size(a))
-    assert near(M, physics.inertia(a, q), size(a))
+    assert 0.5 * qd @ M @ qd == pytest.approx(energy, rel=1e-11, abs=1e-12 * measure_size(a))
+    assert is_near(M, physics.inertia(a, q), measure_size(a))
 
 
 @given(a=links, q=angles, qd=speeds)
 def test_the_coriolis_matrix_uses_christoffel_symbols(a: ArmLinks, q: Array, qd: Array) -> None:
-    assert near(C_of(theta_from_links(a), q, qd), physics.coriolis(a, q, qd), 20 * size(a))
+    assert is_near(
+        C_of(theta_from_links(a), q, qd), physics.coriolis(a, q, qd), 20 * measure_size(a)
+    )
 
 
 @given(a=links, g=g_values, q=angles)
 def test_gravity_is_the_gradient_of_the_potential_energy(
     a: ArmLinks, g: float, q: Array
 ) -> None:
-    assert near(G_of(theta_from_links(a), g, q), physics.gravity(a, g, q), g * size(a))
+    assert is_near(
+        G_of(theta_from_links(a), g, q), physics.gravity(a, g, q), g * measure_size(a)
+    )
 
 
 @given(a=links, q=angles, qd=speeds, x=speeds)
@@ -91,7 +96,9 @@ def test_mdot_minus_two_c_is_skew(a: ArmLinks, q: Array, qd: Array, x: Array) ->
     """Eq. (4), with Mdot as the exact derivative of the masses' inertia along qd."""
     Mdot = physics.inertia_rates(a, q) @ qd
     S = Mdot - 2.0 * C_of(theta_from_links(a), q, qd)
-    assert abs(x @ S @ x) <= 1e-13 * (1 + size(a)) * (1 + np.abs(qd).sum()) * (1 + x @ x)
+    assert abs(x @ S @ x) <= 1e-13 * (1 + measure_size(a)) * (1 + np.abs(qd).sum()) * (
+        1 + x @ x
+    )
 
 
 @given(a=links, g=g_values, q=angles, qd=speeds, v=speeds, acceleration=speeds)
@@ -105,7 +112,7 @@ def test_the_regressor_separates_the_two_velocities(
         + physics.coriolis(a, q, qd) @ v
         + physics.gravity(a, g, q)
     )
-    assert near(Y_of(g, q, qd, v, acceleration) @ theta, wanted, 1000 * size(a))
+    assert is_near(Y_of(g, q, qd, v, acceleration) @ theta, wanted, 1000 * measure_size(a))
 
 
 @given(g=g_values, q=angles, qd=speeds, qdd=speeds)
@@ -114,7 +121,8 @@ def test_with_one_velocity_the_regressor_is_printed(
 ) -> None:
     """Eq. (5), with Y12 and Y22 as Section IV prints them."""
     Y = Y_of(g, q, qd, qd, qdd)
-    s2, c2 = math.sin(q[1]), math.cos(q[1])
+    s2 = math.sin(q[1])
+    c2 = math.cos(q[1])
     y12 = c2 * (2 * qdd[0] + qdd[1]) - s2 * qd[1] * qd[1] - 2 * s2 * qd[0] * qd[1]
     assert Y[0, 1] == pytest.approx(y12, abs=1e-11)
     assert Y[1, 1] == pytest.approx(c2 * qdd[0] + s2 * qd[0] * qd[0], abs=1e-11)
@@ -128,7 +136,7 @@ def test_forward_dynamics_solve_the_equation_of_motion(
     qdd = np.array(two_link_arm.forward_dynamics(theta_from_links(a), g, q, qd, torque))
     M = physics.inertia(a, q)
     rest = M @ qdd + physics.coriolis(a, q, qd) @ qd + physics.gravity(a, g, q) - torque
-    terms = np.abs(M).max() * np.abs(qdd).max() + 400 * size(a) + 200
+    terms = np.abs(M).max() * np.abs(qdd).max() + 400 * measure_size(a) + 200
     assert np.abs(rest).max() <= 1e-12 * terms * np.linalg.cond(M)
 
 
@@ -136,4 +144,4 @@ def test_forward_dynamics_solve_the_equation_of_motion(
 def test_the_tip_follows_from_the_links(a: ArmLinks, q: Array) -> None:
     xy = np.array(two_link_arm.forward_kinematics((a.l1_m, a.l2_m), q))
     ends = physics.centres(a._replace(lc1_m=a.l1_m, lc2_m=a.l2_m), q)
-    assert near(xy, np.array(ends), 10.0)
+    assert is_near(xy, np.array(ends), 10.0)

@@ -11,10 +11,12 @@ class CirclingHand:
     """Holds an arm from 0.2 s to 0.7 s and leads it, 60 messages a second; then the hand is silent."""
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        self._arm, spec = scenario.arms[site], scenario.sites[site]
+        self._arm = scenario.arms[site]
+        spec = scenario.sites[site]
         live = spec.find_live_hand()
         assert live is not None
-        self._mode, self._rules = live.mode, live.make_rules(spec.rate_hz, self._arm)
+        self._mode = live.mode
+        self._rules = live.make_rules(spec.rate_hz, self._arm)
         self._memory = HandMemory()
 
     def __call__(self, site: Site, k: int) -> list[float]:

@@ -1,12 +1,11 @@
 """Runs over a network that scatters samples: early, late, out of order, twice, or never."""
 
-import io
 import itertools
 from collections.abc import Collection, Mapping
 
 from hypothesis import strategies as st
 
-from trilat_net.execution import virtual
+from tests.log.builders import simulate_bytes
 from trilat_net.execution.virtual_network import RecordedNetwork
 from trilat_net.scenario import load_scenario
 
@@ -26,14 +25,16 @@ never = st.frozensets(samples, max_size=40)
 site_sets = st.sets(st.sampled_from(SITES), min_size=1).map(sorted)
 
 
-def gaps(size: int, least: int = 1, most: int = 3) -> st.SearchStrategy[dict[str, set[int]]]:
+def draw_gaps(
+    size: int, least: int = 1, most: int = 3
+) -> st.SearchStrategy[dict[str, set[int]]]:
     """Draws ticks without a record, of some sites; the last tick has a record."""
     lost = st.sets(st.integers(0, TICKS - 2), min_size=1, max_size=size)
     return st.dictionaries(st.sampled_from(SITES), lost, min_size=least, max_size=most)
 
 
 def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
-    """Holds each sample back until the earlier samples of the same link have come."""
+    """Returns delays, in ticks, with which each sample waits for the earlier samples of its link."""
     held: dict[Sample, int] = {}
     for receiver in SCENARIO.names:
         for peer in (0, 1):
@@ -44,13 +45,11 @@ def first_in_first_out(delays: Mapping[Sample, int]) -> dict[Sample, int]:
     return held
 
 
-def delivered(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
+def make_delivered_bytes(delays: Mapping[Sample, int], lost: Collection[Sample] = ()) -> bytes:
     """Returns a log of a run whose samples take the given numbers of ticks, one by default, or are lost."""
     at: dict[str, dict[int, list[list[int]]]] = {name: {} for name in SCENARIO.names}
     for receiver, peer, tick in itertools.product(SCENARIO.names, (0, 1), range(TICKS)):
         if (receiver, peer, tick) not in lost:
             arrives = tick + delays.get((receiver, peer, tick), 1)
             at[receiver].setdefault(arrives, []).append([peer, tick, 0])
-    stream = io.BytesIO()
-    virtual.write_virtual_log(SCENARIO, stream, RecordedNetwork(at, PEERS))
-    return stream.getvalue()
+    return simulate_bytes(SCENARIO, RecordedNetwork(at, PEERS))

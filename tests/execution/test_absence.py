@@ -9,10 +9,17 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from tests.execution.deliveries import SITES, TICKS, delivered
-from tests.execution.logs import without_records
-from tests.log_editing import edited, opened, recorded, without
-from tests.log_surgery import Pieces, Stored, repacked, taken_apart
+from tests.execution.builders import make_log_without
+from tests.execution.deliveries import SITES, TICKS, make_delivered_bytes
+from tests.log.builders import (
+    drop_records,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    open_bytes,
+    write_log,
+)
+from tests.log.surgery import Pieces, Stored, repack_message, take_apart
 from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.log_checks import LogCheckReport
@@ -29,19 +36,19 @@ LATE = {("m1", 0, 20): 35, ("m2", 1, 30): 38, ("s", 0, 25): 39}
 
 
 @cache
-def run(*, other: bool = False) -> bytes:
-    return delivered(LATE if other else {})
+def make_run_bytes(*, other: bool = False) -> bytes:
+    return make_delivered_bytes(LATE if other else {})
 
 
-def pieces(*, chained: bool, other: bool = False) -> Pieces:
-    taken = taken_apart(run(other=other))
+def make_pieces(*, chained: bool, other: bool = False) -> Pieces:
+    taken = take_apart(make_run_bytes(other=other))
     return taken if chained else taken.without_chain()
 
 
 def is_refused(data: bytes, *, chained: bool) -> bool:
     """True if a log does not pass as whole and identical; a log with a chain, by the chain alone."""
     try:
-        log = opened(data)
+        log = open_bytes(data)
         if chained:
             return not judge_integrity(log).passed
         return not LogCheckReport.of_log(log, virtual=False).passed
@@ -50,11 +57,11 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
 
 
 def test_rewriting_without_changes_keeps_the_file() -> None:
-    assert taken_apart(run()).bytes() == run()
-    log = opened(run())
+    assert take_apart(make_run_bytes()).bytes() == make_run_bytes()
+    log = open_bytes(make_run_bytes())
     assert judge_integrity(log).state is DigestState.INTACT
     assert LogCheckReport.of_log(log, virtual=True).passed
-    old = opened(pieces(chained=False).bytes())
+    old = open_bytes(make_pieces(chained=False).bytes())
     assert judge_integrity(old).state is DigestState.ABSENT
     assert LogCheckReport.of_log(old, virtual=True).passed
 
@@ -65,7 +72,7 @@ stretches = st.tuples(st.integers(1, TICKS - 2), st.integers(1, 30)).map(
 )
 
 
-def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
+def list_places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
     """Returns the places in a file of the records of some sites and ticks."""
     topics = taken.topics()
     wanted = {f"/trilat/free/{site}/state" for site in of}
@@ -76,15 +83,16 @@ def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
     ]
 
 
-def remove(draw: Callable, taken: Pieces) -> None:
-    gone = set(places(taken, draw(sites), draw(stretches)))
+def remove_records(draw: Callable, taken: Pieces) -> None:
+    gone = set(list_places(taken, draw(sites), draw(stretches)))
     taken.messages = [m for n, m in enumerate(taken.messages) if n not in gone]
 
 
-def splice(draw: Callable, taken: Pieces) -> None:
+def splice_run(draw: Callable, taken: Pieces) -> None:
     """Returns a log that continues with another run from some tick on, over a gap or none."""
-    k, gap = draw(st.integers(TICKS // 2, TICKS - 5)), draw(st.integers(0, 3))
-    other = taken_apart(run(other=True)).messages
+    k = draw(st.integers(TICKS // 2, TICKS - 5))
+    gap = draw(st.integers(0, 3))
+    other = take_apart(make_run_bytes(other=True)).messages
     topics = taken.topics()
 
     def is_record(m: Stored) -> bool:
@@ -94,30 +102,31 @@ def splice(draw: Callable, taken: Pieces) -> None:
     taken.messages = kept + [m for m in other if is_record(m) and m.sequence >= k + gap]
 
 
-def replay(draw: Callable, taken: Pieces) -> None:
+def replay_records(draw: Callable, taken: Pieces) -> None:
     """Returns a log with a repeated stretch: unchanged, or with the following tick numbers, in
     place of the original.
     """
-    of, ticks = draw(sites), draw(stretches)
-    again = [taken.messages[n] for n in places(taken, of, ticks)]
+    of = draw(sites)
+    ticks = draw(stretches)
+    again = [taken.messages[n] for n in list_places(taken, of, ticks)]
     if draw(st.booleans()):
         taken.messages += again
         return
     assume(ticks.stop + len(ticks) < TICKS)
-    later = set(places(taken, of, range(ticks.stop, ticks.stop + len(ticks))))
+    later = set(list_places(taken, of, range(ticks.stop, ticks.stop + len(ticks))))
     taken.messages = [m for n, m in enumerate(taken.messages) if n not in later]
     for message in again:
         tick = message.sequence + len(ticks)
         taken.messages.append(
-            repacked(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000)
+            repack_message(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000)
         )
 
 
-def renumber(draw: Callable, taken: Pieces) -> None:
+def renumber_records(draw: Callable, taken: Pieces) -> None:
     by = draw(st.integers(-40, 40).filter(bool))
-    for n in places(taken, draw(sites), draw(stretches)):
+    for n in list_places(taken, draw(sites), draw(stretches)):
         tick = taken.messages[n].sequence + by
-        taken.messages[n] = repacked(taken.messages[n], tick=tick)
+        taken.messages[n] = repack_message(taken.messages[n], tick=tick)
 
 
 def change_metadata(draw: Callable, taken: Pieces) -> None:
@@ -154,13 +163,13 @@ def change_description(draw: Callable, taken: Pieces) -> None:
     entry.data = entry.data[:index] + bytes([entry.data[index] ^ 1]) + entry.data[index + 1 :]
 
 
-def change_message(draw: Callable, taken: Pieces) -> None:
+def change_one_message(draw: Callable, taken: Pieces) -> None:
     """Changes a time, or the telemetry of a record, which no execution computes; or removes any message."""
     n = draw(st.integers(0, len(taken.messages) - 1))
     message = taken.messages[n]
     match draw(st.sampled_from(["log_ns", "publish_ns", "telemetry", "out"])):
         case "telemetry" if "late_us" in msgpack.unpackb(message.payload):
-            taken.messages[n] = repacked(message, late_us=77)
+            taken.messages[n] = repack_message(message, late_us=77)
         case "out":
             del taken.messages[n]
         case "publish_ns":
@@ -169,15 +178,15 @@ def change_message(draw: Callable, taken: Pieces) -> None:
             taken.messages[n] = message._replace(log_ns=message.log_ns + 1)
 
 
-OF_RECORDS = [remove, splice, replay, renumber]
-ANY = [*OF_RECORDS, change_metadata, change_description, change_message]
+OF_RECORDS = [remove_records, splice_run, replay_records, renumber_records]
+ANY = [*OF_RECORDS, change_metadata, change_description, change_one_message]
 
 
 def refuses_all(changes: list[Callable], *, chained: bool, examples: int) -> None:
     @settings(max_examples=examples)
     @given(st.data(), st.sampled_from(changes))
     def check(data: st.DataObject, change: Callable) -> None:
-        taken = pieces(chained=chained)
+        taken = make_pieces(chained=chained)
         change(data.draw, taken)
         assert is_refused(taken.bytes(), chained=chained), change.__name__
 
@@ -201,20 +210,20 @@ def test_of_500_changed_logs_none_passes(chained: bool, changes: list[Callable])
 
 def test_two_runs_over_a_gap_are_refused() -> None:
     """The same experiment and the same starts of its sites: another run follows the gap."""
-    taken = pieces(chained=False)
-    other = taken_apart(run(other=True)).messages
+    taken = make_pieces(chained=False)
+    other = take_apart(make_run_bytes(other=True)).messages
     topics = taken.topics()
     taken.messages = [
         m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
     ]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
-    integrity = judge_integrity(opened(taken.bytes()))
+    integrity = judge_integrity(open_bytes(taken.bytes()))
     assert integrity.state is DigestState.CHANGED
     assert "were removed or added" in integrity.text
 
 
 def test_sparse_logs_fail_with_the_judged_share() -> None:
-    log = without_records({"m1": range(2, 100)})
+    log = make_log_without({"m1": range(2, 100)})
     verdict = verify(log)
     assert verdict.agreed
     assert not verdict.passed
@@ -226,16 +235,17 @@ def test_sparse_logs_fail_with_the_judged_share() -> None:
 
 
 def test_torn_logs_pass_no_more_than_asked() -> None:
-    data = edited(recorded("paper"), chunk_bytes=2048)
-    log = opened(data[: len(data) // 2])
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
+    log = open_bytes(data[: len(data) // 2])
     assert not verify(log).passed
     share = verify(log).coverage.share
     assert 0.1 < share < 0.9
     assert verify(log, min_coverage=share).passed
     assert not verify(log, min_coverage=share + 1e-6).passed
-    whole = recorded("paper")
+    whole = make_log_bytes("paper")
     assert (
-        judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is DigestState.OPEN
+        judge_integrity(open_bytes(whole[: whole.index(b"trilat.chain")])).state
+        is DigestState.OPEN
     )
 
 
@@ -244,9 +254,9 @@ def test_foreign_records_are_found_without_execution() -> None:
 
     def record(r: dict) -> dict | None:
         changed = {**r, "boot": 1} if (r["site"], r["tick"]) == ("s", 45) else r
-        return without("s", {43, 44})(changed)
+        return drop_records("s", {43, 44})(changed)
 
-    first = verify(opened(edited(recorded("paper"), record=record))).first
+    first = verify(open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))).first
     assert first is not None
     assert first[:3] == ("s", 45, "boot")
 
@@ -256,29 +266,29 @@ def test_a_claimed_rerun_is_executed_whole() -> None:
         return r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}
 
     claims = {"rerun_executed": "s", "rerun_mode": "open loop"}
-    data = edited(recorded("paper"), record=zeroed, session=claims)
-    assert not verify(opened(data)).agreed
-    worse = verify(opened(edited(data, session={**claims, "driver": "rerun"})))
+    data = edit_log_bytes(make_log_bytes("paper"), record=zeroed, session=claims)
+    assert not verify(open_bytes(data)).agreed
+    worse = verify(open_bytes(edit_log_bytes(data, session={**claims, "driver": "rerun"})))
     assert worse.agreed  # its m1 and m2 met samples that are not in it
     assert worse.coverage.share == 0.0
     assert not worse.passed
 
 
 def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(recorded("free"))
+    write_log(tmp_path, make_log_bytes("free"))
     log_path = tmp_path / "again.mcap"
     rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(log_path)
     verdict = verify(open_log(log_path))
     assert verdict.passed
     assert verdict.identical == 3 * TICKS
-    forged = edited(
+    forged = edit_log_bytes(
         log_path.read_bytes(),
         record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r,
     )
     log_path.write_bytes(forged)
     assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
-    (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")
+    write_log(tmp_path, make_log_bytes("free") + b"x")
     alone = LogCheckReport.of_log(open_log(log_path), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)
@@ -286,7 +296,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
 
 def test_lost_samples_excuse_virtual_time_afterwards() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
-    log = opened(delivered({}, lost))
+    log = open_bytes(make_delivered_bytes({}, lost))
     report = LogCheckReport.of_log(log, virtual=True)
     assert report.passed, report.findings
     assert (
@@ -299,13 +309,13 @@ def test_lost_samples_excuse_virtual_time_afterwards() -> None:
         return {**r, "tau": [r["tau"][0], r["tau"][1] + 1e-12]} if r["tick"] == 30 else r
 
     changed = LogCheckReport.of_log(
-        opened(edited(delivered({}, lost), record=record)), virtual=True
+        open_bytes(edit_log_bytes(make_delivered_bytes({}, lost), record=record)), virtual=True
     )
     assert not changed.findings[-1].passed
 
 
 def test_gaps_pass_with_possible_arrivals() -> None:
-    lines = LogCheckReport.of_log(without_records({"m2": [50, 51]}), virtual=True).findings
+    lines = LogCheckReport.of_log(make_log_without({"m2": [50, 51]}), virtual=True).findings
     fed = next(line for line in lines if "fed" in line.check)
     assert fed.passed, fed
 
@@ -321,10 +331,10 @@ def test_coverage_is_the_least_of_all_sites() -> None:
 
 
 def test_lost_sites_end_where_last_seen() -> None:
-    whole = opened(recorded("paper"))
+    whole = make_log("paper")
     assert {whole.expected_ticks(site) for site in SITES} == {TICKS}
-    data = edited(recorded("paper"), chunk_bytes=2048)
-    torn = opened(data[: len(data) // 2])
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
+    torn = open_bytes(data[: len(data) // 2])
     assert {torn.expected_ticks(site) for site in SITES} == {TICKS}  # nobody tells more
     last = int(torn["s"].tick[-1])
     torn.events.append(Event(member="m1", boot=1, t_ns=1, n=9, kind="lost", text="", about="s"))

@@ -7,26 +7,27 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.chains import six_joints
-from tests.log_editing import Record, edited, opened
+from tests.log.builders import Record, edit_log_bytes, open_bytes
+from tests.scenario.builders import six_joint_text
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario.scenario_reader import load_scenario, parse_scenario
 
-N, TICKS = 6, 80
+N = 6
+TICKS = 80
 
 
 @cache
-def record_chain_log() -> bytes:
+def make_chain_bytes() -> bytes:
     """Returns a run in which every link delays by 20 ms."""
     stream = io.BytesIO()
-    write_virtual_log(parse_scenario(six_joints(TICKS / 1000)), stream)
+    write_virtual_log(parse_scenario(six_joint_text(TICKS / 1000)), stream)
     return stream.getvalue()
 
 
-def changed(field: str, numbers: int) -> Log:
+def make_changed_log(field: str, numbers: int) -> Log:
     """Returns the log whose slave has that many numbers in a vector of one record."""
 
     def change(record: Record) -> Record:
@@ -34,14 +35,14 @@ def changed(field: str, numbers: int) -> Log:
             record[field] = (record[field] * 2)[:numbers]
         return record
 
-    return opened(edited(record_chain_log(), record=change))
+    return open_bytes(edit_log_bytes(make_chain_bytes(), record=change))
 
 
 @pytest.mark.parametrize(
     ("field", "numbers"), [("q", 5), ("q", 7), ("tau", 2), ("theta_hat", 5)]
 )
 def test_records_with_other_joints_are_refused(field: str, numbers: int) -> None:
-    log = changed(field, numbers)
+    log = make_changed_log(field, numbers)
     with pytest.raises(
         LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"
     ):
@@ -56,7 +57,7 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
             record["qd"][N - 1] = math.nextafter(record["qd"][N - 1], math.inf)
         return record
 
-    first = verify(opened(edited(record_chain_log(), record=change))).first
+    first = verify(open_bytes(edit_log_bytes(make_chain_bytes(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
 

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.core.compiled import run_program
+from tests.execution.builders import execute_ticks, run_fused
 from tests.execution.varying_links import VARYING_LINKS
+from tests.programs import run_python
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.core.step.ticks import BUCKETS_PER_S, Mode, TickRecord
@@ -38,7 +39,7 @@ LINKS: tuple[dict[str, Any], ...] = (
 )
 
 
-def floats(output: TickRecord) -> list[float]:
+def list_floats(output: TickRecord) -> list[float]:
     o = output
     return [
         *o.q,
@@ -54,14 +55,7 @@ def floats(output: TickRecord) -> list[float]:
     ]
 
 
-def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
-    ran: dict[str, list[TickRecord]] = {name: [] for name in scenario.names}
-    for site, _, output in virtual.execute_virtual(scenario):
-        ran[site.name].append(output)
-    return ran
-
-
-def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
+def compute_buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
     maxima = np.full(
         (len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0
@@ -74,15 +68,16 @@ def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     return maxima
 
 
-def agree(scenario: Scenario) -> None:
-    expected = per_tick(scenario)
-    fused = FusedRun(scenario)
-    fused.advance_to(scenario.duration_s)
+def assert_agreement(scenario: Scenario) -> None:
+    expected = execute_ticks(scenario)
+    fused = run_fused(scenario)
     for record, outputs in zip(fused.records, expected.values(), strict=True):
-        last = floats(outputs[-1])
+        last = list_floats(outputs[-1])
         np.testing.assert_array_equal(record[: len(last)], last)
     for maximum, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
-        np.testing.assert_array_equal(maximum, buckets(outputs, scenario.sites[name].rate_hz))
+        np.testing.assert_array_equal(
+            maximum, compute_buckets(outputs, scenario.sites[name].rate_hz)
+        )
     stops = [
         o.t_ns * 1e-9
         for outputs in expected.values()
@@ -95,7 +90,7 @@ def agree(scenario: Scenario) -> None:
 @pytest.mark.parametrize("name", list_shipped())
 def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
     scenario = load_scenario(name)
-    agree(load_scenario(name, {"duration_s": min(scenario.duration_s, 2.0)}))
+    assert_agreement(load_scenario(name, {"duration_s": min(scenario.duration_s, 2.0)}))
 
 
 @settings(max_examples=12, deadline=None)
@@ -114,14 +109,13 @@ def test_any_links_rates_and_schemes_agree(
         for site, rate in zip(("m1", "m2", "s"), rates, strict=True)
     }
     run = {"duration_s": 0.4, "seed": seed, "scheme": scheme}
-    agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
+    assert_agreement(load_scenario(load_scenario(name), {**changes, **run, **link}))
 
 
 def test_diverging_runs_end_with_that_tick() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
-    agree(scenario)
-    fused = FusedRun(scenario)
-    fused.advance_to(1.0)
+    assert_agreement(scenario)
+    fused = run_fused(scenario, 1.0)
     assert fused.diverged_s is not None
     before = fused.records
     fused.advance_to(3.0)
@@ -132,7 +126,8 @@ def test_diverging_runs_end_with_that_tick() -> None:
 @given(stops=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=5))
 def test_a_split_run_equals_the_whole_run(stops: list[float]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})
-    whole, parts = FusedRun(scenario), FusedRun(scenario)
+    whole = FusedRun(scenario)
+    parts = FusedRun(scenario)
     whole.advance_to(1.0)
     for until_s in sorted(stops):
         parts.advance_to(until_s)
@@ -161,8 +156,7 @@ def test_a_split_run_equals_the_whole_run(stops: list[float]) -> None:
 def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None:
     """RMS e, peak force and work of the walls as `trilat metrics` has them; the effort by its formula."""
     scenario = load_scenario(load_scenario(name), changes)
-    fused = FusedRun(scenario)
-    fused.advance_to(0.5 * scenario.duration_s)
+    fused = run_fused(scenario, 0.5 * scenario.duration_s)
     fused.advance_to(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
     whole = {
@@ -177,7 +171,9 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
         ), key
     squares = []
     for site in scenario.names:
-        q, tau, theta = log[site].q, log[site].tau, scenario.arms[site].theta
+        q = log[site].q
+        tau = log[site].tau
+        theta = scenario.arms[site].theta
         outer = 9.81 * theta[4] * np.cos(q[:, 0] + q[:, 1])
         gravity = np.stack((9.81 * theta[3] * np.cos(q[:, 0]) + outer, outer), axis=1)
         squares.append(np.mean((tau - gravity) ** 2))
@@ -187,18 +183,16 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
 @pytest.mark.long
 def test_settling_is_the_last_error_limit_crossing() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
-    fused = FusedRun(scenario, settled_rad=0.01)
-    fused.advance_to(13.0)
+    fused = run_fused(scenario, 13.0, settled_rad=0.01)
     late_times_s = [
         output.t_ns
-        for outputs in per_tick(scenario).values()
+        for outputs in execute_ticks(scenario).values()
         for output in outputs
         if max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         >= 0.01
     ]
     assert fused.settled_s == max(late_times_s) / 1e9
-    early = FusedRun(scenario, settled_rad=0.01)
-    early.advance_to(2.0)
+    early = run_fused(scenario, 2.0, settled_rad=0.01)
     assert early.settled_s is None
 
 
@@ -219,9 +213,9 @@ for scheme in ("second_order", "digital"):
 
 @pytest.mark.long
 def test_without_the_compiler_it_has_the_same_bits() -> None:
-    plain = run_program(_PROGRAM, compiled=False)
+    plain = run_python(_PROGRAM, compiled=False)
     assert plain.count("\n") == 8
-    assert plain == run_program(_PROGRAM, compiled=True)
+    assert plain == run_python(_PROGRAM, compiled=True)
 
 
 def test_unsupported_runs_are_refused() -> None:
@@ -235,7 +229,7 @@ def test_unsupported_runs_are_refused() -> None:
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
 def test_plugged_laws_have_per_tick_bits(law: str) -> None:
-    """One law among those of the kernel, which send nothing; and all sites, at two rates."""
+    """The law runs at one site among laws of the kernel, and at all sites at two rates."""
     plugged = {"link.delay_ms": 5.0, "duration_s": 0.2}
     line = f"tests.plugged_laws:{law}"
     for changes in (
@@ -243,8 +237,7 @@ def test_plugged_laws_have_per_tick_bits(law: str) -> None:
         {"control.law": line, "sites.s.rate_hz": 500},
     ):
         scenario = load_scenario("asymmetric", {**plugged, **changes})
-        fused = FusedRun(scenario)
-        fused.advance_to(0.05)
+        fused = run_fused(scenario, 0.05)
         fused.advance_to(scenario.duration_s)
         last = {tick.site.name: tick.output for tick in virtual.execute_virtual(scenario)}
         for name, row in zip(scenario.names, fused.records, strict=True):

@@ -83,7 +83,7 @@ def compute_used(
 
 
 def test_deliveries_between_random_rates_are_exact() -> None:
-    """Also where a tick is planned after later ticks of other sites, because durations are rounded."""
+    """The ticks are exact also if a tick is planned after later ticks of other sites, because durations are rounded."""
     draws = random.Random(1)
     compared = 0
     for _ in range(40):
@@ -95,7 +95,7 @@ def test_deliveries_between_random_rates_are_exact() -> None:
         ends_s = sorted(draws.uniform(0.0, 0.5) for _ in range(3))
         expected = read_used(FusedRun(cell), ends_s, rates_hz)
         computed = compute_used(FusedRun(cell), ends_s, rates_hz, draws)
-        for one, other in zip(computed, expected, strict=True):
-            assert one.tolist()[: len(other)] == other.tolist()
+        for computed_ticks, other in zip(computed, expected, strict=True):
+            assert computed_ticks.tolist()[: len(other)] == other.tolist()
             compared += len(other)
     assert compared > 5000

@@ -159,7 +159,7 @@ def test_2000_random_cells_have_single_run_bits() -> None:
 
 
 def test_chains_have_the_bits_of_their_runs_alone() -> None:
-    """With friction, stops and a robust term, and limits that some runs leave."""
+    """The runs have friction, stops, a robust term, and limits that some of them exceed."""
     law = {"control.law": "adaptive_robust", "control.rho_nm": 0.5}
     base = load_scenario("six_joints", {"duration_s": 0.4, **law})
     draws = random.Random(11)
@@ -222,7 +222,8 @@ def test_runs_continue_in_lanes_or_alone(structure: tuple[str, dict[str, Any]]) 
         runs[index].advance_to(1.0)
         alone = run_alone(cells[index], *ends_s, 1.0)
         check_equal(runs[index], alone)
-        links, expected = runs[index].memory.tables.links, alone.memory.tables.links
+        links = runs[index].memory.tables.links
+        expected = alone.memory.tables.links
         assert [n for n in links.dtype.names if (links[n] != expected[n]).any()] == []
         assert (runs[index].memory.next_samples == alone.memory.next_samples).all()
 

@@ -8,9 +8,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from tests.execution.builders import OTHER_PLATFORM
 from tests.execution.deliveries import SITES, TICKS
-from tests.execution.logs import OTHER_PLATFORM
-from tests.log_editing import Record, edited, opened, recorded
+from tests.log.builders import Record, edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.execution.verification import verify
@@ -25,13 +25,13 @@ DELAY_TICKS = 20
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0, "control.law": LAW}
 
 
-def talk(**more: Any) -> bytes:
-    return recorded("paper", {**SHORT, **more})
+def make_talking_bytes(**more: Any) -> bytes:
+    return make_log_bytes("paper", {**SHORT, **more})
 
 
 def test_peers_get_own_and_common_vectors() -> None:
     """The energy that a site states, from the records of its peers alone, without the parts for others."""
-    log = opened(talk())
+    log = open_bytes(make_talking_bytes())
     alpha = log.scenario.dominance
     for site in SITES:
         energy = np.zeros(TICKS)
@@ -64,7 +64,9 @@ def test_a_changed_number_shows_at_its_own_tick(
             r["ch"][place] += 1e-3
         return r
 
-    first = verify(opened(edited(talk(), record=record, session=session))).first
+    first = verify(
+        open_bytes(edit_log_bytes(make_talking_bytes(), record=record, session=session))
+    ).first
     assert first is not None
     assert first[:3] == ("m2", 40, f"ch.{name}")
 
@@ -78,14 +80,17 @@ def test_arrival_sums_cover_exactly_the_received_numbers(place: int, differing: 
             r["ch"][place] += 1e-3
         return r
 
-    assert verify(opened(edited(talk(), record=record))).differing == differing
+    assert (
+        verify(open_bytes(edit_log_bytes(make_talking_bytes(), record=record))).differing
+        == differing
+    )
 
 
 def test_records_with_wrong_law_messages_are_unreadable() -> None:
     def record(r: Record) -> Record:
         return {**r, "ch": r["ch"][:-1]}
 
-    log = opened(edited(talk(), record=record))
+    log = open_bytes(edit_log_bytes(make_talking_bytes(), record=record))
     with pytest.raises(LogError, match="ch has 4 numbers, not 5"):
         log["m1"].ch  # noqa: B018
 
@@ -121,7 +126,7 @@ def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
 
 
 def test_tables_name_messages_with_their_units() -> None:
-    log = opened(talk())
+    log = open_bytes(make_talking_bytes())
     table = log.table("m2", "state")
     columns = {
         column.source: column for column in table.columns if column.source.startswith("ch.")

@@ -1,12 +1,10 @@
 """A log repeats the hold of an arm by a person: verified, in fed virtual time, and executed again."""
 
-import io
-
 import numpy as np
 import pytest
 
 from tests.execution.circling_hand import CirclingHand
-from tests.log_editing import Record, edited, opened
+from tests.log.builders import Record, edit_log_bytes, open_bytes, simulate_bytes
 from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
@@ -15,7 +13,7 @@ from trilat_net.analysis.certificate.energy_balance import (
 from trilat_net.analysis.torque_sources import TorqueSplit, compute_live_torque
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify
-from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
+from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
@@ -61,7 +59,8 @@ def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
 
 
 def test_record_tables_name_the_hands_values(held_log: Log) -> None:
-    table, mode = held_log.table("m1"), held_log.scenario.sites["m1"].hands[0].mode
+    table = held_log.table("m1")
+    mode = held_log.scenario.sites["m1"].hands[0].mode
     first = {
         "tip": "hand_target_x_m",
         "joint": "hand_target_q1_rad",
@@ -85,11 +84,10 @@ def test_a_changed_hand_is_found(mode: str) -> None:
 
     live = [{"kind": "live", "mode": mode}]
     scenario = load_scenario("paper", {"duration_s": SECONDS, "sites.m1.hands": live})
-    stream = io.BytesIO()
-    write_virtual_log(scenario, stream, hands={"m1": CirclingHand(scenario, "m1")})
-    found = verify(opened(edited(stream.getvalue(), record=change)))
-    assert found.first is not None
-    assert (found.first.site, found.first.tick) == ("m1", 400)
+    data = simulate_bytes(scenario, hands={"m1": CirclingHand(scenario, "m1")})
+    first = verify(open_bytes(edit_log_bytes(data, record=change))).first
+    assert first is not None
+    assert (first.site, first.tick) == ("m1", 400)
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,8 @@ def without_code(log: SimulatedLog) -> Log:
 @pytest.mark.parametrize("name", ["paper", "free"])
 def test_compiled_runs_pause_for_a_hand(name: str, kind: str, keys: dict[str, Any]) -> None:
     scenario = load_scenario(name, at_m2(kind, **keys))
-    log, run = simulate_scenario(scenario), FusedRun(scenario, keep=2000)
+    log = simulate_scenario(scenario)
+    run = FusedRun(scenario, keep=2000)
     run.advance_to(scenario.duration_s)
     for (_, rows), site in zip(run.pop_records(), scenario.names, strict=True):
         columns = scenario.layout(site).columns()
@@ -101,10 +102,10 @@ def test_a_hand_sees_its_peers_after_the_delay() -> None:
 def test_a_hand_that_fails_lets_go_for_good(how: str) -> None:
     with pytest.warns(RuntimeWarning, match="Failing failed at tick 300"):
         log = tn.simulate("paper", at_m2("Failing", settings={"how": how, "at_s": 0.3}))
-    told = [event.text for event in log.events if event.kind == "hand"]
-    assert [text for text in told if "tests.own_code:Failing failed at tick 300: " in text]
-    assert [text for text in told if "is not asked again" in text]
-    assert len([text for text in told if "failed" in text]) == 1
+    texts = [event.text for event in log.events if event.kind == "hand"]
+    assert [text for text in texts if "tests.own_code:Failing failed at tick 300: " in text]
+    assert [text for text in texts if "is not asked again" in text]
+    assert len([text for text in texts if "failed" in text]) == 1
     assert log["m2"].hand[305, 2] == 0.0
     assert log["m2"].hand[299, 2] == 1.0
     assert log["m2"].hand[450:, 0].max() == 0.0
@@ -114,8 +115,8 @@ def test_a_hand_that_fails_lets_go_for_good(how: str) -> None:
 
 def test_letting_go_is_no_failure() -> None:
     log = tn.simulate("paper", at_m2("Failing", settings={"how": "let go", "at_s": 0.3}))
-    told = [event.text for event in log.events if event.kind == "hand"]
-    assert ["failed" in text for text in told] == [False, False]
+    texts = [event.text for event in log.events if event.kind == "hand"]
+    assert ["failed" in text for text in texts] == [False, False]
 
 
 @pytest.mark.parametrize(
@@ -313,7 +314,7 @@ def test_a_person_takes_over_without_a_jump() -> None:
         "timeline": ramps,
         "duration_s": 9.0,
     }
-    found = tn.metrics(tn.simulate("paper", overrides))
-    assert found.run["takeovers"].value == 2
-    assert 0.0 < found.run["takeover_s"].value <= 1.0
-    assert 0.0 < found.run["lead_jump"].value <= 1.2
+    metrics = tn.metrics(tn.simulate("paper", overrides))
+    assert metrics.run["takeovers"].value == 2
+    assert 0.0 < metrics.run["takeover_s"].value <= 1.0
+    assert 0.0 < metrics.run["lead_jump"].value <= 1.2

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from tests.control_laws.law_settings import LAWS
+from tests.execution.builders import OTHER_PLATFORM, make_log_without
 from tests.execution.deliveries import TICKS
-from tests.execution.logs import OTHER_PLATFORM, without_records
-from tests.log_editing import opened, recorded
+from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.execution.resumption import RecordedInputs, read_output
@@ -31,13 +31,13 @@ SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 def record_law(law: str) -> bytes:
     scenario, settings = LAWS.get(law, ("paper", {}))
-    return recorded(scenario, {**SHORT, "control.law": law, **settings})
+    return make_log_bytes(scenario, {**SHORT, "control.law": law, **settings})
 
 
 @pytest.mark.parametrize("law", EVERY_LAW)
 def test_logs_of_any_law_are_executed_again(law: str) -> None:
     """Whole, beside virtual time, and as a rerun without changes, every record is identical."""
-    log = opened(record_law(law))
+    log = open_bytes(record_law(law))
     records = len(log.sites) * TICKS
     verdict = verify(log)
     assert verdict.whole_run
@@ -53,22 +53,23 @@ def test_logs_of_any_law_are_executed_again(law: str) -> None:
 def test_any_law_resumes_behind_a_gap(law: str, session: dict[str, str] | None) -> None:
     """As much can be judged as of the law of the paper, and all of it agrees."""
     lost = {"s": range(50, 61)}
-    verdict = verify(without_records(lost, record_law(law), session))
+    verdict = verify(make_log_without(lost, record_law(law), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
     scenario, _ = LAWS.get(law, ("paper", {}))
-    paper = verify(without_records(lost, recorded(scenario, SHORT), session))
+    paper = verify(make_log_without(lost, make_log_bytes(scenario, SHORT), session))
     assert (verdict.identical, verdict.unjudged) == (paper.identical, paper.unjudged)
     assert verdict.identical > verdict.records - 60
 
 
 @pytest.mark.parametrize("law", LINES)
 def test_any_record_resumes_the_whole_run(law: str) -> None:
-    log = opened(record_law(law))
+    log = open_bytes(record_law(law))
     samples = {name: {state.tick: state for state in log[name].states} for name in log.sites}
     ends = dict.fromkeys(log.sites, TICKS - 1)
     for name in log.sites:
-        part, setup = log[name], log.scenario.setup(name)
+        part = log[name]
+        setup = log.scenario.setup(name)
         for first in range(2, TICKS, 9):
             inputs: RecordedInputs[Any] = RecordedInputs(part, samples, ends, {}, setup.links)
             site = Site(setup)
@@ -83,6 +84,6 @@ def test_any_record_resumes_the_whole_run(law: str) -> None:
 
 
 def test_a_changed_gain_changes_only_its_effect() -> None:
-    log = opened(record_law("tests.plugged_laws:CompiledLine"))
+    log = open_bytes(record_law("tests.plugged_laws:CompiledLine"))
     changed = rerun(log, ["s"], {"sites.s.control.K": 25.0})
     assert 0 < changed.sites["s"].identical < changed.sites["s"].executed

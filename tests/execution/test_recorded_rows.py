@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.execution.logs import external_log, simulated, without_records
-from tests.log_editing import Record, edited, opened, recorded
+from tests.execution.builders import make_external_arm_bytes, make_log_without
+from tests.log.builders import Record, edit_log_bytes, make_log, make_log_bytes, open_bytes
 from trilat_net.core.step import recorded_ticks
 from trilat_net.core.step.site_step import Site
 from trilat_net.execution import recorded_rows, verification
@@ -19,7 +19,7 @@ from trilat_net.scenario import list_shipped
 
 FIELDS = "q qd q_des qd_des tau tau_x theta_hat used rx rx_crc mode mem cmd boot t_ns tick site"
 SITES = ("m1", "m2", "s")
-PAPER = recorded("paper", {"duration_s": 0.4, "link.delay_ms": 20.0})
+PAPER = make_log_bytes("paper", {"duration_s": 0.4, "link.delay_ms": 20.0})
 
 
 def verify_singly(log: Log, **options: Any) -> verification.VerifyResult:
@@ -30,8 +30,8 @@ def verify_singly(log: Log, **options: Any) -> verification.VerifyResult:
 
 
 def assert_same_result(data: bytes, **options: Any) -> verification.VerifyResult:
-    result = verification.verify(opened(data), **options)
-    assert result == verify_singly(opened(data), **options)
+    result = verification.verify(open_bytes(data), **options)
+    assert result == verify_singly(open_bytes(data), **options)
     return result
 
 
@@ -48,7 +48,7 @@ def without_single_ticks(log: Log) -> verification.VerifyResult:
 
 @pytest.mark.parametrize("name", ["paper", "six_joints", "jitter", "contact", "unlike_arms"])
 def test_untouched_records_need_no_single_tick(name: str) -> None:
-    log = opened(recorded(name, {"duration_s": 0.3}))
+    log = make_log(name, {"duration_s": 0.3})
     result = without_single_ticks(log)
     assert result.passed
     assert result.identical == sum(len(log[site]) for site in log.sites)
@@ -56,16 +56,16 @@ def test_untouched_records_need_no_single_tick(name: str) -> None:
 
 @pytest.mark.parametrize("name", list_shipped())
 def test_both_ways_agree_on_shipped_scenarios(name: str) -> None:
-    data = recorded(name, {"duration_s": 0.3})
+    data = make_log_bytes(name, {"duration_s": 0.3})
     assert assert_same_result(data).passed
     assert_same_result(data, resume_every=50)
 
 
 def test_both_ways_agree_on_arms_outside() -> None:
-    assert assert_same_result(external_log()).identical > 0
+    assert assert_same_result(make_external_arm_bytes()).identical > 0
 
 
-def spoil(record: Record, draws: random.Random) -> None:
+def spoil_record(record: Record, draws: random.Random) -> None:
     """Changes a field of a record."""
     name = draws.choice(FIELDS.split())
     value = record[name]
@@ -109,29 +109,31 @@ def test_both_ways_agree_on_spoiled_records(seed: int) -> None:
         if place in dropped:
             return None
         if place in spoiled or (is_lasting and record["tick"] > 200 and place[0] == "m1"):
-            spoil(record, draws)
+            spoil_record(record, draws)
         return record
 
-    assert_same_result(edited(PAPER, record=change), resume_every=draws.choice((0, 0, 30)))
+    assert_same_result(
+        edit_log_bytes(PAPER, record=change), resume_every=draws.choice((0, 0, 30))
+    )
 
 
 def test_both_ways_agree_behind_gaps() -> None:
-    log = without_records({"m1": range(100, 110), "s": [200, 202]}, PAPER)
-    again = without_records({"m1": range(100, 110), "s": [200, 202]}, PAPER)
+    log = make_log_without({"m1": range(100, 110), "s": [200, 202]}, PAPER)
+    again = make_log_without({"m1": range(100, 110), "s": [200, 202]}, PAPER)
     result = verification.verify(log)
     assert result == verify_singly(again)
     assert result.unjudged > 0
 
 
 def test_short_and_long_blocks_end_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = verification.verify(opened(PAPER))
+    expected = verification.verify(open_bytes(PAPER))
     monkeypatch.setattr(recorded_rows, "BLOCK_ROWS", 37)
-    assert verification.verify(opened(PAPER)) == expected
+    assert verification.verify(open_bytes(PAPER)) == expected
 
 
 def test_calendars_that_are_too_short_are_replaced() -> None:
     changes = [{"at_s": 0.1, "link": "m2->m1", "to": {"delay_ms": 900.0}}]
-    log = simulated(
+    log = make_log(
         "paper", {"duration_s": 1.5, "link.delay_ms": 5.0, "timeline": changes, "expect": {}}
     )
     result = verification.verify(log)
@@ -140,10 +142,10 @@ def test_calendars_that_are_too_short_are_replaced() -> None:
 
 
 @given(st.lists(st.integers(0, 2**64 - 1), max_size=9))
-def test_the_checksum_is_that_of_zlib(words: list[int]) -> None:
-    signed = np.array(words, np.uint64).view(np.int64).tolist()
+def test_the_checksum_is_that_of_zlib(numbers: list[int]) -> None:
+    signed = np.array(numbers, np.uint64).view(np.int64).tolist()
     crc = 0xFFFFFFFF
     for word in signed:
         crc = recorded_ticks._update_checksum(crc, word)
-    data = b"".join(word.to_bytes(8, "little") for word in words)
+    data = b"".join(word.to_bytes(8, "little") for word in numbers)
     assert crc ^ 0xFFFFFFFF == zlib.crc32(data)

@@ -8,24 +8,23 @@ import pytest
 from hypothesis import given, settings
 
 import trilat_net
+from tests.execution.builders import all_identical, list_tick_results
 from tests.execution.deliveries import (
     SITES,
     TICKS,
     Sample,
-    delivered,
+    make_delivered_bytes,
     never,
     site_sets,
     under_way,
 )
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickInput
 from trilat_net.execution.verification import TOLERANCE, equal_record
 from trilat_net.execution.what_if import rerun
 from trilat_net.scenario import list_shipped, load_scenario
-
-from .logs import all_identical, motion, simulated
 
 GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("v*.mcap"))
 SHORT = {"duration_s": 0.12, "link.delay_ms": 20.0}
@@ -36,7 +35,7 @@ SHORT = {"duration_s": 0.12, "link.delay_ms": 20.0}
     "scheme", ["second_order", pytest.param("digital", marks=pytest.mark.long)]
 )
 def test_an_unchanged_rerun_equals_the_log_bitwise(name: str, scheme: str) -> None:
-    log = opened(recorded(name, {"duration_s": 0.3, "scheme": scheme}))
+    log = make_log(name, {"duration_s": 0.3, "scheme": scheme})
     for site in log.sites:
         assert all_identical(rerun(log, [site]))
     assert all_identical(rerun(log, closed_loop=True))
@@ -44,7 +43,7 @@ def test_an_unchanged_rerun_equals_the_log_bitwise(name: str, scheme: str) -> No
 
 def test_reruns_of_different_rates_equal_the_log() -> None:
     rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
-    log = opened(recorded("paper", {**rates, **SHORT}))
+    log = make_log("paper", {**rates, **SHORT})
     for replace in (["m2"], ["m2", "s"], list(SITES)):
         assert all_identical(rerun(log, replace))
 
@@ -65,7 +64,8 @@ def test_reruns_of_every_log_version_are_equal(path: Path, replace: list[str]) -
     )
     for site in replace:
         for field in ("q", "qd", "tau", "theta_hat"):
-            ours, theirs = getattr(again.after[site], field), getattr(again.before[site], field)
+            ours = getattr(again.after[site], field)
+            theirs = getattr(again.before[site], field)
             assert abs(ours - theirs).max() <= 1e3 * TOLERANCE * (1 + abs(theirs).max())
 
 
@@ -74,13 +74,15 @@ def test_reruns_of_every_log_version_are_equal(path: Path, replace: list[str]) -
 def test_recorded_delivery_is_repeated_exactly(
     delays: dict[Sample, int], lost: frozenset[Sample], replace: list[str]
 ) -> None:
-    assert all_identical(rerun(opened(delivered(delays, lost)), replace))
+    assert all_identical(rerun(open_bytes(make_delivered_bytes(delays, lost)), replace))
 
 
 def test_a_changed_site_sees_recorded_samples() -> None:
-    """By hand: the site of the changed scenario receives the samples that its records list."""
-    log = opened(
-        delivered({("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)})
+    """A site of the changed scenario, stepped by hand, receives the samples that its records list."""
+    log = open_bytes(
+        make_delivered_bytes(
+            {("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)}
+        )
     )
     changes = {
         "sites.s.control.Kd": 7.0,
@@ -90,11 +92,11 @@ def test_a_changed_site_sees_recorded_samples() -> None:
     again = rerun(log, ["s"], changes)
     site = Site(load_scenario(log.scenario, changes).setup("s"))
     samples = [{state.tick: state for state in log[peer].states} for peer in site.peers]
-    for state, made in zip(log["s"].states, again.after["s"].states, strict=True):
+    for state, record in zip(log["s"].states, again.after["s"].states, strict=True):
         arrivals = [
             Arrival(j, m, samples[j][m].q, samples[j][m].qd, us) for j, m, us in state.rx
         ]
-        assert equal_record(made, site.step(TickInput(state.tick, arrivals)), site.peers)
+        assert equal_record(record, site.step(TickInput(state.tick, arrivals)), site.peers)
     assert again.sites["s"].first is not None
     assert not again.identical
     assert not again.broken
@@ -127,24 +129,29 @@ def test_closed_loop_changes_equal_the_changed_experiment(
     changes: dict[str, object],
 ) -> None:
     """If every sample comes long before it is due, the network does not matter (L2)."""
-    again = rerun(opened(recorded("free")), [], changes, closed_loop=True)
-    twin = simulated("free", {**SHORT, **changes})
+    again = rerun(make_log("free"), [], changes, closed_loop=True)
+    twin = make_log("free", {**SHORT, **changes})
     for site in SITES:
-        ours, theirs = motion(again.after, site), motion(twin, site)
+        ours = list_tick_results(again.after, site)
+        theirs = list_tick_results(twin, site)
         assert ours == theirs[: len(ours)]
         # rates that do not divide: up to the last record of the log
         assert len(ours) >= len(theirs) - 2
 
 
 def test_longer_delays_make_late_samples_harmless() -> None:
-    log = opened(delivered({("m2", 1, 40): 25, ("s", 0, 50): 31, ("s", 1, 51): 30}))
+    log = open_bytes(
+        make_delivered_bytes({("m2", 1, 40): 25, ("s", 0, 50): 31, ("s", 1, 51): 30})
+    )
     again = rerun(log, [], {"link.delay_ms": 31.0}, closed_loop=True)
-    twin = simulated("free", {"duration_s": 0.12, "link.delay_ms": 31.0})
-    assert all(motion(again.after, site) == motion(twin, site) for site in SITES)
+    twin = make_log("free", {"duration_s": 0.12, "link.delay_ms": 31.0})
+    assert all(
+        list_tick_results(again.after, site) == list_tick_results(twin, site) for site in SITES
+    )
 
 
 def test_on_measured_links_only_arrivals_count() -> None:
-    log = opened(delivered({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
+    log = open_bytes(make_delivered_bytes({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
     again = rerun(log, ["s"], {"link.model": "measured"})
     assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == (
         (20.0, 9.0),
@@ -154,19 +161,20 @@ def test_on_measured_links_only_arrivals_count() -> None:
 
 def test_only_executed_sites_react() -> None:
     """If m1 moves otherwise, an executed s sees the change 20 ms later, and no other site does."""
-    log = opened(recorded("free"))
+    log = make_log("free")
     stiff = {"sites.m1.control.Kd": 9.0}
-    alone, both = rerun(log, ["m1"], stiff), rerun(log, ["m1", "s"], stiff)
-    assert motion(alone.after, "s") == motion(log, "s")
+    alone = rerun(log, ["m1"], stiff)
+    both = rerun(log, ["m1", "s"], stiff)
+    assert list_tick_results(alone.after, "s") == list_tick_results(log, "s")
     assert alone.after["s"].payloads[50] == log["s"].payloads[50]
-    assert motion(both.after, "s")[:20] == motion(log, "s")[:20]
-    assert motion(both.after, "s")[30:] != motion(log, "s")[30:]
-    assert motion(alone.after, "m1")[:40] == motion(both.after, "m1")[:40]
-    assert motion(alone.after, "m1")[60:] != motion(both.after, "m1")[60:]
+    assert list_tick_results(both.after, "s")[:20] == list_tick_results(log, "s")[:20]
+    assert list_tick_results(both.after, "s")[30:] != list_tick_results(log, "s")[30:]
+    assert list_tick_results(alone.after, "m1")[:40] == list_tick_results(both.after, "m1")[:40]
+    assert list_tick_results(alone.after, "m1")[60:] != list_tick_results(both.after, "m1")[60:]
 
 
 def test_a_diverging_site_stops_and_is_reported() -> None:
-    log = opened(recorded("free"))
+    log = make_log("free")
     again = rerun(log, ["s", "m1"], {"sites.s.limits.qd_limit_rad_s": 0.3})
     effect = again.sites["s"]
     assert effect.diverged_at_s is not None
@@ -179,7 +187,7 @@ def test_a_diverging_site_stops_and_is_reported() -> None:
 
 
 def test_diverged_logs_are_executed_to_their_end() -> None:
-    log = opened(recorded("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3}))
+    log = make_log("free", {"duration_s": 1.0, "limits.qd_limit_rad_s": 0.3})
     for replace in (["m1"], list(SITES)):
         again = rerun(log, replace)
         assert all_identical(again)
@@ -212,14 +220,14 @@ def test_unusual_arrivals_end_nothing(change: object) -> None:
             change(r)
         return r
 
-    log = opened(edited(recorded("paper"), record=record))
+    log = open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))
     for replace in (["s"], list(SITES)):
         for changes in ({}, {"control.Kd": 5.0}):
             assert rerun(log, replace, changes).sites["s"].executed >= 60
 
 
 def test_facts_are_plain_with_units() -> None:
-    facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).to_dict()
+    facts = rerun(make_log("free"), ["s"], {"sites.s.control.Kd": 5.0}).to_dict()
     assert facts["mode"] == "open loop"
     assert facts["changes"] == [
         {"key": "sites.s.control.Kd", "before": (3.0, 3.0), "after": (5.0, 5.0)}
@@ -232,7 +240,7 @@ def test_facts_are_plain_with_units() -> None:
 
 def test_the_package_offers_reruns(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    path.write_bytes(recorded("paper"))
+    path.write_bytes(make_log_bytes("paper"))
     again = trilat_net.rerun(path, replace="s", set={"control.Kd": 5})
     assert again.sites["s"].compared == TICKS
     assert str(again) == repr(again)

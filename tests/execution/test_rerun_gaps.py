@@ -4,34 +4,33 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.execution.builders import all_identical, list_tick_results, make_log_without
 from tests.execution.deliveries import (
     SITES,
     TICKS,
     Sample,
-    delivered,
+    draw_gaps,
     first_in_first_out,
-    gaps,
+    make_delivered_bytes,
     site_sets,
     under_way,
 )
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
 from trilat_net.errors import LogError
 from trilat_net.execution.what_if import rerun
 
-from .logs import all_identical, motion, without_records
-
 
 @settings(max_examples=15)
-@given(lost=gaps(25), replace=site_sets, delays=under_way)
+@given(lost=draw_gaps(25), replace=site_sets, delays=under_way)
 def test_reruns_continue_behind_a_gap(
     lost: dict[str, set[int]], replace: list[str], delays: dict[Sample, int]
 ) -> None:
-    log = without_records(lost, delivered(first_in_first_out(delays)))
+    log = make_log_without(lost, make_delivered_bytes(first_in_first_out(delays)))
     again = rerun(log, replace)
     assert again.identical
     for name, effect in again.sites.items():
         assert effect.identical + effect.stands == len(log[name])
-        assert motion(again.after, name) == motion(log, name)
+        assert list_tick_results(again.after, name) == list_tick_results(log, name)
 
 
 @pytest.mark.long
@@ -47,12 +46,14 @@ def test_changed_sites_pass_through_gaps(
     """Arrivals without record are inferred, correctly as long as no sample was late."""
     gapped = data.draw(st.sampled_from(replace))
     changes = {"control.Kd": 5.0}
-    whole = rerun(opened(recorded("free")), replace, changes)
-    again = rerun(without_records({gapped: sorted(lost)}, recorded("free")), replace, changes)
+    whole = rerun(make_log("free"), replace, changes)
+    again = rerun(
+        make_log_without({gapped: sorted(lost)}, make_log_bytes("free")), replace, changes
+    )
     assert again.sites[gapped].assumed == len(lost)
     assert any("assumed" in note for note in again.notes)
     for name in replace:
-        assert motion(again.after, name) == motion(whole.after, name)
+        assert list_tick_results(again.after, name) == list_tick_results(whole.after, name)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +61,7 @@ def test_changed_sites_pass_through_gaps(
 )
 def test_late_logs_are_executed_where_possible(changes: dict[str, float]) -> None:
     """Every recorder began at tick 40: with samples 20 ms old, from tick 61 on all in use are known."""
-    log = without_records({site: range(40) for site in SITES}, recorded("free"))
+    log = make_log_without({site: range(40) for site in SITES}, make_log_bytes("free"))
     again = rerun(log, ["s"], changes)
     effect = again.sites["s"]
     assert 20 <= effect.stands <= 24
@@ -68,35 +69,38 @@ def test_late_logs_are_executed_where_possible(changes: dict[str, float]) -> Non
     assert any("stand as they are" in note for note in again.notes)
     assert again.identical is not bool(changes)
     first = 40 + effect.stands
-    assert motion(again.after, "s")[: effect.stands] == motion(log, "s")[: effect.stands]
+    assert (
+        list_tick_results(again.after, "s")[: effect.stands]
+        == list_tick_results(log, "s")[: effect.stands]
+    )
     if changes:
         assert effect.first is not None
         assert effect.first.tick == first  # the gain acts from there
 
 
 def test_arrivals_missing_in_the_log_are_reported() -> None:
-    again = rerun(without_records({"m1": range(30, 35)}), ["s"], {"control.Kd": 5.0})
+    again = rerun(make_log_without({"m1": range(30, 35)}), ["s"], {"control.Kd": 5.0})
     assert again.sites["s"].lacking == 5
     assert any("5 samples that arrived are not in the log" in note for note in again.notes)
 
 
 def test_too_few_records_refuse_a_changed_rerun() -> None:
-    log = without_records({"s": range(10, 110)})
+    log = make_log_without({"s": range(10, 110)})
     with pytest.raises(LogError, match="20 of 120 ticks: too few"):
         rerun(log, ["s"], {"control.Kd": 5.0})
     assert rerun(log, ["s"]).identical
 
 
 def test_late_logs_keep_their_rates() -> None:
-    log = without_records({site: range(40) for site in SITES})
+    log = make_log_without({site: range(40) for site in SITES})
     with pytest.raises(LogError, match="begin at tick 40"):
         rerun(log, [], {"rate_hz": 500}, closed_loop=True)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_torn_logs_are_executed_until_their_tear(share: float) -> None:
-    data = edited(recorded("paper"), chunk_bytes=2048)
-    log = opened(data[: int(share * len(data))])
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
+    log = open_bytes(data[: int(share * len(data))])
     again = rerun(log, ["s"])
     assert all_identical(again)
     assert any("not finished" in note for note in again.notes)
@@ -104,7 +108,7 @@ def test_torn_logs_are_executed_until_their_tear(share: float) -> None:
 
 
 def test_a_log_without_records_has_nothing_to_execute() -> None:
-    log = without_records({site: range(TICKS) for site in SITES})
+    log = make_log_without({site: range(TICKS) for site in SITES})
     again = rerun(log, SITES, {"control.Kd": 5.0})
     assert (again.sites["s"].executed, again.sites["s"].error_rms_rad) == (0, None)
     assert "s: nothing could be executed" in again.notes

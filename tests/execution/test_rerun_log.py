@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.log_editing import opened, recorded
+from tests.execution.builders import make_log_without
+from tests.log.builders import make_log, make_log_bytes, write_log
 from trilat_net.errors import UsageError
 from trilat_net.execution.log_checks import LogCheckReport
 from trilat_net.execution.verification import verify
@@ -16,16 +17,13 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.net.messages import VERSION
 
 from .deliveries import SITES, TICKS
-from .logs import without_records
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "v2.mcap"
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    path = tmp_path / "field.mcap"
-    path.write_bytes(recorded("free"))
-    return path
+    return write_log(tmp_path, make_log_bytes("free"), "field.mcap")
 
 
 def test_rerun_logs_name_source_and_differences(file: Path) -> None:
@@ -47,7 +45,7 @@ def test_rerun_logs_name_source_and_differences(file: Path) -> None:
     "changes", [{}, {"control.Kd": 5, "link.delay_ms": 12.0}], ids=["same", "changed"]
 )
 def test_recorded_sites_stay_byte_for_byte(changes: dict[str, float]) -> None:
-    log = opened(recorded("free"))
+    log = make_log("free")
     after = rerun(log, ["s"], changes).after
     # it is in memory
     assert (after.session["rerun_of"], after.session["rerun_of_sha256"]) == (
@@ -66,7 +64,7 @@ def test_recorded_sites_stay_byte_for_byte(changes: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("replace", [["s"], ["m1", "s"], list(SITES)], ids=" ".join)
 def test_only_executed_sites_are_verified(replace: list[str]) -> None:
-    after = rerun(opened(recorded("free")), replace, {"control.Kd": 5}).after
+    after = rerun(make_log("free"), replace, {"control.Kd": 5}).after
     verdict = verify(after)
     assert after.executed_sites == tuple(sorted(replace))
     assert verdict.agreed, str(verdict.first)
@@ -82,14 +80,14 @@ def test_only_executed_sites_are_verified(replace: list[str]) -> None:
 
 def test_a_closed_loop_is_virtual_time_again() -> None:
     twins = compare_with_virtual(
-        rerun(opened(recorded("free")), [], {"arm.m1_kg": 1.5}, closed_loop=True).after
+        rerun(make_log("free"), [], {"arm.m1_kg": 1.5}, closed_loop=True).after
     )
     for twin in (twins.fed, twins.plain):
         assert (twin.identical, twin.first) == (3 * TICKS, None)
 
 
 def test_copied_records_are_not_judged() -> None:
-    log = without_records({"s": [40, 41, 70], "m1": [40, 41, 42]})
+    log = make_log_without({"s": [40, 41, 70], "m1": [40, 41, 42]})
     verdict = verify(rerun(log, ["s"]).after)
     assert verdict.agreed, str(verdict.first)
     assert [gap[1:] for gap in verdict.gaps] == [(40, 41), (70, 70)]

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.log_editing import opened, recorded
+from tests.log.builders import make_log
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.rerun_execution import (
     RerunRequest,
@@ -21,14 +21,12 @@ Overrides = Mapping[str, Any] | Sequence[str]
 def request_rerun(
     replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False
 ) -> RerunRequest:
-    return resolve_rerun_request(
-        opened(recorded("paper")), replace, overrides, closed_loop=closed_loop
-    )
+    return resolve_rerun_request(make_log("paper"), replace, overrides, closed_loop=closed_loop)
 
 
 def test_an_unchanged_request_is_the_logs_experiment() -> None:
     for name in ("paper", "handover", "outage"):
-        log = opened(recorded(name, {"duration_s": 0.3}))
+        log = make_log(name, {"duration_s": 0.3})
         for replace in (log.sites[:1], log.sites):
             request = resolve_rerun_request(log, replace, (), closed_loop=False)
             assert request.scenario == log.scenario
@@ -75,7 +73,7 @@ def test_differences_are_lines_of_the_executed_scenario(
 
 def test_copied_sites_keep_their_settings() -> None:
     request = request_rerun(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
-    original = opened(recorded("paper")).scenario
+    original = make_log("paper").scenario
     for name in ("m1", "m2"):
         assert request.scenario.sites[name] == original.sites[name]
         assert request.scenario.links[f"s->{name}"] == original.links[f"s->{name}"]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.task_arms import planar_task
+from tests.execution.builders import run_fused
+from tests.scenario.builders import planar_task_text
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.run_end import RunEnd
-from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.figures.registry import list_drawable_figures
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -23,8 +23,7 @@ def log() -> Log:
 
 def test_task_records_equal_the_fused_runs(log: Log) -> None:
     """Places, velocities and wrenches of arms of two and of seven joints."""
-    run = FusedRun(load_scenario("unlike_arms", SHORT))
-    run.advance_to(1.0)
+    run = run_fused(load_scenario("unlike_arms", SHORT), 1.0)
     for record, name in zip(run.records, log.sites, strict=True):
         part = log[name]
         row = np.concatenate([getattr(part, field)[-1] for field in part.layout.lengths()])
@@ -43,12 +42,13 @@ def test_task_errors_are_those_of_place(log: Log) -> None:
 def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
     metrics = compute_log_metrics(log)
     for site in log.sites:
-        own, part = metrics.sites[site], log[site]
-        assert own["rms_error_m"].value == pytest.approx(
+        site_metrics = metrics.sites[site]
+        part = log[site]
+        assert site_metrics["rms_error_m"].value == pytest.approx(
             np.sqrt((part.e**2).mean(axis=0)).max()
         )
-        assert not own["rms_error_rad"].applies
-        assert own["unaccounted_j"].value < 1e-6
+        assert not site_metrics["rms_error_rad"].applies
+        assert site_metrics["unaccounted_j"].value < 1e-6
     distance = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
     assert metrics.run["spread_max_m"].value >= metrics.run["spread_end_m"].value >= distance
     assert {"tracking_errors", "settling", "phase"} <= set(list_drawable_figures(log))
@@ -74,7 +74,7 @@ damping_n_s_m = 20
 
 def test_wall_forces_follow_the_shares() -> None:
     """P+d holds e by K along each axis, so that the wrenches of two sites that rest cancel."""
-    text = planar_task(8.0)
+    text = planar_task_text(8.0)
     head, rest = text.split("[control]")
     text = head + '[control]\nlaw = "p_d"\nK = 60.0\nd = 12.0\n[task]' + rest.split("[task]")[1]
     log = trilat_net.simulate(

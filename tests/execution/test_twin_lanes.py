@@ -48,7 +48,7 @@ def check_both_ways(monkeypatch: pytest.MonkeyPatch, run: Runner) -> Twins:
 
 
 def push_in_many_ways(scenario: Scenario, site: str) -> list[Push]:
-    """At the start, in the middle, so often that differences are scaled, and of the estimate."""
+    """Returns pushes at the start, in the middle, of estimates, and some so often that differences are scaled."""
     often = Push.parse(scenario, f"{site}.q1", 1e-9)._replace(largest=2e-9)
     return [
         Push.parse(scenario, f"{site}.q1"),

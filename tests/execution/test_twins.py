@@ -22,7 +22,7 @@ REST = {f"sites.{site}.q0_rad": [0.3, 0.5] for site in ("m1", "m2", "s")}
 """Arms that are at rest from the beginning: what is left is linear."""
 
 
-def at_rest(d: float) -> Scenario:
+def make_rest_scenario(d: float) -> Scenario:
     return load_scenario("p_d_margin", {"control.d": d, **REST})
 
 
@@ -32,7 +32,7 @@ def rate_per_s(scenario: Scenario, twins: Twins) -> float:
 
 @pytest.mark.parametrize(("d", "seconds"), [(0.5, 40.0), (2.0, 40.0), (3.0, 40.0)])
 def test_linear_differences_obey_their_root(d: float, seconds: float) -> None:
-    scenario = at_rest(d)
+    scenario = make_rest_scenario(d)
     twins = Twins.of_scenario(scenario, [Push.parse(scenario, "m1.q1", 1e-7)], seconds)
     roots = tn.linear("p_d_margin", {"control.d": d}, pose=(0.3, 0.5), ports=False).to_dict()
     root_per_s = roots["as_computed"]["roots"][0]["re_per_s"]
@@ -51,7 +51,7 @@ def test_a_zero_push_changes_no_bit() -> None:
 
 @pytest.mark.parametrize("name", ["live-4g", "live-paper"])
 def test_a_live_run_is_repeated_bit_for_bit(name: str) -> None:
-    """With its recorded arrivals: late samples, lost samples, and early samples."""
+    """The run is repeated with its recorded arrivals: late, lost and early samples."""
     log = tn.open_log(GOLDEN / f"{name}.mcap")
     twins = Twins.of_log(log, Push.choose(log.scenario, 1))
     assert twins.same
@@ -67,7 +67,7 @@ def test_pushes_never_reach_other_closed_groups() -> None:
 
 @pytest.mark.long
 def test_rescaling_a_difference_keeps_its_rate() -> None:
-    scenario = at_rest(0.5)
+    scenario = make_rest_scenario(0.5)
     free = Push.parse(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
     often = free._replace(largest=2e-9)
     twins = Twins.of_scenario(scenario, [free, often], 100.0)
@@ -78,7 +78,7 @@ def test_rescaling_a_difference_keeps_its_rate() -> None:
 
 
 def test_dying_differences_end_or_are_repeated() -> None:
-    scenario = at_rest(3.0)
+    scenario = make_rest_scenario(3.0)
     once = Push.parse(scenario, "m1.qd2", 1e-9)
     twins = Twins.of_scenario(scenario, [once, once._replace(again=True)], 60.0)
     ended, anew = twins.paths

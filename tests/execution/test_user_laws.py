@@ -6,9 +6,14 @@ from typing import Any
 
 import pytest
 
+from tests.execution.builders import (
+    OTHER_PLATFORM,
+    list_results,
+    make_external_arm_bytes,
+    make_log_without,
+)
 from tests.execution.deliveries import SITES, TICKS
-from tests.execution.logs import OTHER_PLATFORM, external_log, numbers, without_records
-from tests.log_editing import Record, edited, opened, recorded
+from tests.log.builders import Record, edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.errors import LawFailed, ScenarioError, UsageError, join_arguments
 from trilat_net.execution import virtual
 from trilat_net.execution.log_checks import LogCheckReport
@@ -23,27 +28,27 @@ LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
-def record_own_law(law: str = LAW, **more: Any) -> bytes:
-    return recorded("paper", {**SHORT, "control.law": law, **more})
+def make_own_law_bytes(law: str = LAW, **more: Any) -> bytes:
+    return make_log_bytes("paper", {**SHORT, "control.law": law, **more})
 
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric"])
 def test_own_paper_law_gives_equal_bits(name: str) -> None:
     """Gains of the shipped scenarios are those of `tests.laws`."""
-    ours = opened(recorded(name, SHORT))
-    theirs = opened(recorded(name, {**SHORT, "control.law": LAW}))
+    ours = open_bytes(make_log_bytes(name, SHORT))
+    theirs = open_bytes(make_log_bytes(name, {**SHORT, "control.law": LAW}))
     for site in ours.sites:
         for a, b in zip(ours[site].states, theirs[site].states, strict=True):
             # but for what a law from outside remembers
-            assert numbers(a)[:-1] == numbers(b)[:-1]
+            assert list_results(a)[:-1] == list_results(b)[:-1]
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
     """If no memory has to be restored the law passes; behind a gap, or tick by tick, it does not."""
-    data = record_own_law("tests.laws:Forgetful")
-    assert verify(opened(data)).passed
-    verdict = verify(without_records({"s": range(50, 61)}, data, session))
+    data = make_own_law_bytes("tests.laws:Forgetful")
+    assert verify(open_bytes(data)).passed
+    verdict = verify(make_log_without({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
     assert verdict.first.field.startswith(("theta_hat", "tau"))
 
@@ -65,12 +70,12 @@ def test_restarted_sites_are_the_same(law: str) -> None:
     ]
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream, commands={"s": {50: changes}})
-    verdict = verify(opened(stream.getvalue()), resume_every=7)
+    verdict = verify(open_bytes(stream.getvalue()), resume_every=7)
     assert verdict.identical == verdict.records == 900
 
 
 def test_hidden_memory_shows_at_a_restart() -> None:
-    log = opened(record_own_law("tests.laws:Forgetful"))
+    log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
     verification = verify(log, resume_every=40)
@@ -79,7 +84,7 @@ def test_hidden_memory_shows_at_a_restart() -> None:
 
 
 def test_reports_explain_hidden_memory() -> None:
-    log = opened(record_own_law("tests.laws:Forgetful"))
+    log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
     (law,) = find_user_laws(log.scenario)[:1]
 
     def find_text(**settings: int) -> str:
@@ -98,7 +103,7 @@ def test_reports_explain_hidden_memory() -> None:
     command = join_arguments(verify_command)
     assert find_text().endswith(f"but by: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
-    built_in = LogCheckReport.of_log(opened(recorded("paper")), virtual=False)
+    built_in = LogCheckReport.of_log(open_bytes(make_log_bytes("paper")), virtual=False)
     assert not [finding for finding in built_in.findings if "--resume-every" in finding.text]
 
 
@@ -108,7 +113,7 @@ def test_changed_memory_shows_at_its_tick() -> None:
             r["mem"][4] += 1e-3
         return r
 
-    verdict = verify(opened(edited(record_own_law(), record=record)))
+    verdict = verify(open_bytes(edit_log_bytes(make_own_law_bytes(), record=record)))
     assert verdict.differing == 1
     assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
 
@@ -125,7 +130,7 @@ def file(
     return file
 
 
-def log_of(file: Path) -> io.BytesIO:
+def make_log_stream(file: Path) -> io.BytesIO:
     stream = io.BytesIO()
     virtual.write_virtual_log(
         load_scenario("two_sites", {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}),
@@ -136,7 +141,7 @@ def log_of(file: Path) -> io.BytesIO:
 
 
 def test_changed_files_are_judged_on_request(file: Path) -> None:
-    stream = log_of(file)
+    stream = make_log_stream(file)
     log = open_log(stream)
     (law,) = find_user_laws(log.scenario)
     assert (law.sites, law.allowed, law.changed) == (("m", "s"), True, "")
@@ -153,19 +158,19 @@ def test_changed_files_are_judged_on_request(file: Path) -> None:
         False,
     )
     with pytest.raises(UsageError, match="is not the file that ran"):
-        reopened(stream, law=file)
-    assert verify(reopened(stream, law=file, other_version=True)).passed
+        reopen_log(stream, law=file)
+    assert verify(reopen_log(stream, law=file, other_version=True)).passed
     file.write_text(file.read_text().replace("pass", "def memory(self): return [1.0]"))
-    assert verify(reopened(stream, law=file, other_version=True)).first.field == "mem"
+    assert verify(reopen_log(stream, law=file, other_version=True)).first.field == "mem"
 
 
-def reopened(stream: io.BytesIO, **how: Any) -> Log:
+def reopen_log(stream: io.BytesIO, **how: Any) -> Log:
     stream.seek(0)
     return open_log(stream, **how)
 
 
 def test_a_missing_file_names_the_remedy(file: Path) -> None:
-    log = open_log(log_of(file))
+    log = open_log(make_log_stream(file))
     file.unlink()
     (law,) = find_user_laws(log.scenario)
     assert str(law).endswith("external code, which may not run; if you trust it: --law FILE")
@@ -173,7 +178,7 @@ def test_a_missing_file_names_the_remedy(file: Path) -> None:
 
 
 def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
-    stream = log_of(file)
+    stream = make_log_stream(file)
     wrong = "1 / 0 if now.k == 7 and self._facts.site == 's'"
     failing = f"def torque(self, now): return {wrong} else super().torque(now)"
     file.write_text(file.read_text().replace("pass", failing))
@@ -223,7 +228,7 @@ def test_failing_laws_leave_a_finished_log(how: str, at: int) -> None:
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
 def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
-    log = opened(edited(external_log(), session=session))
+    log = open_bytes(edit_log_bytes(make_external_arm_bytes(), session=session))
     assert log["s"].q[50].tolist() == [0.5, -0.3]
     verdict = verify(log)
     assert verdict.agreed
@@ -235,9 +240,9 @@ def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
 
 def test_external_arms_are_executed_behind_gaps() -> None:
     """As much can be judged as of a simulated arm."""
-    verdict = verify(without_records({"s": range(40, 45)}, external_log()))
+    verdict = verify(make_log_without({"s": range(40, 45)}, make_external_arm_bytes()))
     assert verdict.agreed
-    ours = verify(without_records({"s": range(40, 45)}, recorded("two_sites", SHORT)))
+    ours = verify(make_log_without({"s": range(40, 45)}, make_log_bytes("two_sites", SHORT)))
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
 
 
@@ -247,7 +252,7 @@ def test_another_measurement_gives_another_torque() -> None:
             r["q"][1] += 1e-6
         return r
 
-    verdict = verify(opened(edited(external_log(), record=record)))
+    verdict = verify(open_bytes(edit_log_bytes(make_external_arm_bytes(), record=record)))
     assert (verdict.first.site, verdict.first.tick) == ("s", 70)
     assert verdict.first.field.startswith("tau")
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.execution.deliveries import DUE, PEERS, SCENARIO, Sample, delivered
-from tests.log_editing import edited, opened, recorded
+from tests.execution.deliveries import DUE, PEERS, SCENARIO, Sample, make_delivered_bytes
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
 from trilat_net import simulate
 from trilat_net.core.step.ticks import Arrival, TickRecord
 from trilat_net.execution import virtual
@@ -29,7 +29,9 @@ Rates = tuple[int, int, int]
 rates = st.sampled_from([1, 7, 100, 333, 450, 1000])
 
 
-def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.0) -> Scenario:
+def make_small_scenario(
+    rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.0
+) -> Scenario:
     changes = {
         f"sites.{name}.rate_hz": rate
         for name, rate in zip(("m1", "m2", "s"), rate_hz, strict=True)
@@ -42,7 +44,7 @@ def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
 def test_sites_step_by_time_then_scenario_order(rate_hz: Rates) -> None:
-    scenario = small(rate_hz)
+    scenario = make_small_scenario(rate_hz)
     ran = [
         (o.t_ns, scenario.names.index(site.name), o.tick)
         for site, _, o in virtual.execute_virtual(scenario)
@@ -57,7 +59,7 @@ def test_sites_step_by_time_then_scenario_order(rate_hz: Rates) -> None:
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
 def test_every_sample_arrives_once_right_after_its_stamp(rate_hz: Rates) -> None:
-    scenario = small(rate_hz)
+    scenario = make_small_scenario(rate_hz)
     stamps: dict[tuple[str, int], int] = {}
     ran = list(virtual.execute_virtual(scenario))
     for site, _, output in ran:
@@ -98,7 +100,7 @@ def without_arrivals(ran: Sequence[virtual.SiteTick]) -> list[TickRecord]:
 @settings(max_examples=8)
 @given(slack=st.lists(st.integers(0, 17), min_size=1, max_size=12))
 def test_early_samples_make_the_network_irrelevant(slack: list[int]) -> None:
-    scenario = small((1000, 1000, 1000))
+    scenario = make_small_scenario((1000, 1000, 1000))
     scattered = virtual.execute_virtual(scenario, ScatteredNetwork(scenario, slack))
     assert without_arrivals(list(scattered)) == without_arrivals(
         list(virtual.execute_virtual(scenario))
@@ -106,20 +108,21 @@ def test_early_samples_make_the_network_irrelevant(slack: list[int]) -> None:
 
 
 def test_overdue_samples_change_the_run() -> None:
-    scenario = small((1000, 1000, 1000))
+    scenario = make_small_scenario((1000, 1000, 1000))
     late = list(virtual.execute_virtual(scenario, ScatteredNetwork(scenario, [0, 25])))
     assert without_arrivals(late) != without_arrivals(list(virtual.execute_virtual(scenario)))
     assert any(sum(c.late for c in site.counts()) for site, _, _ in late)
 
 
 def test_records_show_whether_limits_held() -> None:
-    fine, wild = io.BytesIO(), io.BytesIO()
-    assert virtual.write_virtual_log(small((1000,) * 3), fine)
+    fine = io.BytesIO()
+    wild = io.BytesIO()
+    assert virtual.write_virtual_log(make_small_scenario((1000,) * 3), fine)
     assert not virtual.write_virtual_log(
         load_scenario("free", {"limits.qd_limit_rad_s": 0.3}), wild
     )
-    assert [e.kind for e in opened(fine.getvalue()).events] == ["end"] * 3
-    kinds = [(e.member, e.kind) for e in opened(wild.getvalue()).events]
+    assert [e.kind for e in open_bytes(fine.getvalue()).events] == ["end"] * 3
+    kinds = [(e.member, e.kind) for e in open_bytes(wild.getvalue()).events]
     assert "diverged" in {kind for _, kind in kinds}
     assert [kind for _, kind in kinds].count("end") == 3
 
@@ -136,7 +139,8 @@ def test_simulate_applies_overrides() -> None:
 
 @pytest.mark.parametrize("site", ["m1", "s"])
 def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
-    scenario, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
+    scenario = load_scenario("paper")
+    other = load_scenario("paper", {"seed": 2})
     assert virtual.compute_boot(scenario, site) == virtual.compute_boot(
         load_scenario("paper"), site
     )
@@ -144,8 +148,8 @@ def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
     assert virtual.compute_boot(scenario, "m1") != virtual.compute_boot(scenario, "s")
 
 
-def opened_delivered(delays: dict[Sample, int]) -> Log:
-    return opened(delivered(delays))
+def make_delivered_log(delays: dict[Sample, int]) -> Log:
+    return open_bytes(make_delivered_bytes(delays))
 
 
 links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integers(0, 80))
@@ -156,7 +160,7 @@ links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integer
 def test_runs_without_late_samples_equal_virtual_time(
     delays: dict[Sample, int],
 ) -> None:
-    twins = compare_with_virtual(opened_delivered(delays))
+    twins = compare_with_virtual(make_delivered_log(delays))
     assert twins.late == []
     assert twins.fed == (360, 360, None)
     assert twins.plain == (360, 360, None)
@@ -167,7 +171,7 @@ def test_runs_without_late_samples_equal_virtual_time(
 def test_fed_virtual_time_always_equals_its_log(
     delays: dict[Sample, int],
 ) -> None:
-    log = opened_delivered(delays)
+    log = make_delivered_log(delays)
     twins = compare_with_virtual(log)
     assert twins.fed == (360, 360, None)
     expected = {
@@ -181,7 +185,7 @@ def test_fed_virtual_time_always_equals_its_log(
 
 
 def test_plain_virtual_time_differs_from_late_samples() -> None:
-    log = opened_delivered({("m2", 1, 40): 25})
+    log = make_delivered_log({("m2", 1, 40): 25})
     (late,) = find_absent_samples(log)
     assert late == ("m2", "s", 40, 60, 65)
     assert str(late) == "sample 40 of s was due at tick 60 of m2 and came at tick 65"
@@ -193,7 +197,7 @@ def test_plain_virtual_time_differs_from_late_samples() -> None:
 
 def test_an_overtaken_late_sample_is_harmless() -> None:
     """The sample is missed for one tick; from then on the newest is in use, but the state has moved."""
-    twins = compare_with_virtual(opened_delivered({("m1", 0, 30): 39}))
+    twins = compare_with_virtual(make_delivered_log({("m1", 0, 30): 39}))
     assert [sample.tick for sample in twins.late] == [30]
     assert twins.plain.first is not None
     assert twins.plain.first[:2] == ("m1", 50)
@@ -202,7 +206,7 @@ def test_an_overtaken_late_sample_is_harmless() -> None:
 
 @pytest.mark.parametrize("name", ["paper", "asymmetric", "two_sites", "six_joints"])
 def test_virtual_logs_equal_virtual_time(name: str) -> None:
-    log = opened(recorded(name, {"duration_s": 0.5}))
+    log = make_log(name, {"duration_s": 0.5})
     twins = compare_with_virtual(log)
     assert twins.late == []
     for twin in (twins.fed, twins.plain):
@@ -216,7 +220,9 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
             r["theta_hat"][3] += 1e-15
         return r
 
-    twins = compare_with_virtual(opened(edited(recorded("paper"), record=record)))
+    twins = compare_with_virtual(
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))
+    )
     for twin in (twins.fed, twins.plain):
         assert twin.first is not None
         assert twin.first[:3] == ("m2", 70, "theta_hat[3]")
@@ -226,20 +232,22 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
 @pytest.mark.parametrize("entry", [[70_000, 3, 0], [-1, 3, 0], [0, 2**58, 0], [0, -5, 0]])
 @pytest.mark.parametrize("gap", [range(0), range(5, 80)])
 def test_foreign_samples_are_never_late(entry: list[int], gap: range) -> None:
-    """Also if so many records are missing that no arrivals are assumed."""
+    """This holds also if so many records are missing that no arrivals are assumed."""
 
     def record(r: dict) -> dict | None:
         if (r["site"], r["tick"]) == ("s", 90):
             r["rx"].append(entry)
         return None if r["site"] == "s" and r["tick"] in gap else r
 
-    twins = compare_with_virtual(opened(edited(recorded("paper"), record=record)))
+    twins = compare_with_virtual(
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))
+    )
     assert twins.absent == []
     assert twins.plain.first is None
 
 
 def test_twins_without_hands_are_free() -> None:
-    log = opened(recorded("paper", {"duration_s": 1.2}))
+    log = make_log("paper", {"duration_s": 1.2})
     twin = simulate_without_operators(log)
     assert (twin["m1"].tau_x == 0.0).all()
     assert (log["m1"].tau_x[1100:] < 0.0).all()

@@ -29,7 +29,7 @@ delays = st.dictionaries(
 lost_ticks = st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50)
 
 
-def steady(ticks: int = 1) -> Way:
+def make_steady_way(ticks: int = 1) -> Way:
     """Returns arrivals with the same number of ticks for every sample."""
     return {(peer, tick): ticks for peer in (0, 1) for tick in range(TICKS)}
 
@@ -45,15 +45,16 @@ def in_order(under_way: Way) -> Way:
     return held
 
 
-def record(k: int) -> TickRecord:
+def make_record(k: int) -> TickRecord:
     """Returns the record of a tick at which nothing moves."""
-    two, five = [0.0] * 2, [0.0] * 5
+    two = [0.0] * 2
+    five = [0.0] * 5
     return TickRecord(
         k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], []
     )
 
 
-def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
+def make_site_log(way: Way, lost: set[int] = frozenset()) -> SiteLog:
     """Returns the records of a site at 1 kHz, but for the lost ones."""
     at: dict[int, list[Arrival]] = {}
     for (peer, tick), ticks in way.items():
@@ -64,7 +65,7 @@ def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
             "s",
             1,
             PEERS,
-            record(k),
+            make_record(k),
             at.get(k, []),
             0,
             0,
@@ -75,13 +76,13 @@ def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
     return SiteLog("s", PEERS, 1000, payloads, "a test")
 
 
-def entries(deliveries: Deliveries) -> set[Sample]:
+def list_arrivals(deliveries: Deliveries) -> set[Sample]:
     """Returns every sample that arrives, at any tick."""
     return {(entry[0], entry[1]) for at in deliveries.entries.values() for entry in at}
 
 
 def test_whole_logs_give_their_recorded_arrivals() -> None:
-    part = short(steady(3))
+    part = make_site_log(make_steady_way(3))
     deliveries = complete_deliveries(part, *SENDERS)
     assert deliveries == read_deliveries(part)
     assert deliveries.entries == {state.tick: state.rx for state in part.states}
@@ -94,10 +95,8 @@ def test_whole_logs_give_their_recorded_arrivals() -> None:
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
 def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> None:
-    whole, deliveries = (
-        short(steady(ticks)),
-        complete_deliveries(short(steady(ticks), lost), *SENDERS),
-    )
+    whole = make_site_log(make_steady_way(ticks))
+    deliveries = complete_deliveries(make_site_log(make_steady_way(ticks), lost), *SENDERS)
     assert deliveries.unrecorded == lost
     pairs = {k: sorted(entry[:2] for entry in at) for k, at in deliveries.entries.items() if at}
     assert pairs == {
@@ -107,25 +106,28 @@ def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> 
 
 @given(under_way=delays, lost=lost_ticks)
 def test_every_arrived_sample_is_listed_once(under_way: Way, lost: set[int]) -> None:
-    """In order, for samples older than the newest that a record lists; later samples are unknown."""
-    whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
+    """Samples older than the newest one in a record are listed in order; later samples are unknown."""
+    whole = make_site_log(in_order(under_way))
+    gapped = make_site_log(in_order(under_way), lost)
     deliveries = complete_deliveries(gapped, *SENDERS)
     for state in gapped.states:
         assert deliveries.entries[state.tick] == state.rx
-    assert sum(map(len, deliveries.entries.values())) == len(entries(deliveries))
-    listed = entries(read_deliveries(gapped))
+    assert sum(map(len, deliveries.entries.values())) == len(list_arrivals(deliveries))
+    listed = list_arrivals(read_deliveries(gapped))
     newest = [max((tick for j, tick in listed if j == peer), default=-1) for peer in (0, 1)]
-    assert {s for s in entries(deliveries) if s[1] <= newest[s[0]]} == {
-        s for s in entries(read_deliveries(whole)) if s[1] <= newest[s[0]]
+    assert {s for s in list_arrivals(deliveries) if s[1] <= newest[s[0]]} == {
+        s for s in list_arrivals(read_deliveries(whole)) if s[1] <= newest[s[0]]
     }
     assert all(k > tick for k, at in deliveries.entries.items() for _, tick, _ in at)
 
 
 def test_a_lost_sample_does_not_come() -> None:
     """Sample 50 was lost, far from any gap."""
-    deliveries = complete_deliveries(short({**steady(), (0, 50): None}, {20, 21, 80}), *SENDERS)
-    assert (0, 50) not in entries(deliveries)
-    assert {(1, 50), (0, 20), (0, 79)} <= entries(deliveries)
+    deliveries = complete_deliveries(
+        make_site_log({**make_steady_way(), (0, 50): None}, {20, 21, 80}), *SENDERS
+    )
+    assert (0, 50) not in list_arrivals(deliveries)
+    assert {(1, 50), (0, 20), (0, 79)} <= list_arrivals(deliveries)
 
 
 rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
@@ -133,7 +135,7 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
 def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
-    deliveries = read_deliveries(short(steady(ticks)))
+    deliveries = read_deliveries(make_site_log(make_steady_way(ticks)))
     later_deliveries = retime_deliveries(
         deliveries, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000]
     )
@@ -152,10 +154,10 @@ def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz
 
 
 def test_other_rates_keep_lost_samples_lost() -> None:
-    deliveries = read_deliveries(short({**steady(), (0, 50): None}))
+    deliveries = read_deliveries(make_site_log({**make_steady_way(), (0, 50): None}))
     doubled = retime_deliveries(deliveries, 1000, 1000, [1000, 1000], [2000, 1000])
-    assert not {(0, 100), (0, 101)} & entries(doubled)
-    assert {(0, 99), (0, 102), (1, 50)} <= entries(doubled)
+    assert not {(0, 100), (0, 101)} & list_arrivals(doubled)
+    assert {(0, 99), (0, 102), (1, 50)} <= list_arrivals(doubled)
 
 
 def test_only_the_newest_assumed_samples_arrive() -> None:
@@ -163,5 +165,5 @@ def test_only_the_newest_assumed_samples_arrive() -> None:
     ticks = range(MAX_ARRIVALS + 5)
     network = RecordedNetwork({"s": {9: [(0, tick, 0) for tick in ticks]}}, {"s": ["m1"]})
     for tick in ticks:
-        network.send("m1", record(tick))
+        network.send("m1", make_record(tick))
     assert [arrival.tick for arrival in network.deliver("s", 9)] == [*ticks[5:]]

@@ -17,8 +17,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.faults.fault_session import make_fault_scenario
+
 from .fault_matrix import LIVE, ROWS, Row
-from .fault_session import make_scenario
 from .invariants import allowed_step
 from .judged_seed import Judged, find_undisturbed_step, time_seed
 
@@ -28,7 +29,8 @@ MATRIX = ROOT / "docs" / "data" / "fault-matrix.csv"
 TESTS = ROOT / "docs" / "data" / "faults.csv"
 COUNTS = ROOT / "docs" / "data" / "fault-counts.csv"
 TORQUES = ROOT / "docs" / "data" / "fault-torques.txt"
-BEGIN, END = "<!-- made by python -m tests.faults --write -->", "<!-- end -->"
+BEGIN = "<!-- made by python -m tests.faults --write -->"
+END = "<!-- end -->"
 
 
 class Seeds(NamedTuple):
@@ -61,13 +63,16 @@ class Seeds(NamedTuple):
 
 
 def judge_seeds(count: int, jobs: int | None) -> Seeds:
-    judged, took_s = [], 0.0
+    judged = []
+    took_s = 0.0
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        for seed, (one, seed_s) in enumerate(pool.map(time_seed, range(count), chunksize=4)):
-            judged.append(one)
+        for seed, (judged_seed, seed_s) in enumerate(
+            pool.map(time_seed, range(count), chunksize=4)
+        ):
+            judged.append(judged_seed)
             took_s += seed_s
-            if one.violations:
-                print(f"seed {seed}:\n{one}\n", flush=True)
+            if judged_seed.violations:
+                print(f"seed {seed}:\n{judged_seed}\n", flush=True)
     return Seeds(judged, took_s)
 
 
@@ -160,7 +165,9 @@ def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]
 def describe_seeds(seeds: Seeds) -> list[str]:
     holds = [ticks for judged_seed in seeds.judged for ticks in judged_seed.holds]
     each_s = seeds.took_s / len(seeds.judged)
-    count, broken, most = len(seeds.judged), len(seeds.failed), max(holds, default=0)
+    count = len(seeds.judged)
+    broken = len(seeds.failed)
+    most = max(holds, default=0)
     return [
         f"{count} seeds, {broken} with a violation. Each takes {each_s:.1f} s of a processor: two sessions of "
         f"5 s, of which the second must give the same bytes. Held {len(holds)} times: at most {most} ticks "
@@ -177,16 +184,17 @@ def count_visits(seeds: Seeds) -> list[tuple[str, int]]:
 
 
 def describe_torques(seeds: Seeds) -> str:
-    """How far torques stepped, and the storage of those that held changed."""
+    """Returns lines about the largest steps of torques, and about the change of the storage at rest."""
     steps: dict[str, float] = {}
-    for one in seeds.judged:
-        for mode, step_nm in one.steps_nm.items():
+    for judged_seed in seeds.judged:
+        for mode, step_nm in judged_seed.steps_nm.items():
             steps[mode] = max(steps.get(mode, 0.0), step_nm)
     stepped = ", ".join(f"{mode} {step_nm:.3g}" for mode, step_nm in sorted(steps.items()))
     undisturbed_nm = find_undisturbed_step()
-    allowed_nm = allowed_step(make_scenario(), undisturbed_nm)
+    allowed_nm = allowed_step(make_fault_scenario(), undisturbed_nm)
     at_rest_j, before_j = (
-        max(one.rises_j[mode_index] for one in seeds.judged) for mode_index in (0, 1)
+        max(judged_seed.rises_j[mode_index] for judged_seed in seeds.judged)
+        for mode_index in (0, 1)
     )
     return (
         f"Largest step of a torque in a tick, N m: {stepped} (`start`: the first 0.1 s of every start). "

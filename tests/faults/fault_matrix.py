@@ -5,7 +5,10 @@
 
 from typing import NamedTuple
 
-LIVE, SITES, LOG, NET = "tests/live/", "tests/sites/", "tests/log/", "tests/net/"
+LIVE = "tests/live/"
+SITES = "tests/sites/"
+LOG = "tests/log/"
+NET = "tests/net/"
 
 
 class Row(NamedTuple):

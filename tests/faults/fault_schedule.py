@@ -12,8 +12,10 @@ from trilat_net.net.requests import ChangeRequest
 
 SITES = ("m1", "m2", "s")
 LATCHES = ("stop", "enable", "reset")
-STORM_S, STORM_ORDERS = 0.6, 150
-"""A storm is no longer, and has so many orders then."""
+STORM_S = 0.6
+"""The length of the longest storm of orders."""
+STORM_ORDERS = 150
+"""The number of orders in the longest storm."""
 MEMBERS = (*SITES, "recorder")
 MOST_FAULTS = 4
 
@@ -183,7 +185,7 @@ def storm_of(fault: Fault) -> list[tuple[float, str, ChangeRequest]]:
     return sorted(orders, key=lambda order: order[0])
 
 
-def describe(faults: Sequence[Fault]) -> str:
+def describe_faults(faults: Sequence[Fault]) -> str:
     return "\n".join(
         f"  {fault.at_s:.3f} s: {fault.kind} {' -> '.join(fault.of)} for {fault.for_s:g} s, {fault.size:g}"
         for fault in faults

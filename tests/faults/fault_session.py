@@ -15,7 +15,7 @@ from unittest import mock
 
 import msgpack
 
-from tests.log.disks import SmallDisk, file_on
+from tests.log.disks import SmallDisk, open_file_on
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.errors import WireError
@@ -41,9 +41,13 @@ from .fault_schedule import (
 from .faulty_network import FaultyNetwork
 
 NEVER_NS = 2_000 * 10**9
-"""Of a start whose time is known once the session begins."""
-LINK_S, RECONNECT_S, LOOKS_AGAIN_S = 0.03, 0.1, 0.25
-"""Delay of the links; a connection that has ended is made again no sooner; an operator comes twice."""
+"""The time of a start that is set only once the session begins."""
+LINK_S = 0.03
+"""Delay of the links."""
+RECONNECT_S = 0.1
+"""The least time from the end of a connection to the next one."""
+LOOKS_AGAIN_S = 0.25
+"""The time after which an operator repeats an order."""
 DEFAULT_ARMS = ArmSettings()
 KEYS: dict[str, Any] = {
     "rate_hz": 1000,
@@ -61,7 +65,9 @@ KEYS: dict[str, Any] = {
 
 
 @cache
-def make_scenario(timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS) -> Scenario:
+def make_fault_scenario(
+    timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS
+) -> Scenario:
     """Returns the paper's arms and law without hands, under the rule that waits, aligns, holds
     and returns.
     """
@@ -91,7 +97,7 @@ class Published:
 
 
 INSISTS_NS = 300_000_000
-"""After a first signal the second one, which ends a site that waits for a recorder that is gone."""
+"""The time from the first signal to the second one, which ends a site that waits for a lost recorder."""
 
 
 @dataclass
@@ -152,7 +158,8 @@ class FaultSession(Session):
 
     def _returns(self, fault: Fault) -> None:
         (name,) = fault.of
-        clock, interrupt = self.clocks[name], self.interrupts[name]
+        clock = self.clocks[name]
+        interrupt = self.interrupts[name]
         self.site(name, needs_recorder=False, at_ns=NEVER_NS)
         self.plans.append((fault, clock, interrupt, self.clocks[name]))
 
@@ -165,7 +172,7 @@ class FaultSession(Session):
                 self._begin()
 
     def _begin(self) -> None:
-        """Sets the time of every fault, once tick 0 is known."""
+        """Schedules every fault after tick 0 is known."""
         for fault, clock, interrupt, _ in self.plans:
             at_ns = self._at(fault.at_s)
             if fault.kind == "kill":
@@ -255,7 +262,8 @@ class FaultSession(Session):
         invalid samples.
         """
         (name,) = fault.of
-        loads, junk = [], (b"", b"\xff" * 2000)
+        loads = []
+        junk = (b"", b"\xff" * 2000)
         for load in [load for load in self._recent[name] if load not in junk][-50:]:
             sample = msgpack.unpackb(load)
             loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "q": [9.0, 9.0]}))
@@ -282,9 +290,9 @@ class FaultSession(Session):
         self._ask(site, ChangeRequest(order="stop"))
 
     def _storm(self, fault: Fault) -> None:
-        for after_s, site, asked in storm_of(fault):
+        for after_s, site, order in storm_of(fault):
             at_ns = self._at(fault.at_s + after_s)
-            self.relay.happens(at_ns, lambda site=site, asked=asked: self._ask(site, asked))
+            self.relay.happens(at_ns, lambda site=site, order=order: self._ask(site, order))
 
     def _let_go(self) -> None:
         for site in SITES:
@@ -337,7 +345,7 @@ class FaultSession(Session):
 
 
 def _file_on(disk: SmallDisk, path: Path, **_: Any) -> LogFile:
-    return file_on(disk, path)
+    return open_file_on(disk, path)
 
 
 def run_faults(
@@ -348,7 +356,7 @@ def run_faults(
     arms: ArmSettings = DEFAULT_ARMS,
 ) -> FaultSession:
     """Returns a session with these faults, run to its end."""
-    scenario = make_scenario(timetable, arms)
+    scenario = make_fault_scenario(timetable, arms)
     session = FaultSession(
         scenario, folder / "run.mcap", faults=faults, seed=seed, timetable=timetable
     )

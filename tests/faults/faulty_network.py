@@ -59,10 +59,11 @@ class FaultyNetwork(LocalNetwork):
 
     def __init__(self, relay: Relay, seed: int) -> None:
         super().__init__()
-        self._relay, self._chance = relay, Random(seed)
+        self._relay = relay
+        self._chance = Random(seed)
         self._ways: dict[tuple[str, str], Way] = {}
         self.changes = 0
-        """How often somebody has joined, left or subscribed."""
+        """Counts how often a member has joined, left or subscribed."""
 
     def join_as(self, name: str) -> "FaultyBus":
         member = FaultyBus(self, name)
@@ -132,11 +133,11 @@ class FaultyNetwork(LocalNetwork):
 
         self._relay.happens(since_ns + LEASE_NS, end)
 
-    def disconnect(self, one: str, other: str) -> None:
+    def disconnect(self, first: str, other: str) -> None:
         """Ends the connection of two members at once; mending their ways makes a new
         connection.
         """
-        for sender, receiver in ((one, other), (other, one)):
+        for sender, receiver in ((first, other), (other, first)):
             self.cut(sender, receiver)
             self._end(self.way(sender, receiver), receiver)
 
@@ -148,9 +149,12 @@ class FaultyNetwork(LocalNetwork):
 
     def mend(self, sender: str, receiver: str) -> None:
         way = self.way(sender, receiver)
-        kept, now, known = list(way.kept), self._tokens_of(sender), way.tokens
+        kept = list(way.kept)
+        now = self._tokens_of(sender)
+        known = way.tokens
         way.kept.clear()
-        way.cut_ns, way.ended = None, False
+        way.cut_ns = None
+        way.ended = False
         for deliver in kept:
             deliver()
         self._tell_presence(known - now, receiver, False)
@@ -177,7 +181,8 @@ class FaultyBus(LocalBus):
 
     def __init__(self, network: FaultyNetwork, name: str) -> None:
         super().__init__(network)
-        self.name, self._faulty = name, network
+        self.name = name
+        self._faulty = network
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         self._faulty.changes += 1

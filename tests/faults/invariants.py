@@ -44,15 +44,15 @@ LEGAL = {
 }
 """How a site may change its mode; every start begins with `waiting`."""
 STEP_SHARE = 1.1
-"""Most that the torque may step between ticks, of what it does in the run without faults."""
+"""The largest permitted step of a torque between ticks, relative to the run without faults."""
 START_TICKS = 100
 FAST_ENOUGH_RAD_S = 5.0
-"""A limit of speed that nobody's own motion passes."""
+"""A limit of speed that no arm exceeds by itself."""
 QUICK_ENOUGH_NM_S = 300.0
 """Below this limit of a torque's rate the law itself may swing up as it follows."""
 
 
-def stretches(states: Sequence[State]) -> Iterator[list[State]]:
+def split_stretches(states: Sequence[State]) -> Iterator[list[State]]:
     for _, of_boot in groupby(states, key=lambda state: state.boot):
         yield list(of_boot)
 
@@ -60,7 +60,7 @@ def stretches(states: Sequence[State]) -> Iterator[list[State]]:
 def check_edges(session: FaultSession) -> Iterator[str]:
     """I1: modes change only along the edges of `session_life`."""
     for name, states in session.published.states.items():
-        for stretch in stretches(states):
+        for stretch in split_stretches(states):
             # it may be ordered before its first tick
             if stretch[0].mode not in (
                 "waiting",
@@ -94,11 +94,13 @@ def count_silence(stretch: Sequence[State]) -> Iterator[tuple[State, int]]:
     """Yields the records of a start, each with the age in ticks of its most silent peer's last
     sample.
     """
-    used, since = dict(stretch[0].used), dict.fromkeys(stretch[0].used, stretch[0].tick)
+    used = dict(stretch[0].used)
+    since = dict.fromkeys(stretch[0].used, stretch[0].tick)
     for state in stretch:
         for peer, tick in state.used.items():
             if tick != used[peer]:
-                used[peer], since[peer] = tick, state.tick
+                used[peer] = tick
+                since[peer] = state.tick
         yield state, state.tick - min(since.values())
 
 
@@ -107,7 +109,7 @@ def check_silence(session: FaultSession) -> Iterator[str]:
     ticks.
     """
     for name, states in session.published.states.items():
-        for stretch in stretches(states):
+        for stretch in split_stretches(states):
             for state, silent in count_silence(stretch):
                 if state.mode in ("run", "return") and (
                     silent > SILENT_TICKS or min(state.used.values()) < 0
@@ -118,7 +120,7 @@ def check_silence(session: FaultSession) -> Iterator[str]:
 def find_holds(session: FaultSession) -> Iterator[int]:
     """Returns, for every hold, the ticks since the last sample of a peer came into use."""
     for states in session.published.states.values():
-        for stretch in stretches(states):
+        for stretch in split_stretches(states):
             before = ""
             for state, silent in count_silence(stretch):
                 if state.mode == "hold" != before:
@@ -129,7 +131,7 @@ def find_holds(session: FaultSession) -> Iterator[int]:
 def check_order(session: FaultSession) -> Iterator[str]:
     """I4: the samples in use of a peer never go back, nor beyond the present."""
     for name, states in session.published.states.items():
-        for stretch in stretches(states):
+        for stretch in split_stretches(states):
             for before, after in pairwise(stretch):
                 if any(after.used[peer] < used for peer, used in before.used.items()):
                     yield f"{name} goes back to an older sample at tick {after.tick}"
@@ -145,7 +147,7 @@ def largest_steps(published: Published, from_tick: int) -> dict[str, float]:
     """
     most: dict[str, float] = {}
     for states in published.states.values():
-        for stretch in stretches(states):
+        for stretch in split_stretches(states):
             tau = np.array([state.tau for state in stretch])
             steps = np.abs(np.diff(tau, axis=0)).max(axis=1, initial=0.0)
             modes = np.array(
@@ -169,12 +171,13 @@ def check_torque(session: FaultSession, undisturbed_nm: float) -> Iterator[str]:
     for name, states in session.published.states.items():
         still = session.scenario.setup(name).rest
         assert still is not None
-        for stretch in stretches(states):
+        for stretch in split_stretches(states):
             tau, qd = (
                 np.array([getattr(state, key) for state in stretch]) for key in ("tau", "qd")
             )
             resting = np.array([state.mode in RESTING for state in stretch])[1:, None]
-            steps, brake = np.diff(tau, axis=0), -np.asarray(still.damping) * qd[1:] * resting
+            steps = np.diff(tau, axis=0)
+            brake = -np.asarray(still.damping) * qd[1:] * resting
             beyond = (
                 np.maximum(steps - np.maximum(brake, 0.0), np.minimum(brake, 0.0) - steps)
                 > allowed_nm
@@ -264,14 +267,14 @@ def check_log(session: FaultSession) -> Iterator[str]:
             yield f"{name}: {lost} records are not in the log, which counts {log.missing(name)}"
 
 
-def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
+def find_heard(published: Published, name: str, recorded: Set[int]) -> set[int]:
     """Returns the ticks of a site's records that another member knows.
 
     Of a killed start these are the ticks up to the newest one that reached a site which is
     present when the next start begins. Records that no member received before the kill do not
     count, and neither do the last 20 ms if they are all that is not `there`.
     """
-    starts = list(stretches(published.states[name]))
+    starts = list(split_stretches(published.states[name]))
     heard = {state.tick for state in starts[-1]}
     for start, following in pairwise(starts):
         newest_ticks = [start[0].tick - 1]
@@ -281,7 +284,7 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
                 if other != name
                 else -1
             )
-            for stretch in stretches(states) if other != name else ():
+            for stretch in split_stretches(states) if other != name else ():
                 if stretch[-1].tick >= following[0].tick:
                     newest_ticks += [
                         tick
@@ -290,19 +293,19 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
                         if peer == first_unheard
                     ]
         newest = max(tick for tick in newest_ticks if tick <= start[-1].tick)
-        last = max((tick for tick in there if tick <= newest), default=-1)
+        last = max((tick for tick in recorded if tick <= newest), default=-1)
         newest = last if newest - last <= SILENT_TICKS else newest
         heard |= {state.tick for state in start if state.tick <= newest}
     return heard
 
 
 TELEMETRY = {"late_us": 0, "busy_us": 0, "sent_ns": 0, "echo": []}
-"""What no execution can give again, and nobody computes with."""
+"""Fields of a record that no execution reproduces, and that enter no computation."""
 
 
-def find_altered(published: Sequence[State], there: Sequence[State]) -> list[int]:
+def find_altered(published: Sequence[State], recorded: Sequence[State]) -> list[int]:
     records = {state.tick: state for state in published}
-    others = [state for state in there if records.get(state.tick) != state]
+    others = [state for state in recorded if records.get(state.tick) != state]
     same = msgspec.structs.replace
     return [
         state.tick

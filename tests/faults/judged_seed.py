@@ -12,20 +12,15 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from .fault_schedule import (
-    WHOLE,
-    ArmSettings,
-    Fault,
-    Timetable,
-    describe,
-    draw_faults,
-    draw_settings,
-)
+from tests.faults.fault_schedule import describe_faults
+
+from .fault_schedule import WHOLE, ArmSettings, Fault, Timetable, draw_faults, draw_settings
 from .fault_session import DEFAULT_ARMS, FaultSession, run_faults
 from .invariants import INVARIANTS, START_TICKS, check_torque, find_holds, largest_steps
 from .rest_invariants import find_rises
 
-TORQUE, AGAIN = "I6 torque", "I11 again"
+TORQUE = "I6 torque"
+AGAIN = "I11 again"
 
 
 class Judged(NamedTuple):
@@ -53,14 +48,12 @@ class Judged(NamedTuple):
         lines = [
             f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]
         ]
-        return "\n".join([f"  {self.arms}", describe(self.faults), *lines])
+        return "\n".join([f"  {self.arms}", describe_faults(self.faults), *lines])
 
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
-    faults, arms = (
-        draw_faults(seed, timetable),
-        draw_settings(seed) if timetable == WHOLE else DEFAULT_ARMS,
-    )
+    faults = draw_faults(seed, timetable)
+    arms = draw_settings(seed) if timetable == WHOLE else DEFAULT_ARMS
     return judge_faults(faults, seed, again=again, timetable=timetable, arms=arms)
 
 

@@ -133,7 +133,8 @@ def begins_at_zero() -> AbstractContextManager[Any]:
 
 def loses_records() -> AbstractContextManager[Any]:
     """The recorder loses a message in a thousand."""
-    add, count = LogParts.add, 0
+    add = LogParts.add
+    count = 0
 
     def forgetful(log: LogParts, *message: Any) -> Any:
         nonlocal count

@@ -29,15 +29,18 @@ from .fault_session import FaultSession
 RESTING = ("waiting", "hold", "stopped", "fault")
 JUDGED = RESTING[1:]
 RESIDUAL = 1e-9
-BLEND_S, AT_REST_RAD_S = 0.15, 0.05
+BLEND_S = 0.15
+AT_REST_RAD_S = 0.05
 MOVING_RESIDUAL = 1e-6
-"""Of the work of a reference, which is integrated over ticks by the trapezoidal rule."""
+"""Tolerance of the work of a reference, which is integrated over ticks by the trapezoidal rule."""
 MOST_WAY = 1.1
-"""Of the stopping distance, for joints that move each other."""
-MOST_ENERGY, MOST_SPEED = 1.05, 1.1
-"""Of the kinetic energy and of the largest speed at the order, beyond what is stated."""
+"""Factor on the stopping distance, for joints that move each other."""
+MOST_ENERGY = 1.05
+"""Factor on the kinetic energy at the order."""
+MOST_SPEED = 1.1
+"""Factor on the largest speed at the order."""
 LEAST_ENERGY_J = 1e-4
-"""Of an arm that is at rest already: less than it has at 0.05 rad/s."""
+"""The energy below which an arm is at rest already, which is less than that at 0.05 rad/s."""
 PEERS = 2
 
 
@@ -69,9 +72,7 @@ class Rest(NamedTuple):
 
     @property
     def judged(self) -> int:
-        """Index of the first record in a mode other than `waiting`; the number of records
-        without any.
-        """
+        """Returns the index of the first record in a mode other than `waiting`, or else the number of records."""
         return next(
             (n for n, state in enumerate(self.states) if state.mode in JUDGED), len(self.states)
         )
@@ -80,7 +81,8 @@ class Rest(NamedTuple):
 def find_rests(session: FaultSession) -> Iterator[Rest]:
     """Yields the rests of a session."""
     for name, states in session.published.states.items():
-        setup, theta = session.scenario.setup(name), session.scenario.arms[name].theta
+        setup = session.scenario.setup(name)
+        theta = session.scenario.arms[name].theta
         limited = find_limited_ticks(session.scenario, name, states)
         first_row = 0
         for (_, resting), group in groupby(
@@ -183,7 +185,8 @@ def find_limited_law(rest: Rest) -> np.ndarray:
     The torque of a record is limit(law) + w - B s. The sum can be within the limit although the
     law's part, computed from an estimate that is too large, is not.
     """
-    gains, still = rest.setup.gains, rest.setup.rest
+    gains = rest.setup.gains
+    still = rest.setup.rest
     assert still is not None
     q, qd, q_des, qd_des, tau = (
         rest.rows(key)[1:] for key in ("q", "qd", "q_des", "qd_des", "tau")
@@ -214,13 +217,16 @@ def compute_storage(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndar
     advances, is less by 1/2 h w's. Also returns the power of the reference, (Kd qd + B r +
     w)'qd_des, W.
     """
-    gains, theta, still = rest.setup.gains, scenario.arms[rest.name].theta, rest.setup.rest
+    gains = rest.setup.gains
+    theta = scenario.arms[rest.name].theta
+    still = rest.setup.rest
     assert still is not None
     q, qd, q_des, qd_des, theta_hat = (
         rest.rows(key)[1:] for key in ("q", "qd", "q_des", "qd_des", "theta_hat")
     )
     w = read_next_w(rest)[:-1]
-    e, off = q - q_des, theta_hat - theta
+    e = q - q_des
+    off = theta_hat - theta
     r = qd + np.asarray(gains.Lambda) * e
     kinetic = (r * _multiply_inertia(theta, q, r)).sum(axis=1)
     stored = (np.asarray(gains.Lambda) * np.asarray(gains.Kd) * e**2).sum(axis=1)
@@ -243,18 +249,17 @@ def check_energy(session: FaultSession) -> Iterator[str]:
         )
         allowed_j = MOST_ENERGY * rest.kinetic_j[0] + booked_j + LEAST_ENERGY_J
         for row in np.flatnonzero(rest.kinetic_j[first:] > allowed_j[first:])[:1]:
-            at, has_j, most_j = (
-                rest.states[first + row],
-                rest.kinetic_j[first + row],
-                allowed_j[first + row],
-            )
+            at = rest.states[first + row]
+            has_j = rest.kinetic_j[first + row]
+            most_j = allowed_j[first + row]
             yield f"{rest.name} has {has_j:.3g} J at tick {at.tick} in {at.mode}; at most {most_j:.3g}"
 
 
 def _find_gravity(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndarray]:
     """Returns G, and G by the estimate, rows of records, N m."""
     arm = PlanarArmRows(scenario.arms[rest.name].theta, rest.setup.g_m_s2, (1.0, 1.0))
-    q, known = rest.rows("q"), rest.rows("theta_hat")
+    q = rest.rows("q")
+    known = rest.rows("theta_hat")
     still = np.zeros_like(q)
     theta = np.broadcast_to(scenario.arms[rest.name].theta, known.shape)
     return arm.law_torque(theta, q, still, still, still), arm.law_torque(

@@ -37,10 +37,8 @@ def test_invariants_hold_in_a_hundred_whole_sessions() -> None:
 
 
 def test_sites_report_a_cut_off_peer() -> None:
-    cut, end = (
-        Fault("cut", 0.571, 1.2286, ("m2", "m1"), 0.0),
-        Fault("end", 1.453, 0.01, ("m2",), 0.0),
-    )
+    cut = Fault("cut", 0.571, 1.2286, ("m2", "m1"), 0.0)
+    end = Fault("end", 1.453, 0.01, ("m2",), 0.0)
     assert_holds(judge_faults((cut, end)))
 
 

@@ -40,7 +40,8 @@ def test_a_golden_log_is_what_virtual_time_gives_today(path: Path) -> None:
     today = simulate(log.scenario)
     for site in log.sites:
         for field in ("q", "qd", "tau", "theta_hat"):
-            then, now = getattr(log[site], field), getattr(today[site], field)
+            then = getattr(log[site], field)
+            now = getattr(today[site], field)
             assert np.abs(now - then).max() <= 1e3 * TOLERANCE * (1 + np.abs(then).max())
     assert not compare_with_virtual(log).late
 
@@ -60,7 +61,7 @@ def test_every_released_version_has_one() -> None:
 
 @pytest.mark.long
 def test_a_log_with_a_users_own_law_is_executed_again() -> None:
-    made = subprocess.run(
+    process = subprocess.run(
         [
             *COMMAND,
             "verify",
@@ -74,5 +75,5 @@ def test_a_log_with_a_users_own_law_is_executed_again() -> None:
         capture_output=True,
         text=True,
     )
-    assert made.returncode == 0, made.stderr
-    assert json.loads(made.stdout)["identical"] == 1200
+    assert process.returncode == 0, process.stderr
+    assert json.loads(process.stdout)["identical"] == 1200

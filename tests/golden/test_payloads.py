@@ -54,8 +54,8 @@ def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(
 ) -> None:
     path = tmp_path / "sim.mcap"
     then = ["--duration", SHORTER_THEN[scenario]] if scenario in SHORTER_THEN else []
-    asked = [*COMMAND, "sim", scenario, "-o", str(path), *then, *limits_then(scenario)]
-    subprocess.run(asked, check=True, capture_output=True)
+    command = [*COMMAND, "sim", scenario, "-o", str(path), *then, *limits_then(scenario)]
+    subprocess.run(command, check=True, capture_output=True)
     assert channel_digests(path) == BEFORE["sim"][scenario]
 
 
@@ -70,6 +70,6 @@ def test_payloads_of_live_session_executed_again_are_same_bytes(
     log: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "rerun.mcap"
-    asked = [*COMMAND, "rerun", str(HERE / log), "--closed-loop", "-o", str(path)]
-    subprocess.run(asked, check=True, capture_output=True)
+    command = [*COMMAND, "rerun", str(HERE / log), "--closed-loop", "-o", str(path)]
+    subprocess.run(command, check=True, capture_output=True)
     assert channel_digests(path) == BEFORE["live"][log]

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.golden.surface import list_keys
+
 from .digests import COMMAND
-from .surface import all_options, keys
+from .surface import all_options
 
 HERE = Path(__file__).parent
 BEFORE = json.loads((HERE / "surface.json").read_text())
@@ -39,8 +41,8 @@ def _params(cases: list[dict]) -> list:
     ]
 
 
-def _marks(asked: list[str]) -> tuple:
-    return (pytest.mark.long,) if " ".join(asked[:2]) in LONG else ()
+def _marks(arguments: list[str]) -> tuple:
+    return (pytest.mark.long,) if " ".join(arguments[:2]) in LONG else ()
 
 
 def test_every_command_and_option_is_still_there() -> None:
@@ -53,18 +55,20 @@ def test_every_command_and_option_is_still_there() -> None:
 
 @pytest.mark.parametrize("case", _params(BEFORE["json"]))
 def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path) -> None:
-    asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
-    made = subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True, text=True)
-    text = made.stdout if case["file"] is None else (tmp_path / case["file"]).read_text()
-    assert not set(case["keys"]) - set(keys(json.loads(text)))
-    assert made.returncode == case["exit"], made.stderr
+    arguments = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
+    process = subprocess.run(
+        [*COMMAND, *arguments], cwd=tmp_path, capture_output=True, text=True
+    )
+    text = process.stdout if case["file"] is None else (tmp_path / case["file"]).read_text()
+    assert not set(case["keys"]) - set(list_keys(json.loads(text)))
+    assert process.returncode == case["exit"], process.stderr
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", _params(BEFORE["exit"]))
 def test_every_exit_code_stays(case: dict, tmp_path: Path) -> None:
-    asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
+    arguments = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
     assert (
-        subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True).returncode
+        subprocess.run([*COMMAND, *arguments], cwd=tmp_path, capture_output=True).returncode
         == case["exit"]
     )

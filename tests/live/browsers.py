@@ -39,31 +39,29 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-def launch(playwright: Playwright, *, gl: bool = False) -> Browser:
-    """A browser; one that draws WebGL by software leaves a page no time to hold an arm."""
+def launch_browser(playwright: Playwright, *, gl: bool = False) -> Browser:
+    """Starts a browser, with WebGL on request only, because drawing it by software leaves a page no time."""
     drawing = (
         ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", *PAINTED_BY_SOFTWARE)
         if gl
         else ("--disable-3d-apis",)
     )
-    program, env = (
-        Path(__file__).with_name("chromium.sh"),
-        {**os.environ, "CHROMIUM": str(CHROMIUM)},
-    )
+    program = Path(__file__).with_name("chromium.sh")
+    env = {**os.environ, "CHROMIUM": str(CHROMIUM)}
     return playwright.chromium.launch(executable_path=program, env=env, args=[*QUIET, *drawing])
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """A headless Chromium; a folder whose tests use it imports it in its `conftest.py`."""
+    """Provides a headless Chromium; each folder that uses the fixture imports it in its `conftest.py`."""
     with sync_playwright() as playwright:
-        launched = launch(playwright)
+        launched = launch_browser(playwright)
         yield launched
         launched.close()
 
 
 def chromium_pid() -> int:
-    found = []
+    pids = []
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             line = (folder / "cmdline").read_bytes()
@@ -72,8 +70,8 @@ def chromium_pid() -> int:
                 and b"--remote-debugging-pipe" in line
                 and _descends(int(folder.name))
             ):
-                found.append(int(folder.name))
-    return min(found)
+                pids.append(int(folder.name))
+    return min(pids)
 
 
 def _descends(pid: int) -> bool:
@@ -91,7 +89,7 @@ def browser_page(
     url: str, *, gl: bool = False, script: str = "", **options: Any
 ) -> Iterator[Page]:
     with sync_playwright() as playwright:
-        browser = launch(playwright, gl=gl)
+        browser = launch_browser(playwright, gl=gl)
         try:
             page = browser.new_page(**options)
             problems: list[str] = []
@@ -110,12 +108,12 @@ def page_address(process: Process) -> str:
 
 def role_address(process: Process, role: str) -> str:
     process.prints(f"{role}: ")
-    found = re.search(rf"{role}: (\S+)", process.text())
-    assert found is not None
-    return found[1]
+    match = re.search(rf"{role}: (\S+)", process.text())
+    assert match is not None
+    return match[1]
 
 
-def shows(page: Page, expression: str, timeout_s: float = 30.0) -> Any:
+def wait_until_page(page: Page, expression: str, timeout_s: float = 30.0) -> Any:
     return until(lambda: page.evaluate(expression), timeout_s)
 
 
@@ -132,7 +130,7 @@ def tip_px(page: Page, arm: int) -> tuple[float, float]:
 
 def take_hold(page: Page, arm: int, dx: float, dy: float) -> tuple[float, float]:
     """Presses the pointer on an end effector and drags it by so many pixels; returns where it was."""
-    shows(page, f"trilat.parts.arms.cards[{arm}].graspable")
+    wait_until_page(page, f"trilat.parts.arms.cards[{arm}].graspable")
     x, y = tip_px(page, arm)
     page.mouse.move(x, y)
     page.mouse.down()

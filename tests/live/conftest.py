@@ -4,12 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from .namespaces import Machines, NoNamespaces, machines
+from tests.live.namespaces import make_machines
+
+from .namespaces import Machines, NoNamespaces
 from .processes import PLAIN, Stage
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything here is live, and live sites need Linux."""
+    """Marks all tests of the folder as live, and skips them where live sites cannot run."""
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.live)
@@ -28,15 +30,15 @@ def processes_find_the_laws_of_tests_and_no_sessions_but_their_own(
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    made = Stage(tmp_path)
-    yield made
-    made.clear()
+    new_stage = Stage(tmp_path)
+    yield new_stage
+    new_stage.clear()
 
 
 @pytest.fixture
 def apart() -> Iterator[Machines]:
     try:
-        with machines() as made:
-            yield made
+        with make_machines() as all_machines:
+            yield all_machines
     except NoNamespaces as reason:
         pytest.skip(str(reason))

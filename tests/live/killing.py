@@ -1,9 +1,10 @@
-"""A recorder that is killed in the middle of a session, and what became of its file."""
+"""A recorder that is killed in the middle of a session, and the recovery of its file."""
 
 import signal
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.net.waiting import sleep_for_ns
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.mcap_reader import McapReader
@@ -34,7 +35,7 @@ class Killed:
     lost_ms: float
 
 
-def killed(stage: Stage, after_s: float, *more: str) -> Killed:
+def kill_recorder(stage: Stage, after_s: float, *more: str) -> Killed:
     """Runs the paper's experiment, kills its recorder some time after its first records, ends the sites.
 
     Args:
@@ -48,7 +49,7 @@ def killed(stage: Stage, after_s: float, *more: str) -> Killed:
         session.site(name, "--needs-recorder")
     session.recording()
     clock = SystemClock()
-    clock.sleep_until(clock.monotonic_ns() + round(after_s * 1e9))
+    sleep_for_ns(clock, round(after_s * 1e9))
     killed_ns = clock.monotonic_ns()
     recorder = session.processes["recorder"]
     recorder.signal(signal.SIGKILL)
@@ -63,19 +64,19 @@ def killed(stage: Stage, after_s: float, *more: str) -> Killed:
     return Killed(
         recovery,
         log,
-        _messages(torn),
-        _messages(recovery.output),
-        max((killed_ns - newest_ns) / 1e6 for newest_ns in _newest(log)),
+        _read_messages(torn),
+        _read_messages(recovery.output),
+        max((killed_ns - newest_ns) / 1e6 for newest_ns in _find_newest(log)),
     )
 
 
-def _messages(path: Path) -> list[tuple[str, bytes]]:
+def _read_messages(path: Path) -> list[tuple[str, bytes]]:
     with path.open("rb") as stream:
         return [(item.topic, item.payload) for item in McapReader(stream, str(path)).messages()]
 
 
-def _newest(log: Log) -> list[int]:
-    """Per site when its newest record was sent, on the machine's monotonic clock."""
+def _find_newest(log: Log) -> list[int]:
+    """Returns the time at which each site sent its newest record, on the machine's monotonic clock."""
     (epoch_ns,) = {
         at for event in log.events if event.kind == "start" for at in event.epochs.values()
     }

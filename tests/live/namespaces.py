@@ -1,7 +1,8 @@
-"""Machines that are none: network namespaces with addresses of their own, joined by virtual cables.
+"""Simulated machines: network namespaces with separate addresses, joined by virtual cables.
 
-Law: nothing stays. Every namespace of a test has a name of its own and is removed at the end, whatever
-happens; the machine's own network is not touched.
+Invariant:
+- Nothing stays: every namespace of a test has a unique name and is removed at the end, also after errors.
+- The network of the real machine is not touched.
 """
 
 import os
@@ -13,23 +14,25 @@ from contextlib import contextmanager, suppress
 from itertools import combinations, count
 from typing import Self
 
-from .processes import FOLLOWS, GLIDE, PAPER, Session, Stage, connections
+from tests.live.processes import connection_options
+
+from .processes import FOLLOWS, GLIDE, PAPER, Session, Stage
 
 _numbers = count()
 ALL = (*PAPER, "recorder")
 PORT = "tcp/0.0.0.0:7447"
 CLOCKS = {"m1": (0.0, 0.0), "m2": (3.0, 100.0), "s": (-2.0, -100.0), "recorder": (1.0, 50.0)}
-"""How far each clock is ahead, s, and by how much it runs faster, ppm."""
+"""The offset of each clock in s, and its drift in ppm."""
 
 
 class NoNamespaces(Exception):  # noqa: N818 - it names a reason
-    """Why there can be none here."""
+    """The reason why network namespaces are not available."""
 
 
-def ip(*words: str) -> None:
-    done = subprocess.run(["ip", *words], capture_output=True, text=True, timeout=30)
+def run_ip(*arguments: str) -> None:
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=30)
     if done.returncode:
-        raise NoNamespaces(f"ip {' '.join(words)}: {done.stderr.strip()}")
+        raise NoNamespaces(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 
 
 class Machines:
@@ -49,32 +52,34 @@ class Machines:
 
     def add(self, name: str) -> None:
         space = f"trilat-{os.getpid()}-{next(_numbers)}"
-        ip("netns", "add", space)
+        run_ip("netns", "add", space)
         self._spaces[name] = space
         self.ip(name, "link", "set", "lo", "up")
 
-    def ip(self, name: str, *words: str) -> None:
-        ip("-n", self._spaces[name], *words)
+    def ip(self, name: str, *arguments: str) -> None:
+        run_ip("-n", self._spaces[name], *arguments)
 
-    def cable(self, one: str, other: str) -> tuple[str, str]:
+    def cable(self, first: str, other: str) -> tuple[str, str]:
         number = next(_numbers)
         ends = f"t{number}a", f"t{number}b"
-        there = ("netns", self._spaces[other])
-        self.ip(one, "link", "add", ends[0], "type", "veth", "peer", "name", ends[1], *there)
+        other_space = ("netns", self._spaces[other])
+        self.ip(
+            first, "link", "add", ends[0], "type", "veth", "peer", "name", ends[1], *other_space
+        )
         return ends
 
     def on(self, name: str) -> tuple[str, ...]:
-        """The words before a command that is to run on a machine."""
+        """Returns the words that precede a command in order to run the command on a machine."""
         return ("ip", "netns", "exec", self._spaces[name])
 
-    def part(self, one: str, other: str) -> None:
-        """Cuts the way between two machines, both directions; the others see nothing of it."""
-        for here, there in ((one, other), (other, one)):
-            self.ip(here, "route", "add", "blackhole", self.address[there])
+    def part(self, first: str, other: str) -> None:
+        """Cuts the way between two machines in both directions, unnoticed by the others."""
+        for sender, receiver in ((first, other), (other, first)):
+            self.ip(sender, "route", "add", "blackhole", self.address[receiver])
 
-    def mend(self, one: str, other: str) -> None:
-        for here, there in ((one, other), (other, one)):
-            self.ip(here, "route", "del", "blackhole", self.address[there])
+    def mend(self, first: str, other: str) -> None:
+        for sender, receiver in ((first, other), (other, first)):
+            self.ip(sender, "route", "del", "blackhole", self.address[receiver])
 
     def deafen(self, name: str, other: str, *, ends: bool = False) -> None:
         """Cuts the way from another machine to this one, and not the way back; or `ends` that.
@@ -101,25 +106,25 @@ class Machines:
         """
         self._use(name, "tc", "qdisc", "replace", "dev", self.end[name], "root", *queue)
 
-    def _use(self, name: str, *words: str) -> None:
+    def _use(self, name: str, *command: str) -> None:
         try:
             done = subprocess.run(
-                [*self.on(name), *words], capture_output=True, text=True, timeout=30
+                [*self.on(name), *command], capture_output=True, text=True, timeout=30
             )
         except FileNotFoundError as error:
             raise NoNamespaces(str(error)) from None
         if done.returncode:
-            raise NoNamespaces(f"{' '.join(words)}: {done.stderr.strip()}")
+            raise NoNamespaces(f"{' '.join(command)}: {done.stderr.strip()}")
 
     def remove(self) -> None:
         """Removes all; cables go with their machines."""
         for space in self._spaces.values():
             with suppress(NoNamespaces):
-                ip("netns", "del", space)
+                run_ip("netns", "del", space)
 
 
 @contextmanager
-def machines() -> Iterator[Machines]:
+def make_machines() -> Iterator[Machines]:
     """Machines that are gone at the end.
 
     Raises:
@@ -129,68 +134,70 @@ def machines() -> Iterator[Machines]:
         raise NoNamespaces("there is no `ip` (iproute2)")
     if os.geteuid() != 0:
         raise NoNamespaces("network namespaces need root")
-    made = Machines()
+    all_machines = Machines()
     try:
         for name in ("probe", "other probe"):  # as in a container, where root may not
-            made.add(name)
-        made.cable("probe", "other probe")
-        made.ip("probe", "link", "add", "bridge", "type", "bridge")
-        yield made
+            all_machines.add(name)
+        all_machines.cable("probe", "other probe")
+        all_machines.ip("probe", "link", "add", "bridge", "type", "bridge")
+        yield all_machines
     finally:
-        made.remove()
+        all_machines.remove()
 
 
-def bridged(made: Machines, names: Sequence[str]) -> None:
-    """Machines at one switch, which is a machine too; everybody reaches everybody."""
-    made.add("switch")
-    made.ip("switch", "link", "add", "bridge", "type", "bridge")
-    made.ip("switch", "link", "set", "bridge", "up")
+def connect_by_bridge(all_machines: Machines, names: Sequence[str]) -> None:
+    """Connects machines by one switch, which is a machine too, so that each reaches all others."""
+    all_machines.add("switch")
+    all_machines.ip("switch", "link", "add", "bridge", "type", "bridge")
+    all_machines.ip("switch", "link", "set", "bridge", "up")
     for number, name in enumerate(names, 1):
-        made.add(name)
-        port, end = made.cable("switch", name)
-        made.ip("switch", "link", "set", port, "master", "bridge", "up")
-        _number(made, name, end, f"10.77.0.{number}")
+        all_machines.add(name)
+        port, end = all_machines.cable("switch", name)
+        all_machines.ip("switch", "link", "set", port, "master", "bridge", "up")
+        _assign_address(all_machines, name, end, f"10.77.0.{number}")
 
 
-def starred(made: Machines, centre: str, names: Sequence[str]) -> None:
-    """Machines that reach the one in the centre and nobody else: each is in a network of its own."""
-    made.add(centre)
+def connect_as_star(all_machines: Machines, centre: str, names: Sequence[str]) -> None:
+    """Connects each machine to the central one only, by a separate network."""
+    all_machines.add(centre)
     for number, name in enumerate(names, 1):
-        made.add(name)
-        port, end = made.cable(centre, name)
-        made.centre[name] = f"10.77.{number}.254"
-        _number(made, centre, port, made.centre[name])
-        _number(made, name, end, f"10.77.{number}.1")
+        all_machines.add(name)
+        port, end = all_machines.cable(centre, name)
+        all_machines.centre[name] = f"10.77.{number}.254"
+        _assign_address(all_machines, centre, port, all_machines.centre[name])
+        _assign_address(all_machines, name, end, f"10.77.{number}.1")
 
 
-def _number(made: Machines, name: str, end: str, address: str) -> None:
-    made.ip(name, "address", "add", f"{address}/24", "dev", end)
-    made.ip(name, "link", "set", end, "up")
-    made.address[name], made.end[name] = address, end
+def _assign_address(all_machines: Machines, name: str, end: str, address: str) -> None:
+    all_machines.ip(name, "address", "add", f"{address}/24", "dev", end)
+    all_machines.ip(name, "link", "set", end, "up")
+    all_machines.address[name] = address
+    all_machines.end[name] = end
 
 
-def reaches(made: Machines, name: str, address: str) -> bool:
-    """Whether a machine has a way to an address: a refused connection is an answer."""
+def can_reach(all_machines: Machines, name: str, address: str) -> bool:
+    """Returns True if a machine can reach an address; a refused connection counts as reached."""
     program = f"import socket; socket.create_connection(({address!r}, 1), 1)"
-    knock = [*made.on(name), sys.executable, "-c", program]
+    knock = [*all_machines.on(name), sys.executable, "-c", program]
     done = subprocess.run(knock, capture_output=True, text=True, timeout=10)
     assert "unreachable" in done.stderr or "refused" in done.stderr, done.stderr
     return "refused" in done.stderr
 
 
-def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+def list_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     return [pair for two in combinations(names, 2) for pair in (two, two[::-1])]
 
 
 class Apart(Session):
-    """Three sites and a recorder, each on its machine with its clock."""
+    """Returns a session of three sites and a recorder, each on its machine with its clock."""
 
     def __init__(self, stage: Stage, apart: Machines, *options: str) -> None:
         super().__init__(stage, "paper", PAPER, *options)
-        self._apart, self.before = apart, {name: apart.on(name) for name in ALL}
+        self._apart = apart
+        self.before = {name: apart.on(name) for name in ALL}
 
     def ways(self, name: str) -> list[str]:
-        """How the README says it: through a router, or by who listens where the others reach it."""
+        """Returns the options of a member, as the README states them: by a router, or by endpoints."""
         offset_s, drift_ppm = CLOCKS[name]
         clock = ["--clock-offset-s", str(offset_s), "--clock-drift-ppm", str(drift_ppm)]
         if name in self._apart.centre:
@@ -200,12 +207,12 @@ class Apart(Session):
         return [
             *clock,
             *listen,
-            *connections([f"tcp/{self._apart.address[other]}:7447" for other in others]),
+            *connection_options([f"tcp/{self._apart.address[other]}:7447" for other in others]),
         ]
 
     @classmethod
     def following(cls, stage: Stage, apart: Machines, duration_s: int) -> Self:
-        """A session under `glide`, in which every site follows its peers."""
+        """Starts a session under `glide`, and returns once every site follows its peers."""
         session = cls(stage, apart, "--duration", str(duration_s), *GLIDE)
         session.all()
         session.begun()

@@ -1,4 +1,4 @@
-"""A page without a browser: its socket, which takes every frame and says so."""
+"""A page without a browser: a socket that receives and acknowledges every frame."""
 
 import json
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ PATIENCE_S = 60.0
 
 
 def socket_address(link: str) -> str:
-    """Where the page of a link opens its socket, as `main.js` finds it."""
+    """Returns the address of the socket that the page of a link opens, as `main.js` computes it."""
     parts = urlsplit(link)
     query = "&".join(filter(None, (parts.query, parts.fragment)))
     return f"ws://{parts.netloc}/socket" + (f"?{query}" if query else "")
 
 
 def with_query(link: str, query: str) -> str:
-    """A page's link with more in its query, which stands before the token: another role, another view."""
+    """Returns a page's link with a longer query before the token, such as a role or a view."""
     parts = urlsplit(link)
     return parts._replace(query="&".join(filter(None, (parts.query, query)))).geturl()
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from tests.cli.running import COMMAND, PLAIN
-from tests.faults.invariants import SILENT_TICKS, count_silence, stretches
-from tests.net.waiting import until
+from tests.faults.invariants import SILENT_TICKS, count_silence, split_stretches
+from tests.net.waiting import sleep_for_ns, until
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_layout import active_path
@@ -27,9 +27,12 @@ PATIENCE_S = 60.0
 TALKING = ("--set", "control.law=tests.channel_law:Talking")
 """Options of a session whose laws send to all and to each."""
 GLIDE = (
-    *("--set", 'on_stale.action="glide"'),
-    *("--set", "on_stale.align_speed_rad_s=1.0"),
-    *("--set", "on_stale.align_limit_rad=3.0"),
+    "--set",
+    'on_stale.action="glide"',
+    "--set",
+    "on_stale.align_speed_rad_s=1.0",
+    "--set",
+    "on_stale.align_limit_rad=3.0",
 )
 OUTSIDE = [
     word
@@ -47,7 +50,8 @@ OUTSIDE = [
     for word in ("--set", f"sites.s.{key}={value}")
 ]
 """Options of a session whose site s has an arm outside of the program."""
-JOINS, FOLLOWS = "joins the running session", " s, run, "
+JOINS = "joins the running session"
+FOLLOWS = " s, run, "
 HOLDER = """
 import sys, time, trilat_net
 with trilat_net.hand("t", sys.argv[1], connect=sys.argv[2:], source="to be killed", timeout_s=60.0) as hand:
@@ -66,7 +70,8 @@ class Process:
     def __init__(
         self, name: str, arguments: Sequence[str], folder: Path, before: Sequence[str] = ()
     ) -> None:
-        self.name, self.folder = name, folder
+        self.name = name
+        self.folder = folder
         self._printed = folder / f"{name}.printed"
         with self._printed.open("wb") as sink:
             self._process = subprocess.Popen(
@@ -100,7 +105,7 @@ class Process:
         return int(self._process.returncode)
 
     def children(self) -> dict[int, str]:
-        """What it has started, and what those have: the starter of a session and its members."""
+        """Returns all processes below this one: the starter of a session and its members."""
         return dict(list_descendants(self.pid))
 
     def end(self) -> None:
@@ -115,7 +120,7 @@ class Process:
 
 
 def list_descendants(pid: int) -> Iterator[tuple[int, str]]:
-    """Processes of this program below one, however far, each with its command."""
+    """Returns the commands of all processes of this program below a process, by process id."""
     with contextlib.suppress(OSError):
         for child in map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()):
             line = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ").decode()
@@ -125,14 +130,14 @@ def list_descendants(pid: int) -> Iterator[tuple[int, str]]:
 
 
 def is_running(pid: int) -> bool:
-    """Unlike `gone`, of one that has ended and that nobody has waited for: it runs no more."""
+    """Returns True if a process runs; unlike for `is_gone`, an ended process need not be waited for."""
     try:
         return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
         return False
 
 
-def gone(pid: int) -> bool:
+def is_gone(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -168,7 +173,9 @@ class Session:
     def __init__(
         self, stage: Stage, scenario: str, sites: Sequence[str], *options: str
     ) -> None:
-        self.stage, self._scenario, self._options = stage, scenario, options
+        self.stage = stage
+        self._scenario = scenario
+        self._options = options
         self.sites = tuple(sites)
         *self.endpoints, self.recorder_endpoint = find_free_endpoints(len(sites) + 1)
         self.log = stage.folder / "run.mcap"
@@ -176,14 +183,14 @@ class Session:
         self.before: dict[str, Sequence[str]] = {}  # words before the command of a member
 
     def ways(self, name: str) -> list[str]:
-        """The options by which a member meets the others: each listens, and connects to those before it."""
+        """Returns the options by which a member listens, and connects to the members before it."""
         place = self.sites.index(name) if name in self.sites else len(self.sites)
-        own = [*self.endpoints, self.recorder_endpoint][place]
-        return ["--listen", own, *connections(self.endpoints[:place])]
+        endpoint = [*self.endpoints, self.recorder_endpoint][place]
+        return ["--listen", endpoint, *connection_options(self.endpoints[:place])]
 
     def site(self, name: str, *more: str, called: str = "") -> Process:
-        words = ("site", name, "--scenario", self._scenario, *self._options)
-        return self._start(name, words, more, called or name)
+        arguments = ("site", name, "--scenario", self._scenario, *self._options)
+        return self._start(name, arguments, more, called or name)
 
     def recorder(
         self, *more: str, called: str = "recorder", log: Path | None = None
@@ -191,11 +198,11 @@ class Session:
         return self._start("recorder", ("record", "-o", str(log or self.log)), more, called)
 
     def _start(
-        self, name: str, words: Sequence[str], more: Sequence[str], called: str
+        self, name: str, arguments: Sequence[str], more: Sequence[str], called: str
     ) -> Process:
-        words = (*words, "--session", "t", *self.ways(name), *more)
+        arguments = (*arguments, "--session", "t", *self.ways(name), *more)
         self.processes[called] = self.stage.start(
-            called, *words, before=self.before.get(name, ())
+            called, *arguments, before=self.before.get(name, ())
         )
         return self.processes[called]
 
@@ -211,9 +218,9 @@ class Session:
 
     def is_reproduced(self) -> Log:
         self.ends_well()
-        log = whole(self.log)
-        executed_again(log)
-        equal_to_virtual_time(log)
+        log = open_whole_log(self.log)
+        assert_executed_again(log)
+        assert_equals_virtual_time(log)
         return log
 
     def begun(self) -> None:
@@ -221,62 +228,62 @@ class Session:
             process.prints(BEGUN)
 
     def recording(self) -> None:
-        recorded(self.log)
+        wait_for_records(self.log)
 
     def codes(self) -> dict[str, int]:
         return {name: process.code() for name, process in self.processes.items()}
 
 
-def recorded(log: Path) -> None:
-    until(lambda: size(log) > 60_000, PATIENCE_S)  # its head is a third of that
+def wait_for_records(log: Path) -> None:
+    until(lambda: measure_log_size(log) > 60_000, PATIENCE_S)  # its head is a third of that
 
 
-def size(log: Path) -> int:
+def measure_log_size(log: Path) -> int:
     for path in (active_path(log), log):
         with contextlib.suppress(FileNotFoundError):
             return path.stat().st_size
     return 0
 
 
-def connections(endpoints: Sequence[str]) -> list[str]:
+def connection_options(endpoints: Sequence[str]) -> list[str]:
     return [word for endpoint in endpoints for word in ("--connect", endpoint)]
 
 
-def whole(*paths: Path, in_full: bool = True) -> Log:
+def open_whole_log(*paths: Path, in_full: bool = True) -> Log:
     log = open_log(*paths)
     assert log.complete
     for name in log.sites:
-        (made,) = (
+        (tick_count,) = (
             event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
         )
         ticks = [state.tick for state in log[name].states]
-        assert ticks[-1] == made - 1
+        assert ticks[-1] == tick_count - 1
         # a site at an arm outside leaves out what it misses
         if name not in log.scenario.external:
-            assert ticks == list(range(made))
-        assert len(ticks) == len(set(ticks)) == made - log[name].skipped
-        assert not in_full or made == log.scenario.ticks(name)
+            assert ticks == list(range(tick_count))
+        assert len(ticks) == len(set(ticks)) == tick_count - log[name].skipped
+        assert not in_full or tick_count == log.scenario.ticks(name)
     assert all("missing 0, duplicate 0" in log.account(name) for name in log.sites)
     return log
 
 
-def with_own_laws(log: Log) -> Log:
-    """A log of which the laws may run: it is of a session of the test."""
+def allow_own_laws(log: Log) -> Log:
+    """Returns a log whose laws may run, because the test recorded the log."""
     allow_own_code(log.scenario)
     return log
 
 
-def executed_again(log: Log) -> None:
-    """Every record is what its inputs give."""
-    verdict = verify(with_own_laws(log))
+def assert_executed_again(log: Log) -> None:
+    """Asserts that every record follows from its inputs."""
+    verdict = verify(allow_own_laws(log))
     assert verdict.whole_run
     assert verdict.first is None
     assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
 
 
-def equal_to_virtual_time(log: Log) -> None:
-    """Fed with its arrivals: always and everywhere. Plain: until a sample was late or lost, if one was."""
-    twins = compare_with_virtual(with_own_laws(log))
+def assert_equals_virtual_time(log: Log) -> None:
+    """Asserts that a log equals virtual time: with its arrivals always, plainly until a sample was late or lost."""
+    twins = compare_with_virtual(allow_own_laws(log))
     records = sum(len(log[name]) for name in log.sites)
     assert twins.fed.first is None
     assert twins.fed.identical == twins.fed.records == records
@@ -289,14 +296,14 @@ def equal_to_virtual_time(log: Log) -> None:
 
 def pause(time_s: float) -> None:
     clock = SystemClock()
-    clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+    sleep_for_ns(clock, round(time_s * 1e9))
 
 
 def ticks_to_hold(log: Log) -> dict[str, list[int]]:
-    """Of every hold of each site, how many ticks after its last sample in use it began."""
-    found: dict[str, list[int]] = {site: [] for site in log.sites}
-    for site, holds in found.items():
-        for stretch in stretches(log[site].states):
+    """Returns the number of ticks from the last sample in use to each hold, by site."""
+    holds_by_site: dict[str, list[int]] = {site: [] for site in log.sites}
+    for site, holds in holds_by_site.items():
+        for stretch in split_stretches(log[site].states):
             before = ""
             for state, silent in count_silence(stretch):
                 assert state.mode not in ("run", "return") or silent <= SILENT_TICKS, (
@@ -306,29 +313,30 @@ def ticks_to_hold(log: Log) -> dict[str, list[int]]:
                 if state.mode == "hold" != before:
                     holds.append(silent)
                 before = state.mode
-    return found
+    return holds_by_site
 
 
-def engaged_after_s(log: Log) -> list[float]:
-    """Of each start that joined, how long after its first tick it followed its peers, s."""
-    found = []
+def list_engagements_s(log: Log) -> list[float]:
+    """Returns the time in s from the first tick of each later start until the site followed its peers."""
+    delays_s = []
     for site, starts in log.starts.items():
         part = log[site]
         for first, _ in starts:
             engaged = (part.tick >= first) & (part.mode == "run")
             assert engaged.any(), (site, first)
-            found.append(float(part.tick[np.argmax(engaged)] - first) / part.rate_hz)
-    return found
+            delays_s.append(float(part.tick[np.argmax(engaged)] - first) / part.rate_hz)
+    return delays_s
 
 
 class Holder:
     """A process that holds m1 until it is killed."""
 
     def __init__(self, session: Session, folder: Path, before: Sequence[str] = ()) -> None:
-        words = [*before, sys.executable, "-c", HOLDER, "m1", *session.endpoints]
-        self._printed, root = folder / "holder.txt", Path(__file__).parents[2]
+        command = [*before, sys.executable, "-c", HOLDER, "m1", *session.endpoints]
+        self._printed = folder / "holder.txt"
+        root = Path(__file__).parents[2]
         with self._printed.open("wb") as sink:
-            self._process = subprocess.Popen(words, stdout=sink, env=PLAIN, cwd=root)
+            self._process = subprocess.Popen(command, stdout=sink, env=PLAIN, cwd=root)
 
     def holds(self) -> bool:
         return b"holds" in self._printed.read_bytes()
@@ -339,13 +347,14 @@ class Holder:
 
 
 GONE_S = 0.320
-"""From the last sign of life of whoever holds an arm to no force on it."""
+"""The longest time from the last message of a hand to the end of its force."""
 
 
 def assert_let_go(log: Log, who: str = "to be killed") -> None:
-    """Soon after its last message there is no force on m1, and the log says why."""
+    """Asserts that the force on m1 ends soon after the last message of a hand, and that the log has the reason."""
     part = log["m1"]
-    number, grip = part.hand[:, 1], part.hand[:, 0]
+    number = part.hand[:, 1]
+    grip = part.hand[:, 0]
     newest = int(np.flatnonzero(np.diff(number) > 0)[-1]) + 1
     last = int(np.flatnonzero(grip > 0.0)[-1])
     assert np.abs(part.tau_x[newest : last + 1]).max() > 1.0

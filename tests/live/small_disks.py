@@ -1,6 +1,7 @@
-"""A disk of some MiB that is none: in memory, seen by those alone who are told to.
+"""A disk of some MiB in memory, visible only to chosen processes.
 
-Law: nothing stays. It is mounted in a namespace of its own, which is gone with its last process.
+Invariant:
+- Nothing stays: the disk is mounted in its own namespace, which ends with the last process in it.
 """
 
 import shutil
@@ -11,7 +12,7 @@ from pathlib import Path
 
 
 class NoSmallDisk(Exception):  # noqa: N818 - it names a reason
-    """Why there can be none here."""
+    """The reason why small disks are not available."""
 
 
 class SmallDisk:

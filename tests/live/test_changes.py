@@ -4,9 +4,10 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
+from tests.live.processes import assert_executed_again, connection_options, open_whole_log
 from trilat_net.errors import RunFailed
 
-from .processes import PAPER, Session, Stage, connections, executed_again, whole
+from .processes import PAPER, Session, Stage
 
 
 @pytest.mark.long
@@ -17,7 +18,7 @@ def test_python_and_commands_change_sessions_alike(stage: Stage) -> None:
     running.all()
     running.begun()
     running.recording()
-    to = ("set", "--session", "t", *connections(running.endpoints))
+    to = ("set", "--session", "t", *connection_options(running.endpoints))
     cwd = stage.folder
     link = trilat(*to, "link", "m1->s", "--delay", "350ms", "--loss", "5%", cwd=cwd)
     assert "takes effect at tick" in link.succeeds()
@@ -39,8 +40,8 @@ def test_python_and_commands_change_sessions_alike(stage: Stage) -> None:
     assert {row["member"] for row in session.ping(count=5).to_rows()} >= set(PAPER)
     session.end()
     running.ends_well()
-    log = whole(running.log, in_full=False)
-    executed_again(log)
+    log = open_whole_log(running.log, in_full=False)
+    assert_executed_again(log)
     taken = {tick: text for tick, texts in log.changes("s").items() for text in texts}
     assert [len(log.changes(name)) for name in PAPER] == [0, 0, len(taken)]
     in_order = [taken[tick] for tick in sorted(taken)]

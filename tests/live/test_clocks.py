@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from tests.cli.running import trilat
-from tests.truth import judge_link, members, offset_errors
+from tests.live.processes import connection_options
+from tests.truth import judge_link, list_members, offset_errors
 
-from .processes import PAPER, Session, Stage, connections
+from .processes import PAPER, Session, Stage
 
 SKEWS = {
     "m2": ("--clock-offset-s", "3", "--clock-drift-ppm", "100"),
@@ -31,7 +32,12 @@ def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
         session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
     session.begun()
     seen = trilat(
-        "ping", "--session", "t", "--json", *connections(session.endpoints), cwd=stage.folder
+        "ping",
+        "--session",
+        "t",
+        "--json",
+        *connection_options(session.endpoints),
+        cwd=stage.folder,
     )
     log = session.is_reproduced()
     for site in PAPER:
@@ -44,7 +50,7 @@ def test_delays_lie_in_bounds_and_clocks_are_found(stage: Stage) -> None:
             if np.median(samples.bound_us) <= IDLE_US:
                 assert np.abs(errors[errors[:, 0] >= 10.0, 1]).max() <= 100.0
                 assert np.abs(errors[errors[:, 0] >= 10.0, 2]).max() <= 20.0
-    clocks = members(log)
+    clocks = list_members(log)
     for own, other, about_s in (("m1", "m2", 3.0), ("recorder", "m1", -86_400.0)):
         found = re.search(
             rf"clock of {other}: another one, offset (\S+) s \+- (\d+) us",

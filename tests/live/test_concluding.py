@@ -55,8 +55,8 @@ def test_a_diverged_run_fails_despite_sound_log(
 def test_a_port_in_use_leaves_no_folder(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        words = ("--conclude", "--listen", place, "--connect", *find_free_endpoints(1))
-        done = trilat("record", "--session", "x", *words, cwd=tmp_path)
+        arguments = ("--conclude", "--listen", place, "--connect", *find_free_endpoints(1))
+        done = trilat("record", "--session", "x", *arguments, cwd=tmp_path)
     done.refuses("the port is in use", code=done.code)
     assert done.code != 0
     assert not list((tmp_path / "runs").iterdir())

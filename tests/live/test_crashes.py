@@ -6,25 +6,27 @@ import signal
 import pytest
 from mcap.reader import make_reader
 
+from tests.live.killing import kill_recorder
+from tests.live.processes import assert_executed_again
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.recovery import recover
 
-from .killing import SITES, killed
-from .processes import Session, Stage, executed_again
+from .killing import SITES
+from .processes import Session, Stage
 from .small_disks import NoSmallDisk, SmallDisk, small_disk
 
 
 @pytest.mark.parametrize("durable", [False, True])
 @pytest.mark.long
 def test_a_killed_recorder_keeps_all_flushed_messages(durable: bool, stage: Stage) -> None:
-    done = killed(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
+    done = kill_recorder(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
     assert done.recovery.lossless, done.recovery.lost
     assert done.kept == done.flushed
     assert done.log.complete
     assert all(len(done.log[name]) for name in SITES)
-    executed_again(done.log)
+    assert_executed_again(done.log)
     # no bar, which stands in the benchmarks: a second would mean that flushing was forgotten
     assert done.lost_ms < 1000
 
@@ -46,7 +48,12 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
     path = disk.folder / "run.mcap"
     small = stage.start(
         "on a small disk",
-        *("record", "--session", "t", "-o", str(path), *session.ways("recorder")),
+        "record",
+        "--session",
+        "t",
+        "-o",
+        str(path),
+        *session.ways("recorder"),
         before=disk.before,
     )
     for name in SITES:
@@ -88,11 +95,11 @@ def test_a_restarted_recorder_writes_the_next_part(stage: Stage) -> None:
     second = session.log.with_name("run-002.mcap")
     log = open_log(session.log, second)
     for name in SITES:
-        (made,) = (
+        (tick_count,) = (
             event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
         )
-        assert [state.tick for state in log[name].states] == list(range(made))
+        assert [state.tick for state in log[name].states] == list(range(tick_count))
     with second.open("rb") as stream:
         metadata = {entry.name: entry.metadata for entry in make_reader(stream).iter_metadata()}
     assert metadata["trilat.part"] == {"index": "2", "previous": "run.mcap"}
-    executed_again(log)
+    assert_executed_again(log)

@@ -10,42 +10,43 @@ import pytest
 
 import trilat_net
 from tests.cli.running import trilat
+from tests.live.processes import is_gone, wait_for_records
 from tests.net.waiting import until
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 
-from .processes import Process, Stage, gone, recorded
+from .processes import Process, Stage
 
 
-def demo(stage: Stage, duration: str = "3") -> Process:
+def start_demo(stage: Stage, duration: str = "3") -> Process:
     return stage.start(
         "demo", "demo", "two_sites", "--duration", duration, "--out", str(stage.folder / "out")
     )
 
 
-def child(demo: Process, words: str) -> int:
+def find_child(demo: Process, words: str) -> int:
     return until(
         lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30
     )
 
 
-def recording(stage: Stage) -> Path:
+def wait_for_recording(stage: Stage) -> Path:
     log = stage.folder / "out" / "run.mcap"
-    recorded(log)
+    wait_for_records(log)
     return log
 
 
 @pytest.mark.long
 def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
-    running = demo(stage)
-    log_file = recording(stage)
+    running = start_demo(stage)
+    log_file = wait_for_recording(stage)
     children = running.children()
     assert len(children) == 4  # two sites, a recorder, and what starts them
-    os.kill(child(running, "site s "), signal.SIGKILL)
+    os.kill(find_child(running, "site s "), signal.SIGKILL)
     assert running.code() == 1
     errors = [line for line in running.text().splitlines() if line.startswith("error: ")]
     assert errors == ["error: s was killed by SIGKILL"]
-    assert all(gone(pid) for pid in children)
+    assert all(is_gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete
     verdict = verify(log)
@@ -59,14 +60,14 @@ def test_ctrl_c_ends_everything_and_finishes_file(stage: Stage) -> None:
     running = stage.start(
         "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
     )
-    log_file = recording(stage)
+    log_file = wait_for_recording(stage)
     children = running.children()
     with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
         hand.move(*hand.pose)
     running.prints("; late ")
     running.signal(signal.SIGINT)
     assert running.code() == 130
-    assert all(gone(pid) for pid in children)
+    assert all(is_gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete
     assert {event.member for event in log.events if event.kind == "end"} == {"m1", "m2", "s"}
@@ -85,20 +86,20 @@ def test_ctrl_c_ends_everything_and_finishes_file(stage: Stage) -> None:
     ],
 )
 def test_signals_before_sessions_leave_no_log(number: int, when: str, stage: Stage) -> None:
-    running = demo(stage)
+    running = start_demo(stage)
     running.prints("s live: ")
     if when:
-        child(running, when)  # that child has been started just now
+        find_child(running, when)  # that child has been started just now
     children = running.children()
     running.signal(number)
     assert running.code() == 128 + number
-    assert all(gone(pid) for pid in children)
+    assert all(is_gone(pid) for pid in children)
     assert not (stage.folder / "out" / "run.mcap").exists()
 
 
 @pytest.mark.long
 def test_ctrl_c_while_drawing_keeps_the_log(stage: Stage) -> None:
-    running = demo(stage, duration="0.5")
+    running = start_demo(stage, duration="0.5")
     running.prints("checking the log and drawing")
     children = running.children()
     running.signal(signal.SIGINT)

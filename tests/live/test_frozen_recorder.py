@@ -8,9 +8,10 @@ from collections.abc import Mapping
 
 import pytest
 
+from tests.live.processes import wait_for_records
 from trilat_net.log.log_reader import Log, open_log
 
-from .processes import PAPER, Process, Session, Stage, pause, recorded
+from .processes import PAPER, Process, Session, Stage, pause
 
 LONGEST_FREEZE_S = 5.0
 LEASE_S = 5.0
@@ -18,7 +19,7 @@ LEASE_S = 5.0
 MADE = re.compile(r"^(\w+): (\d+) ticks, \d+ of them late", re.MULTILINE)
 
 
-def assert_accounted(log: Log, made: Mapping[str, int]) -> None:
+def assert_accounted(log: Log, tick_counts: Mapping[str, int]) -> None:
     """Every record is in the file or counted as missing; of an unknown end the log says that."""
     for site in log.sites:
         ticks = log[site].tick.tolist()
@@ -26,13 +27,13 @@ def assert_accounted(log: Log, made: Mapping[str, int]) -> None:
         if site in log.unknown_ends:
             assert "is unknown" in log.headline()
             continue
-        assert len(ticks) + log.missing(site) == made[site], site
+        assert len(ticks) + log.missing(site) == tick_counts[site], site
         received = f"received {len(ticks)}, missing {log.missing(site)},"
         assert received in log.account(site), log.account(site)
 
 
 def ticks_made(*texts: str) -> dict[str, int]:
-    """How many ticks the sites say that they made, in what they print at their end."""
+    """Returns the number of ticks that each site states at its end."""
     return {site: int(ticks) for text in texts for site, ticks in MADE.findall(text)}
 
 
@@ -66,10 +67,10 @@ def interrupt_members(stage: Stage, freeze: Freeze) -> tuple[Log, dict[str, int]
 
 
 def interrupt_demo(stage: Stage, freeze: Freeze) -> tuple[Log, dict[str, int]]:
-    """One command that has started all members."""
+    """Interrupts the command that started all members, and returns the log and the number of ticks by site."""
     folder = stage.folder / "run"
     demo = stage.start("demo", "demo", "paper", "--duration", "60", "-o", str(folder))
-    recorded(folder / "run.mcap")
+    wait_for_records(folder / "run.mcap")
     pause(freeze.run_s)
     recorder = find_recorder(demo)
     os.kill(recorder, signal.SIGSTOP)
@@ -92,10 +93,14 @@ def find_recorder(demo: Process) -> int:
 def test_ctrl_c_with_frozen_recorder_loses_nothing(moment: int, stage: Stage) -> None:
     freeze = Freeze(random.Random(5300 + moment))
     interrupt = interrupt_demo if moment % 2 else interrupt_members
-    log, made = interrupt(stage, freeze)
-    assert set(made) == set(PAPER)
-    assert_accounted(log, made)
-    print(moment, {site: (made[site], log.missing(site)) for site in PAPER}, log.unknown_ends)
+    log, tick_counts = interrupt(stage, freeze)
+    assert set(tick_counts) == set(PAPER)
+    assert_accounted(log, tick_counts)
+    print(
+        moment,
+        {site: (tick_counts[site], log.missing(site)) for site in PAPER},
+        log.unknown_ends,
+    )
 
 
 @pytest.mark.long

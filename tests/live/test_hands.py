@@ -9,10 +9,12 @@ import pytest
 
 import trilat_net
 from tests.cli.running import trilat
+from tests.live.namespaces import connect_by_bridge
+from tests.live.processes import connection_options
 from tests.net.waiting import until
 
-from .namespaces import Machines, bridged
-from .processes import PAPER, Holder, Session, Stage, assert_let_go, connections
+from .namespaces import Machines
+from .processes import PAPER, Holder, Session, Stage, assert_let_go
 
 
 class Circling(threading.Thread):
@@ -20,8 +22,10 @@ class Circling(threading.Thread):
 
     def __init__(self, session: Session, site: str, seconds: float, turn_s: float) -> None:
         super().__init__(name=f"hand at {site}", daemon=True)
-        self._places, self._site = session.endpoints, site
-        self._rounds, self._turn = round(60.0 * seconds), 2.0 * math.pi / (60.0 * turn_s)
+        self._places = session.endpoints
+        self._site = site
+        self._rounds = round(60.0 * seconds)
+        self._turn = 2.0 * math.pi / (60.0 * turn_s)
         self.felt_n = 0.0
         self._wait = threading.Event()
 
@@ -52,7 +56,7 @@ def test_sessions_of_two_programs_verify_and_repeat(stage: Stage) -> None:
     hands = [Circling(session, "m1", 2.5, 2.0), Circling(session, "m2", 2.5, 3.1)]
     for hand in hands:
         hand.start()
-    to = ("set", "--session", "t", *connections(session.endpoints))
+    to = ("set", "--session", "t", *connection_options(session.endpoints))
     for order in (DELAY, SHARES):
         trilat(*to, *order, cwd=session.log.parent).succeeds()
     for hand in hands:
@@ -85,7 +89,7 @@ def test_a_program_cut_off_leaves_no_force(
     stage: Stage, tmp_path: Path, apart: Machines
 ) -> None:
     """The session is on one machine, the program on another; no tick is missing because of the cut."""
-    bridged(apart, ("lab", "holder"))
+    connect_by_bridge(apart, ("lab", "holder"))
     session = Session(stage, "play", PAPER, "--duration", "15", "--insecure")
     session.before = dict.fromkeys((*PAPER, "recorder"), apart.on("lab"))
     session.endpoints = [

@@ -28,6 +28,6 @@ def test_a_person_takes_over_from_a_policy_live(
         "connect": session.endpoints,
         "timeout_s": 60.0,
     }
-    with plugins() as found:
-        seen = drive(found, running, threading.Event().wait, **reach)
+    with plugins() as plugin_classes:
+        seen = drive(plugin_classes, running, threading.Event().wait, **reach)
     assert_taken_over(seen, session.is_reproduced())

@@ -7,43 +7,25 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.truth import Member, again, judge_link, members, offset_errors
+from tests.live.namespaces import can_reach, connect_as_star, connect_by_bridge, list_pairs
+from tests.live.processes import assert_executed_again, list_engagements_s, open_whole_log
+from tests.truth import Member, find_restarted, judge_link, list_members, offset_errors
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 
-from .namespaces import (
-    ALL,
-    CLOCKS,
-    PORT,
-    Apart,
-    Machines,
-    NoNamespaces,
-    bridged,
-    pairs,
-    reaches,
-    starred,
-)
-from .processes import (
-    JOINS,
-    PAPER,
-    Stage,
-    engaged_after_s,
-    executed_again,
-    pause,
-    ticks_to_hold,
-    whole,
-)
+from .namespaces import ALL, CLOCKS, PORT, Apart, Machines, NoNamespaces
+from .processes import JOINS, PAPER, Stage, pause, ticks_to_hold
 
 
 def clocks_as_injected(log: Log) -> None:
     """Every estimate that was logged is the injected one within its bound, and so is every sample's delay."""
-    clocks = members(log)
+    clocks = list_members(log)
     for name, (offset_s, drift_ppm) in CLOCKS.items():
         assert clocks[name].offset_ns == offset_s * 1e9
         assert float(clocks[name].rate - 1) * 1e6 == pytest.approx(drift_ppm)
-    for site, peer in pairs(PAPER):
+    for site, peer in list_pairs(PAPER):
         link = judge_link(log, site, peer)
         assert link.inside >= 0.999
         assert link.tick.size >= 0.5 * len(log[site])
@@ -65,7 +47,7 @@ def clocks_as_injected(log: Log) -> None:
 def test_three_machines_in_any_order_of_starts(
     order: tuple[str, ...], stage: Stage, apart: Machines
 ) -> None:
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart(stage, apart, "--duration", "3")
     session.all(*order)
     log = session.is_reproduced()
@@ -74,15 +56,17 @@ def test_three_machines_in_any_order_of_starts(
 
 @pytest.mark.long
 def test_unreachable_machines_meet_at_a_router(stage: Stage, apart: Machines) -> None:
-    starred(apart, "centre", ALL)
-    assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
-    assert not any(reaches(apart, one, apart.address[other]) for one, other in pairs(ALL))
+    connect_as_star(apart, "centre", ALL)
+    assert all(can_reach(apart, name, apart.centre[name]) for name in ALL)
+    assert not any(
+        can_reach(apart, machine, apart.address[other]) for machine, other in list_pairs(ALL)
+    )
     session = Apart(stage, apart, "--duration", "3")
     for name in ("m1", "recorder"):
         session.all(name)
         session.processes[name].prints("no router answers at tcp/10.77.")
-    words = ("router", "--listen", PORT, "--insecure", "--until-idle", "1")
-    router = stage.start("router", *words, before=apart.on("centre"))
+    command = ("router", "--listen", PORT, "--insecure", "--until-idle", "1")
+    router = stage.start("router", *command, before=apart.on("centre"))
     session.all("s", "m2")
     log = session.is_reproduced()
     assert router.code() == 0
@@ -107,8 +91,9 @@ class Heard:
     outages: list[tuple[int, int]]
 
 
-def heard(log: Log, site: str, peer: str) -> Heard:
-    states, place = log[site].states, log.scenario.peers(site).index(peer)
+def list_heard(log: Log, site: str, peer: str) -> Heard:
+    states = log[site].states
+    place = log.scenario.peers(site).index(peer)
     arrivals = [
         (state.tick, tick) for state in states for index, tick, _ in state.rx if index == place
     ]
@@ -119,11 +104,8 @@ def heard(log: Log, site: str, peer: str) -> Heard:
 
 @pytest.mark.long
 def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None:
-    """Once for less than Zenoh's lease, so that what waited comes in a burst, and once for longer.
-
-    One direction measures, the other delays by 200 ms.
-    """
-    bridged(apart, ALL)
+    """The way is cut for less than Zenoh's lease, so that messages arrive in a burst, and for longer than the lease."""
+    connect_by_bridge(apart, ALL)
     session = Apart(stage, apart, "--duration", "13", "--set", 'links.m2->m1.model="measured"')
     session.all()
     session.begun()
@@ -135,20 +117,22 @@ def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None
         clock.sleep_until(begun_ns + round(ends_s * 1e9))
         apart.mend("m1", "m2")
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     fed = compare_with_virtual(log).fed
     assert fed.first is None
     assert fed.identical == fed.records == 39_000
-    for site, peer in pairs(PAPER):
+    for site, peer in list_pairs(PAPER):
         used = [state.used[peer] for state in log[site].states]
         assert used == sorted(used)
     lost = [(event.member, event.about) for event in log.events if event.kind == "lost"]
     assert sorted(lost) == [("m1", "m2"), ("m2", "m1")]
-    back_to_nominal(log, "m1", "m2", delay=0, nominal=5)
-    back_to_nominal(log, "m2", "m1", delay=200, nominal=202)
+    assert_nominal_age(log, "m1", "m2", delay=0, nominal=5)
+    assert_nominal_age(log, "m2", "m1", delay=200, nominal=202)
     counted = log.link_stats("m2")[-1]
-    late = [tick for tick, sample in heard(log, "m2", "m1").arrivals if tick > sample + 200]
+    late = [
+        tick for tick, sample in list_heard(log, "m2", "m1").arrivals if tick > sample + 200
+    ]
     assert len(late) > 300
     assert counted.late["m1"] == sum(tick <= counted.tick for tick in late)
 
@@ -156,7 +140,7 @@ def test_cut_ways_heal_and_loops_continue(stage: Stage, apart: Machines) -> None
 @pytest.mark.long
 def test_machines_hold_during_cuts_and_return(stage: Stage, apart: Machines) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart.following(stage, apart, 40)
     apart.part("m1", "m2")
     pause(6.0)
@@ -169,17 +153,20 @@ def test_machines_hold_during_cuts_and_return(stage: Stage, apart: Machines) -> 
     session.ends_well()
     log = open_log(session.log)
     assert {str(log[name].mode[-1]) for name in PAPER} == {"run"}
-    assert max(engaged_after_s(log)) <= 2.0
+    assert max(list_engagements_s(log)) <= 2.0
     for name in ("m1", "m2"):
         held = np.count_nonzero(log[name].mode == "hold")
         assert held > 4000
-    assert max(max(found) for found in ticks_to_hold(log).values()) <= 21
+    assert max(max(holds) for holds in ticks_to_hold(log).values()) <= 21
     assert [log.missing(name) for name in PAPER] == [0, 0, 0]
     result = verify(log)
     assert result.passed
     assert result.differing == 0
     assert [site for site, _, _ in result.absences] == ["m1"]
-    clocks = {**members(log), "m1": again(log, "m1")}  # of each the one at the end
+    clocks = {
+        **list_members(log),
+        "m1": find_restarted(log, "m1"),
+    }  # of each the one at the end
     begun_ns = {name: np.median(began_ns(log, name, clocks[name])) for name in PAPER}
     assert max(begun_ns.values()) - min(begun_ns.values()) <= 1_000_000
 
@@ -191,7 +178,7 @@ def test_one_way_cuts_hold_both_ends(stage: Stage, apart: Machines) -> None:
     m2 holds at once. Nor do TCP's acknowledgements reach it: what it sends goes on for 0.1 to 0.2 s, until
     its retransmission timer runs out; then m1 hears nothing either, and holds too.
     """
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     session = Apart.following(stage, apart, 36)
     for cut_s in (2.5, 8.0):
         try:
@@ -202,26 +189,27 @@ def test_one_way_cuts_hold_both_ends(stage: Stage, apart: Machines) -> None:
         apart.deafen("m2", "m1", ends=True)
         pause(5.0)
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     for site, peer in (("m1", "m2"), ("m2", "m1")):
-        assert len(heard(log, site, peer).outages) == 2
+        assert len(list_heard(log, site, peer).outages) == 2
         said = [
-            one.text
-            for one in log.events
-            if one.member == site and "a peer is silent" in one.text
+            event.text
+            for event in log.events
+            if event.member == site and "a peer is silent" in event.text
         ]
         assert len(said) >= 2
-    deaf, dumb = heard(log, "m2", "m1").outages, heard(log, "m1", "m2").outages
+    deaf = list_heard(log, "m2", "m1").outages
+    dumb = list_heard(log, "m1", "m2").outages
     assert all(first <= last + 100 for (first, _), (last, _) in zip(deaf, dumb, strict=True))
-    assert max(max(found, default=0) for found in ticks_to_hold(log).values()) <= 21
+    assert max(max(holds, default=0) for holds in ticks_to_hold(log).values()) <= 21
     lost = {(event.member, event.about) for event in log.events if event.kind == "lost"}
     assert lost == {("m1", "m2"), ("m2", "m1")}
     assert {str(log[name].mode[-1]) for name in PAPER} == {"run"}
 
 
 def began_ns(log: Log, name: str, clock: Member) -> list[int]:
-    """When tick 0 would have been by each record of the last five seconds, on the clock under all others."""
+    """Returns the time of tick 0 according to each record of the last five seconds, on the machine's clock."""
     part = log[name]
     sent_ns = part.sent_ns[part.tick >= part.last_tick - 5000].tolist()
     return [
@@ -230,10 +218,9 @@ def began_ns(log: Log, name: str, clock: Member) -> list[int]:
     ]
 
 
-def back_to_nominal(log: Log, site: str, peer: str, delay: int, nominal: int) -> None:
-    """While the way is cut the age grows, by record and by statistics; then it is nominal within two ticks
-    of the first fresh arrival, or of when that one is due."""
-    link = heard(log, site, peer)
+def assert_nominal_age(log: Log, site: str, peer: str, delay: int, nominal: int) -> None:
+    """Asserts that the age grows while the way is cut, and is nominal within two ticks of the first fresh arrival."""
+    link = list_heard(log, site, peer)
     assert len(link.outages) == 2
     for before, after in link.outages:
         # a sample may come within the tick in which it was made: its age begins at 0

@@ -6,21 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.live.processes import assert_executed_again, open_whole_log
 from trilat_net.execution.virtual import execute_virtual
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
 
-from .processes import (
-    OUTSIDE,
-    PATIENCE_S,
-    PLAIN,
-    TALKING,
-    Session,
-    Stage,
-    executed_again,
-    whole,
-)
+from .processes import OUTSIDE, PATIENCE_S, PLAIN, TALKING, Session, Stage
 
 ARM = Path(__file__).parents[2] / "examples" / "external_arm.py"
 SLOW = """
@@ -45,19 +37,19 @@ def test_slow_laws_end_sessions_in_order(stage: Stage, monkeypatch: pytest.Monke
     session = Session(stage, "two_sites", ("m", "s"), *law, "--duration", "20")
     session.all()
     assert session.codes() == {"recorder": 0, "m": 1, "s": 1}
-    (told,) = (
+    (failure,) = (
         line
         for line in session.processes["s"].text().splitlines()
         if line.startswith("error: ")
     )
-    assert "the law slow_law:Law of s failed at tick 4" in told
-    assert "the code is too slow" in told
-    assert told.removeprefix("error: ") in session.processes["m"].text()
+    assert "the law slow_law:Law of s failed at tick 4" in failure
+    assert "the code is too slow" in failure
+    assert failure.removeprefix("error: ") in session.processes["m"].text()
     log = open_log(session.log)
     assert log.complete
     assert [event.member for event in log.events if event.kind == "failed"] == ["s"]
     assert 400 < len(log["s"]) < 500
-    executed_again(log)
+    assert_executed_again(log)
 
 
 def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
@@ -68,8 +60,8 @@ def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
     session.processes["s"].prints("waiting for its arm on trilat/t/s/measured")
     assert "over: the arm is at " in drive_arm(session, "two_sites")
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert compare_with_virtual(log).fed.identical == 3000 - log["s"].skipped
     assert log["m1"].sent["target[s]"].any()
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations
@@ -78,7 +70,7 @@ def test_external_arms_join_a_session_of_two(stage: Stage) -> None:
 
 def drive_arm(session: Session, scenario: str, *options: str) -> str:
     """Runs the program of the example until it ends; what it printed."""
-    words = (
+    arguments = (
         "s",
         "--scenario",
         scenario,
@@ -89,7 +81,7 @@ def drive_arm(session: Session, scenario: str, *options: str) -> str:
         *options,
     )
     done = subprocess.run(
-        [sys.executable, str(ARM), *words],
+        [sys.executable, str(ARM), *arguments],
         env=PLAIN,
         capture_output=True,
         text=True,
@@ -108,7 +100,7 @@ def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
     session.all()
     site = session.processes["s"]
     site.prints("waiting for its arm on trilat/t/s/measured")
-    words = (
+    arguments = (
         "s",
         "--scenario",
         "six_joints",
@@ -117,7 +109,7 @@ def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
         "--connect",
         session.endpoints[-1],
     )
-    wrong = subprocess.Popen([sys.executable, str(ARM), *words], env=PLAIN)
+    wrong = subprocess.Popen([sys.executable, str(ARM), *arguments], env=PLAIN)
     try:
         site.prints("its arm sends measurements of 6 joints; the scenario has 7")
     finally:
@@ -125,8 +117,8 @@ def test_refused_joints_leave_room_for_right_ones(stage: Stage) -> None:
         wrong.wait()
     assert drive_arm(session, "seven_joints", "--sensor").count(",") == 6
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert compare_with_virtual(log).fed.identical == 9000 - log["s"].skipped
     felt = log["s"].tau_x
     # somebody leans on the first joint with a half sine of 0.5 N m

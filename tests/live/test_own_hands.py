@@ -21,7 +21,8 @@ def assert_bits_of_virtual_time(log: Log) -> None:
     virtual = tn.simulate(log)
     for name in log.sites:
         for vector in VECTORS:
-            live, ours = getattr(log[name], vector), getattr(virtual[name], vector)
+            live = getattr(log[name], vector)
+            ours = getattr(virtual[name], vector)
             assert np.array_equal(live, ours), (name, vector)
 
 

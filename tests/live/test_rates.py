@@ -14,7 +14,7 @@ PATIENCE_S = 420.0
 """On two processors a dozen sites start for a minute, and may make up for what they missed for minutes."""
 
 
-def many(folder: Path, count: int) -> Path:
+def write_chain_scenario(folder: Path, count: int) -> Path:
     """A scenario of so many sites, each of which follows the one before it and the first one."""
     names = [f"a{n}" for n in range(count)]
     path = folder / "many.toml"
@@ -27,7 +27,7 @@ def many(folder: Path, count: int) -> Path:
     return path
 
 
-def demo(stage: Stage, *words: str) -> tuple[Process, Log]:
+def run_demo(stage: Stage, *words: str) -> tuple[Process, Log]:
     running = stage.start(
         "demo", "demo", *words, "--duration", "10", "--out", str(stage.folder / "out")
     )
@@ -35,7 +35,7 @@ def demo(stage: Stage, *words: str) -> tuple[Process, Log]:
     return running, open_log(stage.folder / "out" / "run.mcap")
 
 
-def accounted(log: Log) -> None:
+def assert_accounted(log: Log) -> None:
     """Of every site the end is in the log, and every record that it made is there or counted as missing."""
     assert log.complete
     for name in log.sites:
@@ -52,13 +52,13 @@ def accounted(log: Log) -> None:
 
 @pytest.mark.long
 def test_three_sites_at_four_kilohertz(stage: Stage) -> None:
-    _, log = demo(stage, "paper", "--set", "rate_hz=4000")
-    accounted(log)
+    _, log = run_demo(stage, "paper", "--set", "rate_hz=4000")
+    assert_accounted(log)
     assert sum(len(log[name]) for name in log.sites) == 120_000
 
 
 @pytest.mark.long
 def test_many_sites_at_one_kilohertz(stage: Stage) -> None:
-    _, log = demo(stage, str(many(stage.folder, 12)))
-    accounted(log)
+    _, log = run_demo(stage, str(write_chain_scenario(stage.folder, 12)))
+    assert_accounted(log)
     assert len(log.sites) == 12

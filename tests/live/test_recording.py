@@ -5,21 +5,22 @@ from pathlib import Path
 
 import pytest
 
-from tests.net.waiting import until
+from tests.live.processes import assert_executed_again, open_whole_log
+from tests.net.waiting import sleep_for_ns, until
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import Process, Session, Stage, executed_again, whole
+from .processes import Process, Session, Stage
 
 S = 1_000_000_000
 
 
 def pause(for_ns: int) -> None:
     clock = SystemClock()
-    clock.sleep_until(clock.monotonic_ns() + for_ns)
+    sleep_for_ns(clock, for_ns)
 
 
 def one_more(session: Session, log: Path) -> Process:
@@ -30,7 +31,7 @@ def one_more(session: Session, log: Path) -> Process:
     return recorder
 
 
-def interrupted(session: Session) -> dict[str, int]:
+def interrupt_sites(session: Session) -> dict[str, int]:
     """Ends the sites after a while, however long it took to come here; how every site ended."""
     pause(S)
     for name in session.sites:
@@ -40,10 +41,10 @@ def interrupted(session: Session) -> dict[str, int]:
 
 def from_the_start(path: Path) -> Log:
     """A log that has every record that was made, and everything else."""
-    log = whole(path, in_full=False)
+    log = open_whole_log(path, in_full=False)
     accounts = [text for topic, text in log.accounts.items() if topic.startswith("/trilat")]
     assert all("missing 0, duplicate 0" in text for text in accounts)
-    executed_again(log)
+    assert_executed_again(log)
     return log
 
 
@@ -72,7 +73,7 @@ def test_a_killed_recorders_successor_has_all_records(stage: Stage) -> None:
     killed.signal(signal.SIGKILL)
     until(killed.ended, 10.0)
     later = one_more(session, stage.folder / "later.mcap")
-    assert interrupted(session) == {"m": 130, "s": 130}
+    assert interrupt_sites(session) == {"m": 130, "s": 130}
     assert later.code() == 0
     log = from_the_start(stage.folder / "later.mcap")
     (late,) = [event for event in log.events if event.kind == "late"]
@@ -90,7 +91,7 @@ def test_two_recorders_at_once_have_the_same_records(stage: Stage) -> None:
     session.all()
     session.begun()
     twin = one_more(session, stage.folder / "twin.mcap")
-    assert interrupted(session) == {"m": 130, "s": 130}
+    assert interrupt_sites(session) == {"m": 130, "s": 130}
     assert (session.processes["recorder"].code(), twin.code()) == (0, 0)
     logs = [from_the_start(path) for path in (session.log, stage.folder / "twin.mcap")]
     for name in session.sites:

@@ -5,10 +5,11 @@ from itertools import combinations
 import pytest
 
 from tests.cli.running import trilat
+from tests.live.processes import connection_options, open_whole_log
 from trilat_net.execution.virtual_comparison import find_absent_samples
 from trilat_net.execution.what_if import rerun
 
-from .processes import PAPER, Session, Stage, connections, whole
+from .processes import PAPER, Session, Stage
 
 LINKS = (
     "link.delay_ms=1",  # some samples come late
@@ -31,10 +32,10 @@ def test_rerun_sites_of_a_session_are_unchanged(stage: Stage) -> None:
     session.all()
     session.begun()
     session.recording()
-    to = ("set", "--session", "t", *connections(session.endpoints))
+    to = ("set", "--session", "t", *connection_options(session.endpoints))
     trilat(*to, "link", "m1->s", "--delay", "30ms", cwd=stage.folder).succeeds()
     session.ends_well()
-    log = whole(session.log)
+    log = open_whole_log(session.log)
     assert any(sample.arrived_tick is not None for sample in find_absent_samples(log))
     assert "hold" in {state.mode for state in log["m2"].states}
     assert log.changes("s")

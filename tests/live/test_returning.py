@@ -6,24 +6,15 @@ from collections.abc import Sequence
 import pytest
 
 from tests.faults.invariants import SILENT_TICKS
+from tests.live.processes import list_engagements_s
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.session_check import check_file
 
-from .processes import (
-    FOLLOWS,
-    GLIDE,
-    JOINS,
-    PAPER,
-    Session,
-    Stage,
-    engaged_after_s,
-    pause,
-    ticks_to_hold,
-)
+from .processes import FOLLOWS, GLIDE, JOINS, PAPER, Session, Stage, pause, ticks_to_hold
 
 
-def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
+def kill_and_restart_sites(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
     """The paper's session: one site after the other is killed and started again, then one stopped for 1 s."""
     session = Session(stage, "paper", PAPER, "--duration", "600", *GLIDE)
     session.all()
@@ -54,14 +45,14 @@ def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Sess
 def test_restarted_sites_follow_within_two_seconds(
     victims: Sequence[str], stage: Stage
 ) -> None:
-    session, log = killed_and_started_again(stage, victims)
-    took_s = engaged_after_s(log)
+    session, log = kill_and_restart_sites(stage, victims)
+    took_s = list_engagements_s(log)
     assert len(took_s) == len(victims)
     assert max(took_s) <= 2.0, took_s
     holds = ticks_to_hold(log)
     assert len(holds["m2"]) >= len(victims) + 1  # and once for who was stopped
     assert min(map(len, holds.values())) >= 2
-    assert max(max(found) for found in holds.values()) <= SILENT_TICKS + 1
+    assert max(max(ticks) for ticks in holds.values()) <= SILENT_TICKS + 1
     for site in log.sites:
         assert log.missing(site) == 0
         if site not in victims:

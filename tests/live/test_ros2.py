@@ -16,20 +16,11 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 import trilat_net as tn
+from tests.live.processes import assert_executed_again, connection_options, open_whole_log
 from tests.net.waiting import until
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import (
-    OUTSIDE,
-    PAPER,
-    Session,
-    Stage,
-    assert_let_go,
-    connections,
-    executed_again,
-    pause,
-    whole,
-)
+from .processes import OUTSIDE, PAPER, Session, Stage, assert_let_go, pause
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
@@ -49,14 +40,15 @@ class Stranger:
             "scouting": {"multicast": {"enabled": False}},
         }
         self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
-        self._gid, self._sent = name.ljust(16), 0
+        self._gid = name.ljust(16)
+        self._sent = 0
         self.heard: dict[str, list[tuple[bytes, bytes]]] = defaultdict(list)
         self._kept = [self._session.declare_subscriber("0/**", self._hear)]
 
     def _hear(self, sample: Any) -> None:
-        came = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
         self.heard["/".join(str(sample.key_expr).split("/")[1:-2])].append(
-            (sample.payload.to_bytes(), came)
+            (sample.payload.to_bytes(), attachment)
         )
 
     def _attachment(self) -> bytes:
@@ -94,23 +86,23 @@ class Stranger:
 
     def latched(self, topic: str, kind: str) -> Any:
         """The last message of a topic that was published before this subscription."""
-        came: list[bytes] = []
+        payloads: list[bytes] = []
         late = zenoh.ext.HistoryConfig(detect_late_publishers=True)
         subscriber = zenoh.ext.declare_advanced_subscriber(
             self._session,
             f"0/{topic}/**",
-            lambda sample: came.append(sample.payload.to_bytes()),
+            lambda sample: payloads.append(sample.payload.to_bytes()),
             history=late,
         )
-        until(lambda: bool(came), 20.0)
+        until(lambda: bool(payloads), 20.0)
         subscriber.undeclare()
-        return ROS.deserialize_cdr(came[-1], kind)
+        return ROS.deserialize_cdr(payloads[-1], kind)
 
     def close(self) -> None:
         self._session.close()
 
 
-def pose(x: float, y: float) -> Any:
+def make_pose_message(x: float, y: float) -> Any:
     types = ROS.types
     stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
@@ -123,16 +115,17 @@ def pose(x: float, y: float) -> Any:
 
 
 def joint_state(names: Sequence[str], q: Sequence[float], qd: Sequence[float]) -> Any:
-    """Of a robot whose clock began with it."""
-    types, seconds = ROS.types, time.monotonic_ns()
+    """Returns the joint state of a robot whose clock began with the robot."""
+    types = ROS.types
+    seconds = time.monotonic_ns()
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds // 10**9, nanosec=seconds % 10**9)
-    numbers = (np.array(one) for one in (q, qd, [0.0] * len(q)))
+    numbers = (np.array(vector) for vector in (q, qd, [0.0] * len(q)))
     return types["sensor_msgs/msg/JointState"](
         types["std_msgs/msg/Header"](stamp, ""), [*names], *numbers
     )
 
 
-def shares(*numbers: float) -> Any:
+def make_shares_message(*numbers: float) -> Any:
     layout = ROS.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     return ROS.types["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array(numbers))
 
@@ -146,7 +139,13 @@ def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, An
     session.all()
     session.begun()
     bridge = stage.start(
-        "ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints)
+        "ros2",
+        "ros2",
+        "--session",
+        "t",
+        "--ros",
+        router,
+        *connection_options(session.endpoints),
     )
     bridge.prints("is in the graph of ROS 2")
     stranger = Stranger(router)
@@ -162,12 +161,14 @@ def test_strangers_lead_and_stop_arms_and_verify(stage: Stage) -> None:
     with bridged_session(stage, 25) as (session, bridge, ros):
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for n in range(150):
-            goal = pose(start.x - 0.15 * min(1.0, n / 60.0), start.y)
+            goal = make_pose_message(start.x - 0.15 * min(1.0, n / 60.0), start.y)
             ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", goal)
             pause(1.0 / 60.0)
-        led = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
-        assert led.x - start.x == pytest.approx(-0.15, abs=0.05)
-        ros.publish("t/s/set_dominance", "std_msgs/msg/Float64MultiArray", shares(0.9, 0.1))
+        tip = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
+        assert tip.x - start.x == pytest.approx(-0.15, abs=0.05)
+        ros.publish(
+            "t/s/set_dominance", "std_msgs/msg/Float64MultiArray", make_shares_message(0.9, 0.1)
+        )
         assert ros.call("t/s/stop")[0]
         assert ros.call("t/s/reset") == (
             False,
@@ -176,27 +177,31 @@ def test_strangers_lead_and_stop_arms_and_verify(stage: Stage) -> None:
         until(lambda: ros.newest("t/s/mode", "std_msgs/msg/String").data == "stopped", 20.0)
         assert ros.call("t/s/enable")[0]
         kinds = {"joint_states": "MP", "target_pose": "MS", "stop": "SS"}
-        told = ros.tokens()
+        tokens = ros.tokens()
         for name, kind in kinds.items():
-            assert any(f"/{kind}/%/%t/trilat/%t%m1%{name}/" in token for token in told)
+            assert any(f"/{kind}/%/%t/trilat/%t%m1%{name}/" in token for token in tokens)
         log = session.is_reproduced()
         assert bridge.code() == 0
         for states, attachment in ros.heard["t/m2/joint_states"][-50:]:
             assert len(attachment) == 33
-            one = ROS.deserialize_cdr(states, "sensor_msgs/msg/JointState")
-            stamp_ns = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
+            joint_state = ROS.deserialize_cdr(states, "sensor_msgs/msg/JointState")
+            stamp_ns = joint_state.header.stamp.sec * 10**9 + joint_state.header.stamp.nanosec
             row = (stamp_ns - int(log.session["epoch_unix_ns"])) * log["m2"].rate_hz // 10**9
-            assert one.position.tolist() == log["m2"].q[row].tolist()
-            assert one.effort.tolist() == log["m2"].tau[row].tolist()
+            assert joint_state.position.tolist() == log["m2"].q[row].tolist()
+            assert joint_state.effort.tolist() == log["m2"].tau[row].tolist()
         assert np.abs(log["m1"].tau_x).max() > 1.0
         changes = [json.loads(text) for state in log["s"].states for text in state.cmd]
-        assert [one["to"] for one in changes if "dominance" in one] == [{"m1": 0.9, "m2": 0.1}]
-        told = [
+        assert [change["to"] for change in changes if "dominance" in change] == [
+            {"m1": 0.9, "m2": 0.1}
+        ]
+        published_shares = [
             ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray").data.tolist()
             for data, _ in ros.heard["t/s/dominance"]
         ]
-        assert told[-1] == [0.9, 0.1]
-        assert all(0.0 < first < 0.9 for first, _ in told[:-1])  # on its ramp, and before
+        assert published_shares[-1] == [0.9, 0.1]
+        assert all(
+            0.0 < first < 0.9 for first, _ in published_shares[:-1]
+        )  # on its ramp, and before
 
 
 @pytest.mark.long
@@ -207,7 +212,7 @@ def test_a_killed_bridge_leaves_no_force(stage: Stage) -> None:
             ros.publish(
                 "t/m1/target_pose",
                 "geometry_msgs/msg/PoseStamped",
-                pose(start.x - 0.1, start.y),
+                make_pose_message(start.x - 0.1, start.y),
             )
             pause(1.0 / 60.0)
         bridge.signal(signal.SIGKILL)
@@ -222,7 +227,13 @@ def test_late_routers_are_joined_and_latecomers_see(stage: Stage) -> None:
     session.all()
     session.begun()
     bridge = stage.start(
-        "ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints)
+        "ros2",
+        "ros2",
+        "--session",
+        "t",
+        "--ros",
+        router,
+        *connection_options(session.endpoints),
     )
     bridge.prints(f"no router of ROS answers at {router}: waiting for it")
     first = stage.start("router", "router", "--listen", router)
@@ -247,7 +258,7 @@ def test_late_routers_are_joined_and_latecomers_see(stage: Stage) -> None:
         assert services["/t/end"] == ["std_srvs/srv/Trigger"]
         assert ros.call("t/end")[0]
         session.ends_well()
-        executed_again(whole(session.log, in_full=False))
+        assert_executed_again(open_whole_log(session.log, in_full=False))
         assert bridge.code() == 0
     finally:
         ros.close()
@@ -271,19 +282,22 @@ def test_ros_robots_brake_when_their_site_is_silent(stage: Stage) -> None:
     (stage.folder / "robot.toml").write_text(ROBOT)
     session = Session(stage, "two_sites", ("m", "s"), *OUTSIDE, "--duration", "8", *SLOWER)
     session.all()
-    words = (
+    arguments = (
         "--session",
         "t",
         "--ros",
         router,
         "--names",
         "robot.toml",
-        *connections(session.endpoints),
+        *connection_options(session.endpoints),
     )
-    bridge = stage.start("ros2", "ros2", *words)
+    bridge = stage.start("ros2", "ros2", *arguments)
     running.prints("listening at")
-    ros, robot = Stranger(router), tn.SimulatedArm(tn.load_scenario("two_sites"), "s")
-    site, said, frozen = session.processes["s"], list[list[float]](), False
+    ros = Stranger(router)
+    robot = tn.SimulatedArm(tn.load_scenario("two_sites"), "s")
+    site = session.processes["s"]
+    said = list[list[float]]()
+    frozen = False
     robot.accelerate(np.zeros(2))  # compiles: a robot that has begun is never silent
     try:
         while not site.ended():
@@ -300,26 +314,26 @@ def test_ros_robots_brake_when_their_site_is_silent(stage: Stage) -> None:
             if not frozen and len(got) > 1000 and "session begins" in site.text():
                 frozen = True
                 site.signal(signal.SIGSTOP)
-                until(lambda: commands(ros)[-1] == SAFE)
+                until(lambda: list_torque_commands(ros)[-1] == SAFE)
                 site.signal(signal.SIGCONT)
             pause(0.002)
         session.ends_well()
         assert bridge.code() == 0
         assert frozen
-        assert commands(ros)[-1] == SAFE
+        assert list_torque_commands(ros)[-1] == SAFE
     finally:
         ros.close()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert {tuple(q) for q in log["s"].q.tolist()} <= {tuple(q) for q in said}
     torques = {tuple(tau) for tau in log["s"].tau.tolist()}
-    assert {(shoulder, elbow) for elbow, shoulder in commands(ros)} - torques <= {
+    assert {(shoulder, elbow) for elbow, shoulder in list_torque_commands(ros)} - torques <= {
         (SAFE[1], SAFE[0])
     }
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01
 
 
-def commands(ros: Stranger) -> list[list[float]]:
+def list_torque_commands(ros: Stranger) -> list[list[float]]:
     """All that the robot's controller got."""
     got = ros.heard["effort_controller/commands"]
     return [torques_of(data) for data, _ in list(got)]
@@ -327,5 +341,5 @@ def commands(ros: Stranger) -> list[list[float]]:
 
 def torques_of(data: bytes) -> list[float]:
     message: Any = ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray")
-    found: list[float] = message.data.tolist()
-    return found
+    torques: list[float] = message.data.tolist()
+    return torques

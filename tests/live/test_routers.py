@@ -4,13 +4,14 @@ import signal
 
 import pytest
 
+from tests.live.processes import assert_executed_again, connection_options
 from tests.net.certificates import Certificates
 from trilat_net.execution.log_checks import LogCheckReport
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.member_keys import create_keys
 from trilat_net.net.zenoh_config import OPERATOR, RECORDER, ROUTER
 
-from .processes import Process, Session, Stage, connections, executed_again
+from .processes import Process, Session, Stage
 
 SITES = ("m", "s")
 
@@ -100,7 +101,7 @@ def test_all_may_stop_but_only_operators_enable(stage: Stage) -> None:
         return "--keys", str(stage.folder / "keys" / name)
 
     def order(words: str, whose: str) -> tuple[int, str]:
-        ways = connections(session.endpoints)
+        ways = connection_options(session.endpoints)
         asked = stage.start(
             f"{words} by {whose}", *words.split(), "--session", "t", *ways, *keys(whose)
         )
@@ -124,7 +125,7 @@ def test_all_may_stop_but_only_operators_enable(stage: Stage) -> None:
     assert order("stop --end", OPERATOR)[0] == 0
     session.ends_well()
     log = open_log(session.log)
-    executed_again(log)
+    assert_executed_again(log)
     changes = [change for state in log["s"].states for change in state.cmd]
     assert [change.rpartition(":")[2] for change in changes] == ['"stop"}', '"enable"}'] * 2
 

@@ -5,22 +5,19 @@ import signal
 import pytest
 
 from tests.cli.running import trilat
+from tests.live.processes import (
+    assert_equals_virtual_time,
+    assert_executed_again,
+    connection_options,
+    open_whole_log,
+)
+from tests.net.waiting import sleep_for_ns
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import find_absent_samples
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
 
-from .processes import (
-    BEGUN,
-    PAPER,
-    TALKING,
-    Session,
-    Stage,
-    connections,
-    equal_to_virtual_time,
-    executed_again,
-    whole,
-)
+from .processes import BEGUN, PAPER, TALKING, Session, Stage
 
 
 @pytest.mark.long  # on a push `make live` does the same with the commands
@@ -47,7 +44,7 @@ def test_frozen_sites_on_slow_links_keep_bits(stage: Stage) -> None:
     session.recording()
     clock = SystemClock()
     session.processes["m2"].signal(signal.SIGSTOP)
-    clock.sleep_until(clock.monotonic_ns() + 1_000_000_000)
+    sleep_for_ns(clock, 1_000_000_000)
     session.processes["m2"].signal(signal.SIGCONT)
     log = session.is_reproduced()
     assert max(log["m2"].late_us) > 800_000
@@ -56,7 +53,7 @@ def test_frozen_sites_on_slow_links_keep_bits(stage: Stage) -> None:
 
 def ping_waiting_session(session: Session) -> None:
     """Asserts that a ping is answered before the session begins; the ping joins nothing."""
-    to = connections(session.endpoints)
+    to = connection_options(session.endpoints)
     words = ("ping", "--session", "t", "--count", "10", *to)
     printed = trilat(*words, cwd=session.log.parent).succeeds()
     assert "session t waits for its members" in printed
@@ -73,8 +70,8 @@ def test_needed_recorders_may_come_last(stage: Stage) -> None:
         if name == "s":
             ping_waiting_session(session)
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     started = [event for event in log.events if event.kind == "start"]
     assert [event.member for event in started] == ["m"]
     assert set(started[0].boots) == {"recorder", "m", "s"}
@@ -95,10 +92,10 @@ def test_two_sessions_without_endpoints_do_not_meet(stage: Stage) -> None:
     for member in members:
         assert member.code() == 0, member
     for name in names:
-        log = whole(stage.folder / f"{name}.mcap")
+        log = open_whole_log(stage.folder / f"{name}.mcap")
         assert log.session["session"] == name
-        executed_again(log)
-        equal_to_virtual_time(log)
+        assert_executed_again(log)
+        assert_equals_virtual_time(log)
         assert "lost" not in {event.kind for event in log.events}
 
 

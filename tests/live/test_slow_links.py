@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.live.namespaces import connect_by_bridge
+from tests.live.processes import assert_executed_again, open_whole_log
 from trilat_net.log.log_reader import Log
 
-from .namespaces import ALL, Apart, Machines, NoNamespaces, bridged
-from .processes import PAPER, Session, Stage, executed_again, pause, ticks_to_hold, whole
+from .namespaces import ALL, Apart, Machines, NoNamespaces
+from .processes import PAPER, Session, Stage, pause, ticks_to_hold
 
 OPEN = {
     "netem": ("netem", "delay", "0ms"),
@@ -21,7 +23,7 @@ OPEN = {
 @pytest.fixture
 def queue(apart: Machines) -> str:
     """The best queue of this kernel; the machines of a session are there."""
-    bridged(apart, ALL)
+    connect_by_bridge(apart, ALL)
     try:
         apart.shape("m1", *OPEN["tbf"])
     except NoNamespaces as reason:
@@ -34,7 +36,7 @@ def queue(apart: Machines) -> str:
 
 
 def delays_ms(log: Log, site: str, peer: str) -> NDArray[np.float64]:
-    """From the stamp of each sample that came to the tick that took it in."""
+    """Returns the time from the stamp of each arrived sample to the tick that received it, in ms."""
     place = log.scenario.peers(site).index(peer)
     return np.array(
         [
@@ -60,13 +62,13 @@ def test_sites_hold_during_long_delays_then_follow(
     apart.shape("m1", *OPEN[queue])
     pause(6.0)
     session.ends_well()
-    log = whole(session.log)
-    executed_again(log)
+    log = open_whole_log(session.log)
+    assert_executed_again(log)
     assert max(delays_ms(log, "s", "m1").max(), delays_ms(log, "m2", "m1").max()) > 200.0
     holds = ticks_to_hold(log)
     assert holds["m2"]
     assert holds["s"]
-    assert max(max(found, default=0) for found in holds.values()) <= 21
+    assert max(max(ticks, default=0) for ticks in holds.values()) <= 21
     assert {str(log[name].mode[-1]) for name in PAPER} == {"run"}
 
 
@@ -74,7 +76,7 @@ def test_sites_hold_during_long_delays_then_follow(
 def test_jitter_within_the_delay_changes_no_record(
     queue: str, stage: Stage, apart: Machines
 ) -> None:
-    """What m1 sends waits for moments, some tens of milliseconds; the session is that of virtual time."""
+    """The messages of m1 wait for some tens of milliseconds, and the session equals virtual time."""
     session = Apart(stage, apart, "--duration", "8")
     session.all()
     session.begun()

@@ -14,13 +14,15 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.cli.running import COMMAND, PLAIN
+from tests.live.browsers import wait_until_page
+from tests.live.processes import assert_executed_again
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import list_shipped, load_scenario
 
-from .browsers import browser_page, needs_browser, page_address, shows, take_hold
+from .browsers import browser_page, needs_browser, page_address, take_hold
 from .page_client import PageClient, page_client
-from .processes import Process, Stage, executed_again
+from .processes import Process, Stage
 
 HELD = [
     name
@@ -31,10 +33,11 @@ HELD = [
 
 
 @contextmanager
-def watching(stage: Stage, session: str) -> Iterator[int]:
+def watch_session(stage: Stage, session: str) -> Iterator[int]:
     """`trilat watch` with a terminal, whose keys are pressed at the other end, once it shows the session."""
     keys, terminal = pty.openpty()
-    printed, words = stage.folder / "watch.printed", [*COMMAND, "watch", "--session", session]
+    printed = stage.folder / "watch.printed"
+    words = [*COMMAND, "watch", "--session", session]
     with printed.open("wb") as sink:
         owns = {"stdin": terminal, "start_new_session": True, "preexec_fn": own_terminal}
         watch = subprocess.Popen(words, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
@@ -59,47 +62,47 @@ def own_terminal() -> None:
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
-def live(stage: Stage, scenario: str, *options: str) -> Process:
+def start_live(stage: Stage, scenario: str, *options: str) -> Process:
     """A session with a page, at a rate that leaves time to its page on a machine that others use too."""
     rate = ("--set", "rate_hz=100")
     out = str(stage.folder / "out")
     return stage.start("live", "live", scenario, "--no-browser", "--out", out, *rate, *options)
 
 
-def run(stage: Stage, *words: str) -> Process:
+def run_command(stage: Stage, *words: str) -> Process:
     done = stage.start(f"{words[0]}-{len(list(stage.folder.iterdir()))}", *words)
     assert done.code() == 0, done
     return done
 
 
-def enabled(stage: Stage, page: PageClient) -> None:
+def enable_sites(stage: Stage, page: PageClient) -> None:
     page.shows("stopped")
-    run(stage, "enable", "--session", page.hello["session"])
+    run_command(stage, "enable", "--session", page.hello["session"])
     page.shows("run")
 
 
 @pytest.mark.parametrize("scenario", HELD)
 def test_every_arm_stops_from_everywhere_and_returns(scenario: str, stage: Stage) -> None:
-    running = live(stage, scenario)
+    running = start_live(stage, scenario)
     with page_client(page_address(running)) as page:
         page.shows("run")
         session = page.hello["session"]
-        stop = run(stage, "stop", "--session", session).text()
+        stop = run_command(stage, "stop", "--session", session).text()
         assert stop.startswith(f"stopping every arm of session {session} ...\n")
         assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(
             page.frame["sites"]
         )
-        enabled(stage, page)
+        enable_sites(stage, page)
         page.send(do="stop")
-        enabled(stage, page)
-        with watching(stage, session) as keys:
+        enable_sites(stage, page)
+        with watch_session(stage, session) as keys:
             os.write(keys, b"s")
-            enabled(stage, page)
+            enable_sites(stage, page)
         page.send(do="end")
         running.prints("checking the log")  # as `demo` does
     running.signal(signal.SIGINT)
     assert running.code() == 130
-    executed_again(open_log(stage.folder / "out" / "run.mcap"))
+    assert_executed_again(open_log(stage.folder / "out" / "run.mcap"))
 
 
 def is_asked(first: Page, second: Page) -> bool:
@@ -107,35 +110,39 @@ def is_asked(first: Page, second: Page) -> bool:
     if not first.evaluate("trilat.frame.holds.includes('m1')"):
         first.mouse.up()
         take_hold(first, 0, 20.0, 5.0)
-        shows(first, "trilat.frame.holds.includes('m1')")
+        wait_until_page(first, "trilat.frame.holds.includes('m1')")
     second.evaluate("document.getElementById('part').click()")
     until(lambda: second.evaluate("trilat.takesPart || trilat.frame.asks"))
     # the first was too slow for a moment, so nobody was in its way
     if second.evaluate("trilat.takesPart"):
         second.evaluate("document.getElementById('part').click()")
-        shows(second, "!trilat.takesPart")
+        wait_until_page(second, "!trilat.takesPart")
         return False
-    shows(first, "trilat.frame.asked.length === 1 && !document.getElementById('ask').hidden")
+    wait_until_page(
+        first, "trilat.frame.asked.length === 1 && !document.getElementById('ask').hidden"
+    )
     return True
 
 
 @needs_browser
 @pytest.mark.long
 def test_holders_are_asked_before_others_take_part(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")
+    running = start_live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as first:
-        shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
+        wait_until_page(
+            first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable"
+        )
         second = first.context.browser.new_page()  # type: ignore[union-attr]
         second.goto(address)
-        shows(second, "trilat.frame && trilat.frame.pages === 2")
+        wait_until_page(second, "trilat.frame && trilat.frame.pages === 2")
         first.bring_to_front()
         for answer in ("no", "yes"):
             assert any(is_asked(first, second) for _ in range(5))
             assert not second.evaluate("trilat.takesPart")
             first.evaluate(f"document.getElementById('ask-{answer}').click()")
-            shows(second, "!trilat.frame.asks")
-            shows(second, f"trilat.takesPart === {str(answer == 'yes').lower()}")
+            wait_until_page(second, "!trilat.frame.asks")
+            wait_until_page(second, f"trilat.takesPart === {str(answer == 'yes').lower()}")
         first.mouse.up()
     running.signal(signal.SIGINT)
     running.prints("checking the log")

@@ -1,4 +1,4 @@
-"""Files whose pages a disk lost, kept from before, or wrote elsewhere; and what recovery makes of them."""
+"""Files whose pages a disk lost, did not update, or wrote elsewhere, and their recovery."""
 
 import io
 import random
@@ -10,8 +10,8 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from tests.log.dealt import Message, messages
-from tests.log_editing import recorded
+from tests.log.builders import make_log_bytes
+from tests.log.split_logs import Message, read_messages
 from trilat_net.errors import LogError, NothingSaved
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
@@ -22,9 +22,10 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 DAMAGES = ("none", "zeroed", "stale", "misdirected", "random")
 
 
-def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
-    """A log as another program writes it: its definitions in the first chunk, without a digest chain."""
-    reader, stream = make_reader(io.BytesIO(data)), io.BytesIO()
+def rewrite_as_other_program(data: bytes, chunk_bytes: int, **options: object) -> bytes:
+    """Returns a log as another program writes it: definitions in the first chunk, and no digest chain."""
+    reader = make_reader(io.BytesIO(data))
+    stream = io.BytesIO()
     writer = Writer(stream, chunk_size=chunk_bytes, **options)  # type: ignore[arg-type]
     writer.start()
     metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
@@ -56,21 +57,23 @@ def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
     return stream.getvalue()
 
 
-def shelf() -> dict[str, bytes]:
-    """Whole logs of every kind of writer: live and virtual ones, and as other programs write them."""
-    long = recorded("paper", {"duration_s": 1.5})
+def make_log_collection() -> dict[str, bytes]:
+    """Returns whole logs of every kind of writer, by name: live, virtual, and of other programs."""
+    long = make_log_bytes("paper", {"duration_s": 1.5})
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     return {
-        "short": recorded("paper"),
+        "short": make_log_bytes("paper"),
         "long": long,
-        "another run": recorded("paper", {"duration_s": 1.5, "seed": 5}),
+        "another run": make_log_bytes("paper", {"duration_s": 1.5, "seed": 5}),
         "live": live,
         "live elsewhere": (GOLDEN / "live-4g.mcap").read_bytes(),
-        "unpacked": rewritten(long, 50_000, compression=CompressionType.NONE),
-        "lz4": rewritten(long, 400_000, compression=CompressionType.LZ4),
-        "zstd": rewritten(live, 400_000),
-        "without checksums": rewritten(live, 50_000, enable_crcs=False),
-        "without chunks": rewritten(recorded("paper"), 0, use_chunking=False),
+        "unpacked": rewrite_as_other_program(long, 50_000, compression=CompressionType.NONE),
+        "lz4": rewrite_as_other_program(long, 400_000, compression=CompressionType.LZ4),
+        "zstd": rewrite_as_other_program(live, 400_000),
+        "without checksums": rewrite_as_other_program(live, 50_000, enable_crcs=False),
+        "without chunks": rewrite_as_other_program(
+            make_log_bytes("paper"), 0, use_chunking=False
+        ),
     }
 
 
@@ -84,10 +87,10 @@ class DamagedFile:
     pages: tuple[tuple[str, int], ...]
 
 
-def damaged(
+def draw_damaged_file(
     files: Mapping[str, bytes], names: Sequence[str], draw: random.Random
 ) -> DamagedFile:
-    """One of some logs with up to two bad pages, in six of ten cases cut off anywhere."""
+    """Draws one of some logs with up to two bad pages, which in six of ten cases is cut off anywhere."""
     name = draw.choice(names)
     whole = files[name]
     data = bytearray(whole)
@@ -96,7 +99,8 @@ def damaged(
         del data[draw.randrange(PAGE_BYTES, len(whole)) :]
     pages = []
     for _ in range(draw.choice([1, 1, 1, 2])):
-        kind, page = draw.choice(DAMAGES), draw.randrange(-(-len(data) // PAGE_BYTES))
+        kind = draw.choice(DAMAGES)
+        page = draw.randrange(-(-len(data) // PAGE_BYTES))
         pages.append((kind, page))
         offset = page * PAGE_BYTES
         length = len(data[offset : offset + PAGE_BYTES])
@@ -104,7 +108,7 @@ def damaged(
         if kind == "zeroed":
             content = bytes(length)
         elif kind == "stale":
-            older = files[draw.choice([one for one in names if one != name])]
+            older = files[draw.choice([other for other in names if other != name])]
             content = (older * (offset // len(older) + 2))[offset : offset + length]
         elif kind == "misdirected":
             place = draw.randrange(max(1, len(whole) // PAGE_BYTES)) * PAGE_BYTES
@@ -146,29 +150,30 @@ def recovered_all(
     *,
     verified: bool = True,
 ) -> RecoveryTally:
-    """Recovers files one after the other, and compares what is in them with the undamaged ones."""
-    truth = {name: Counter(messages(data)) for name, data in files.items()}
+    """Recovers damaged files, and compares their messages with those of the undamaged files."""
+    truth = {name: Counter(read_messages(data)) for name, data in files.items()}
     tally = RecoveryTally(Counter(), [], [], [], [])
     for case in cases:
-        outcome = _recovered(case, truth[case.name], folder, tally, verified)
+        outcome = _judge_recovery(case, truth[case.name], folder, tally, verified)
         tally.outcomes[outcome] += 1
     return tally
 
 
-def _recovered(
+def _judge_recovery(
     case: DamagedFile,
     truth: Counter[Message],
     folder: Path,
     tally: RecoveryTally,
     verified: bool,
 ) -> str:
-    source, output = folder / "damaged.mcap", folder / "recovered.mcap"
+    source = folder / "damaged.mcap"
+    output = folder / "recovered.mcap"
     source.write_bytes(case.data)
     try:
         result = recover(source, output, force=True)
     except NothingSaved:
         return "nothing to save"
-    if Counter(messages(output.read_bytes())) - truth:
+    if Counter(read_messages(output.read_bytes())) - truth:
         tally.invented.append(case)
     try:
         log = open_log(output)

@@ -1,4 +1,4 @@
-"""What several tests of logs share."""
+"""Fixtures that several tests of logs share."""
 
 import os
 
@@ -9,6 +9,6 @@ from trilat_net.log import log_file
 
 @pytest.fixture
 def unsynced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hundreds of files, of which none need survive the loss of power."""
+    """Skips the synchronisation of files with the disk, since a test's files need not survive a loss of power."""
     monkeypatch.setattr(log_file, "sync_folder", lambda _: None)
     monkeypatch.setattr(os, "fsync", lambda _: None)

@@ -19,7 +19,9 @@ class SmallDisk:
     """
 
     def __init__(self, capacity: int, error: int = errno.ENOSPC, most: int = 1 << 30) -> None:
-        self.capacity, self.error, self.most = capacity, error, most
+        self.capacity = capacity
+        self.error = error
+        self.most = most
         self.written = 0
         self.kept = 0
 
@@ -51,11 +53,12 @@ class SmallFile(io.FileIO):
 
 
 class SmallRoom(DiskReserve):
-    """Room kept on a small disk; none where `possible` is False."""
+    """Space reserved on a small disk; nothing is reserved if `possible` is False."""
 
     def __init__(self, disk: SmallDisk, possible: bool = True) -> None:
         super().__init__(Path())
-        self._disk, self._possible = disk, possible
+        self._disk = disk
+        self._possible = possible
 
     def grow(self, size: int) -> None:
         if not self._possible or size <= self._disk.kept:
@@ -69,7 +72,7 @@ class SmallRoom(DiskReserve):
         self._disk.kept = 0
 
 
-def file_on(disk: SmallDisk, path: Path, room: bool = True) -> LogFile:
+def open_file_on(disk: SmallDisk, path: Path, room: bool = True) -> LogFile:
     return LogFile(path, room=SmallRoom(disk, room), opened=disk.opened)
 
 
@@ -77,13 +80,13 @@ Sent = tuple[int, int, bytes, int, int]
 """Channel, log time, payload, publish time, sequence."""
 
 
-def sent(count: int) -> list[Sent]:
-    """Messages that cannot be packed."""
+def draw_messages(count: int) -> list[Sent]:
+    """Returns messages with random payloads, which do not compress."""
     return [(1 + n % 2, 10 * n, os.urandom(40), 10 * n + 1, n) for n in range(count)]
 
 
-def begun(file: LogFile) -> McapWriter:
-    """A file with two channels, flushed."""
+def begin_container(file: LogFile) -> McapWriter:
+    """Returns the flushed writer of a file with two channels."""
     container = McapWriter(file, "lib")
     schema = container.register_schema("S", "jsonschema", b"{}")
     for name in "ab":

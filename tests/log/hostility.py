@@ -12,7 +12,7 @@ import lz4.frame
 import msgpack
 import zstandard
 
-from tests.log_editing import edited
+from tests.log.builders import edit_log_bytes
 from trilat_net.analysis.file_overview import info
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import TrilatError
@@ -37,14 +37,40 @@ LENGTHS = (
     (1 << 64) - 1,
 )
 NUMBERS = (
-    *(0, -1, 1, 3, 119, 120, 255, 1 << 31, 1 << 40, (1 << 40) - 1),
-    *((1 << 63) - 1, -(1 << 63), (1 << 64) - 1),
+    0,
+    -1,
+    1,
+    3,
+    119,
+    120,
+    255,
+    1 << 31,
+    1 << 40,
+    (1 << 40) - 1,
+    (1 << 63) - 1,
+    -(1 << 63),
+    (1 << 64) - 1,
 )
 VALUES: tuple[Any, ...] = (
     *NUMBERS,
-    *(float("nan"), float("inf"), 1e308, -1e308, 5e-324),
-    *("", "x", "m1", "diverged", "end", None, True, [], {}),
-    *([0, 0], [0.0] * 3, [float("nan")] * 3, [1e300] * 3),
+    float("nan"),
+    float("inf"),
+    1e308,
+    -1e308,
+    5e-324,
+    "",
+    "x",
+    "m1",
+    "diverged",
+    "end",
+    None,
+    True,
+    [],
+    {},
+    [0, 0],
+    [0.0] * 3,
+    [float("nan")] * 3,
+    [1e300] * 3,
     [[0, 0, 0]] * 300,
     [[1 << 40, (1 << 40) - 1, -(1 << 58)]],
     [[0, 5, 0], [0, 5, 0], [1, (1 << 58), 3]],
@@ -54,7 +80,7 @@ VALUES: tuple[Any, ...] = (
     ["{}", '{"link": "m2->m1"}', "[" * 2000, '{"at_s": 1e999}'],
     ["x" * 5000],
 )
-"""What a field of a message may be turned into."""
+"""Hostile values of a field of a message."""
 TEXTS = (
     "",
     "0",
@@ -69,8 +95,19 @@ TEXTS = (
     "²",
 )
 SCENARIO_VALUES = (
-    *("0x" + "f" * 300, "-1", "1e308", "5e-324", "nan", "''", "[]", "{}", "[[]]"),
-    *("true", "86400", "20000", "1"),
+    "0x" + "f" * 300,
+    "-1",
+    "1e308",
+    "5e-324",
+    "nan",
+    "''",
+    "[]",
+    "{}",
+    "[[]]",
+    "true",
+    "86400",
+    "20000",
+    "1",
     "[1e308, 1e308]",
     "'/dev/zero'",
     "'0 0, 1 lost'",
@@ -78,7 +115,7 @@ SCENARIO_VALUES = (
 
 
 class Draws(Protocol):
-    """Where choices come from: `random.Random`, or the bytes of a fuzzer."""
+    """A source of choices, such as `random.Random` or the bytes of a fuzzer."""
 
     def randrange(self, start: int, stop: int) -> int:
         """Returns a number from start to before stop."""
@@ -91,29 +128,29 @@ def one_of(draws: Draws, values: Sequence[Any]) -> Any:
     return values[draws.randrange(0, len(values))]
 
 
-def another(value: Any, draws: Draws) -> Any:
+def draw_other_value(value: Any, draws: Draws) -> Any:
     """Returns another value, mostly of the same kind."""
     alike = [each for each in VALUES if type(each) is type(value)]
     return one_of(draws, alike if alike and draws.random() < 0.8 else VALUES)
 
 
-def flipped(data: bytes, draws: Draws) -> bytes:
-    """Some bits are others."""
+def flip_bits(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy with up to three flipped bits."""
     changed = bytearray(data)
     for _ in range(draws.randrange(1, 4)):
         changed[draws.randrange(0, len(changed))] ^= 1 << draws.randrange(0, 8)
     return bytes(changed)
 
 
-def torn(data: bytes, draws: Draws) -> bytes:
-    """The end, or a piece in the middle, is not there."""
+def cut_bytes(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy without its end, or without a piece in the middle."""
     start = draws.randrange(0, len(data))
     length = len(data) if draws.random() < 0.5 else draws.randrange(1, 2000)
     return data[:start] + data[start + length :]
 
 
-def lengthened(data: bytes, draws: Draws) -> bytes:
-    """A number at some place is a hostile one: a length, an offset, a count."""
+def replace_length(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy with a hostile length, offset or count at a random place."""
     changed = bytearray(data)
     size = one_of(draws, (2, 4, 8))
     at = draws.randrange(0, len(data) - size)
@@ -123,8 +160,8 @@ def lengthened(data: bytes, draws: Draws) -> bytes:
     return bytes(changed)
 
 
-def record_lengthened(data: bytes, draws: Draws) -> bytes:
-    """The length of a record of the file is another."""
+def replace_record_length(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy in which one record states a wrong length."""
     frames = list(RecordScanner(io.BytesIO(data)).frames())
     frame = one_of(draws, frames)
     changed = bytearray(data)
@@ -133,10 +170,10 @@ def record_lengthened(data: bytes, draws: Draws) -> bytes:
     return bytes(changed)
 
 
-def chunk(
+def make_chunk(
     records: bytes, size: int | None = None, compression: str = "zstd", crc: int | None = None
 ) -> bytes:
-    """A chunk with these records, which says what it likes."""
+    """Returns a chunk with the given records, whose stated size and checksum may be wrong."""
     packed = {
         "zstd": lambda: zstandard.compress(records),
         "lz4": lambda: lz4.frame.compress(records),
@@ -156,8 +193,8 @@ def chunk(
     return struct.pack("<BQ", 6, len(content)) + content
 
 
-def repacked(data: bytes, draws: Draws, change: Callable[[bytes, Draws], bytes]) -> bytes:
-    """What is inside a chunk is changed, and its checksum is right."""
+def change_chunk(data: bytes, draws: Draws, change: Callable[[bytes, Draws], bytes]) -> bytes:
+    """Returns a copy in which the content of one chunk is changed, and its checksum is right."""
     framing = RecordScanner(io.BytesIO(data))
     chunks = [frame for frame in framing.frames() if frame.opcode == 6]
     if not chunks:
@@ -167,16 +204,17 @@ def repacked(data: bytes, draws: Draws, change: Callable[[bytes, Draws], bytes])
         inside = change(unpack_chunk(framing.content(frame)), draws)
     except Exception:  # it is damaged already
         return data
-    new = chunk(inside, compression=one_of(draws, ("zstd", "lz4", "")))
+    new = make_chunk(inside, compression=one_of(draws, ("zstd", "lz4", "")))
     return data[: frame.offset] + new + data[frame.end :]
 
 
-def inside_changed(data: bytes, draws: Draws) -> bytes:
-    return repacked(data, draws, one_of(draws, (flipped, torn, lengthened)))
+def change_inside(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy in which the content of one chunk is damaged."""
+    return change_chunk(data, draws, one_of(draws, (flip_bits, cut_bytes, replace_length)))
 
 
-def message_changed(data: bytes, draws: Draws) -> bytes:
-    """A message of the log says something else, in one field or two."""
+def change_message(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy in which one message has another value in a field."""
 
     def change(inside: bytes, draws: Draws) -> bytes:
         records = iterate_records(inside)
@@ -189,20 +227,20 @@ def message_changed(data: bytes, draws: Draws) -> bytes:
             try:
                 fields = msgpack.unpackb(payload)
                 name = one_of(draws, list(fields))
-                fields[name] = another(fields[name], draws)
+                fields[name] = draw_other_value(fields[name], draws)
                 payload = msgpack.packb(fields)
             except Exception:  # not one of ours, or what cannot be packed
-                payload = flipped(payload, draws) if payload else payload
+                payload = flip_bits(payload, draws) if payload else payload
             new = struct.pack("<BQ", 5, 22 + len(payload)) + inside[at + 9 : at + 31] + payload
             inside = inside[:at] + new + inside[at + 9 + length :]
             break
         return inside
 
-    return repacked(data, draws, change)
+    return change_chunk(data, draws, change)
 
 
-def field_changed(data: bytes, draws: Draws) -> bytes:
-    """A field is another from some record of a site on."""
+def change_field(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy in which a field has another value from some record of a site on."""
     names = "tick t_ns used rx cmd mem mode late_us boot site echo v sent_ns rx_crc busy_us q"
     name = one_of(draws, names.split())
     kinds = {
@@ -215,30 +253,31 @@ def field_changed(data: bytes, draws: Draws) -> bytes:
         "mode": "",
         "site": "",
     }
-    value = another(kinds.get(name, 0), draws)
-    since, site = draws.randrange(0, 30), one_of(draws, ("m1", "m2", "s"))
+    value = draw_other_value(kinds.get(name, 0), draws)
+    since = draws.randrange(0, 30)
+    site = one_of(draws, ("m1", "m2", "s"))
 
     def change(record: dict[str, Any]) -> dict[str, Any]:
         hit = record["site"] == site and record["tick"] >= since
         return {**record, name: value} if hit else record
 
     try:
-        return edited(data, record=change)
+        return edit_log_bytes(data, record=change)
     except Exception:  # it was no log any more
         return data
 
 
-def told_otherwise(data: bytes, draws: Draws) -> bytes:
-    """The session's metadata say something else."""
+def change_session(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy in which one entry of the session's metadata is another text."""
     keys = "session driver scenario_sha256 epoch_unix_ns schema_version sites fingerprint seed rerun_executed"
     try:
-        return edited(data, session={one_of(draws, keys.split()): one_of(draws, TEXTS)})
+        return edit_log_bytes(data, session={one_of(draws, keys.split()): one_of(draws, TEXTS)})
     except Exception:
         return data
 
 
-def scenario_changed(data: bytes, draws: Draws) -> bytes:
-    """A value of the scenario is another, or a table is there twice."""
+def change_scenario(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy whose scenario has other values."""
 
     def change(text: str) -> str:
         lines = text.split("\n")
@@ -252,26 +291,34 @@ def scenario_changed(data: bytes, draws: Draws) -> bytes:
         return "\n".join(lines)
 
     try:
-        return edited(data, scenario=change)
+        return edit_log_bytes(data, scenario=change)
     except Exception:
         return data
 
 
 CHANGES: tuple[Callable[[bytes, Draws], bytes], ...] = (
-    *(flipped, torn, lengthened, record_lengthened, inside_changed),
-    *(message_changed, message_changed, field_changed, told_otherwise, scenario_changed),
+    flip_bits,
+    cut_bytes,
+    replace_length,
+    replace_record_length,
+    change_inside,
+    change_message,
+    change_message,
+    change_field,
+    change_session,
+    change_scenario,
 )
 
 
-def mangled(data: bytes, draws: Draws) -> bytes:
-    """A log, changed in one way or two."""
+def mangle_log(data: bytes, draws: Draws) -> bytes:
+    """Returns a copy that is changed in one or two ways."""
     for _ in range(draws.randrange(1, 3)):
         if len(data) > 16:
             data = one_of(draws, CHANGES)(data, draws)
     return data
 
 
-def _arrays(path: Path) -> None:
+def _read_arrays(path: Path) -> None:
     log = open_log(path)
     for site in log.sites:
         part = log[site]
@@ -283,11 +330,11 @@ def _arrays(path: Path) -> None:
     _ = log.accounts, log.complete
 
 
-def _executed(path: Path) -> None:
+def _verify(path: Path) -> None:
     verify(open_log(path))
 
 
-def _recovered(path: Path) -> None:
+def _recover(path: Path) -> None:
     output = path.with_name("made.mcap")
     output.unlink(missing_ok=True)
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):  # no disk is under test here
@@ -295,18 +342,18 @@ def _recovered(path: Path) -> None:
 
 
 READERS: dict[str, Callable[[Path], object]] = {
-    "arrays": _arrays,
-    "verify": _executed,
+    "arrays": _read_arrays,
+    "verify": _verify,
     "info": lambda path: info(path).facts,
     "check": lambda path: check_file(path),
-    "recover": _recovered,
+    "recover": _recover,
     "replay": lambda path: preload_messages([path], PlaySelection(), 64 << 20),
 }
-"""Everybody who reads a log, by name."""
+"""The readers of logs, by name."""
 
 
 def read_by_all(path: Path) -> dict[str, str]:
-    """Has everybody read a file; returns what each said against it. Other than a `TrilatError` is raised."""
+    """Returns the complaints of all readers about a file, by reader; only a `TrilatError` counts as a complaint."""
     complaints = {}
     for name, reader in READERS.items():
         try:

@@ -1,9 +1,9 @@
-"""Files as other people's readers get them: of a simulation, of a recorder, a part, recovered, exported."""
+"""Files for readers of other programs: simulated, recorded, in parts, recovered and exported."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
-from trilat_net.core.step.ticks import TickRecord
+from tests.log.builders import simulate_bytes, write_log
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
@@ -22,16 +22,8 @@ KINDS = ("virtual", "live", "first part", "last part", "recovered")
 VIEWS_HZ = 100.0
 
 
-def outputs() -> dict[str, list[TickRecord]]:
-    """What each site does."""
-    made: dict[str, list[TickRecord]] = {name: [] for name in SCENARIO.names}
-    for step in virtual.execute_virtual(SCENARIO):
-        made[step.site.name].append(step.output)
-    return made
-
-
-def live(storage: LogStorage) -> None:
-    """Records a session as the recorder does: records that were sent late and came later."""
+def record_live_file(storage: LogStorage) -> None:
+    """Writes a session as the recorder does, with records that were sent late and arrived later."""
 
     def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
         return LogWriter(
@@ -48,15 +40,18 @@ def live(storage: LogStorage) -> None:
 
     with LogParts(storage, begin) as log:
         for step in virtual.execute_virtual(SCENARIO):
-            name, k, t_ns = step.site.name, step.output.tick, step.output.t_ns
-            sent_ns, log_ns = t_ns + 80_000, EPOCH_NS + t_ns + 300_000
+            name = step.site.name
+            k = step.output.tick
+            t_ns = step.output.t_ns
+            sent_ns = t_ns + 80_000
+            log_ns = EPOCH_NS + t_ns + 300_000
             payload = encode_state(
                 name, 7, step.site.peers, step.output, step.arrivals, 70, 20, sent_ns
             )
             state = decode(payload, State)
             log.add(f"trilat/lab/{name}/state", payload, sent_ns, log_ns, k, state)
             if k % 100 == 0:
-                stats = statistics(name, step.site.peers[0], k, t_ns)
+                stats = make_link_stats(name, step.site.peers[0], k, t_ns)
                 log.add(f"trilat/lab/{name}/link", encode(stats), t_ns, log_ns, k, stats)
                 log.flush()
         for n, name in enumerate(SCENARIO.names):
@@ -79,8 +74,8 @@ def live(storage: LogStorage) -> None:
         log.finish({})
 
 
-def statistics(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
-    """Statistics of a site with one peer, as a live loop publishes them."""
+def make_link_stats(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
+    """Returns the statistics of a site with one peer, as a live loop publishes them."""
     counts = {name: {peer: 0} for name in ("accepted", "late", "duplicate", "refused")}
     measured = {"offset_us": {peer: -120}, "bound_us": {peer: 40}, "rtt_us": {peer: 400}}
     facts = {
@@ -97,20 +92,17 @@ def statistics(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
     return LinkStats(**facts, **loop, **delays, **measured, **counts)
 
 
-def made(folder: Path) -> dict[str, Path]:
-    """Makes every kind of file, and the bag of the live one."""
-    whole = folder / "virtual.mcap"
-    with whole.open("wb") as stream:
-        virtual.write_virtual_log(SCENARIO, stream, views_hz=VIEWS_HZ)
-    live(LogStorage(folder / "live.mcap"))
-    live(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
+def write_standard_files(folder: Path) -> dict[str, Path]:
+    """Writes a file of every kind, and the bag of the live one, and returns the paths by kind."""
+    whole = write_log(folder, simulate_bytes(SCENARIO, views_hz=VIEWS_HZ), "virtual.mcap")
+    live = folder / "live.mcap"
+    record_live_file(LogStorage(live))
+    record_live_file(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
     parts = sorted(folder.glob("parts-*.mcap"))
-    torn = folder / "torn.mcap"
-    torn.write_bytes(
-        (folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10]
-    )
-    recover(torn, folder / "recovered.mcap")
+    torn = write_log(folder, live.read_bytes()[: live.stat().st_size * 7 // 10], "torn.mcap")
+    recovered = folder / "recovered.mcap"
+    recover(torn, recovered)
     bag = folder / "live-ros2.mcap"
-    export_ros2(open_log(folder / "live.mcap"), bag)
-    found = (whole, folder / "live.mcap", parts[0], parts[-1], folder / "recovered.mcap")
-    return {**dict(zip(KINDS, found, strict=True)), "bag": bag}
+    export_ros2(open_log(live), bag)
+    paths = (whole, live, parts[0], parts[-1], recovered)
+    return {**dict(zip(KINDS, paths, strict=True)), "bag": bag}

@@ -13,8 +13,8 @@ from trilat_net.log.accounting import Account, RangeSet, StartGap
 streams = st.lists(st.integers(0, 60), max_size=80)
 
 
-def gaps_of(came: set[int], end: int) -> list[list[int]]:
-    missing = [tick for tick in range(end) if tick not in came]
+def gaps_of(received: set[int], end: int) -> list[list[int]]:
+    missing = [tick for tick in range(end) if tick not in received]
     starts = [t for t in missing if t - 1 not in missing]
     ends = [t for t in missing if t + 1 not in missing]
     return [list(pair) for pair in zip(starts, ends, strict=True)]
@@ -22,23 +22,27 @@ def gaps_of(came: set[int], end: int) -> list[list[int]]:
 
 @given(stream=streams, ticks=st.integers(0, 70))
 def test_accounts_equal_the_set_of_ticks(stream: list[int], ticks: int) -> None:
-    account, came, duplicate, reordered, newest = Account(), set[int](), 0, 0, -1
+    account = Account()
+    received = set[int]()
+    duplicate = 0
+    reordered = 0
+    newest = -1
     for tick in stream:
-        is_new = tick not in came
+        is_new = tick not in received
         assert account.receive(tick) == is_new
         duplicate += not is_new
         reordered += is_new and tick < newest
-        came.add(tick)
+        received.add(tick)
         newest = max(newest, tick)
     account.add_expected(ticks)
-    gaps = gaps_of(came, max(ticks, newest + 1))
+    gaps = gaps_of(received, max(ticks, newest + 1))
     assert account.gaps == gaps
     assert (account.received, account.duplicate, account.reordered) == (
-        len(came),
+        len(received),
         duplicate,
         reordered,
     )
-    assert account.missing == max(ticks, newest + 1) - len(came)
+    assert account.missing == max(ticks, newest + 1) - len(received)
     assert account.largest_gap == max((last - first + 1 for first, last in gaps), default=0)
     assert account.last == max(ticks - 1, newest)
 
@@ -49,7 +53,8 @@ def test_gaps_are_bounded_and_missing_is_exact(
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(accounting, "MAX_GAPS", most)
-        account, taken = Account(), set[int]()
+        account = Account()
+        taken = set[int]()
         for tick in stream:
             if account.receive(tick):
                 assert tick not in taken
@@ -70,9 +75,14 @@ def test_gaps_are_bounded_and_missing_is_exact(
 def test_remembered_records_are_stored_once_in_order(
     stream: list[tuple[str, int]], hopeless: int
 ) -> None:
-    account, there, newest, reordered, refilled, duplicate = Account(), set[int](), -1, 0, 0, 0
+    account = Account()
+    stored_numbers = set[int]()
+    newest = -1
+    reordered = 0
+    refilled = 0
+    duplicate = 0
     for how, number in stream:
-        new = number not in there
+        new = number not in stored_numbers
         if how == "came":
             reordered += new and number < newest
             duplicate += not new
@@ -80,11 +90,11 @@ def test_remembered_records_are_stored_once_in_order(
         else:
             refilled += new
         assert (account.receive if how == "came" else account.refill)(number) == new
-        there.add(number)
+        stored_numbers.add(number)
     account.abandon_below(hopeless)
-    assert (account.received, account.refilled) == (len(there), refilled)
+    assert (account.received, account.refilled) == (len(stored_numbers), refilled)
     assert (account.reordered, account.duplicate) == (reordered, duplicate)
-    missing = sorted(set(range(account.expected)) - there)
+    missing = sorted(set(range(account.expected)) - stored_numbers)
     for start in range(0, 52, 3):
         wanted = [number for number in missing if number >= max(start, hopeless)]
         gap = account.find_requestable_gap(start)
@@ -93,12 +103,12 @@ def test_remembered_records_are_stored_once_in_order(
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=30).map(sorted), st.booleans())
-def test_longest_silence_is_between_two_arrivals(came: list[int], again: bool) -> None:
+def test_longest_silence_is_between_two_arrivals(arrivals_ns: list[int], again: bool) -> None:
     account = Account()
-    for number, at_ns in enumerate(came):
+    for number, at_ns in enumerate(arrivals_ns):
         account.receive(0 if again else number, at_ns)
         account.refill(number + 5)
-    assert account.silence_ns == max((b - a for a, b in pairwise(came)), default=0)
+    assert account.silence_ns == max((b - a for a, b in pairwise(arrivals_ns)), default=0)
 
 
 def test_an_account_reads_as_one_line() -> None:
@@ -123,7 +133,7 @@ def test_of_very_many_gaps_the_first_are_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first_start", "made", "missing", "unmade"),
+    ("first_start", "tick_count", "missing", "unmade"),
     [
         (range(5), 0, 0, 5),  # it was killed: what it made besides is not known
         (range(5), 7, 2, 3),  # it stated seven at its end
@@ -132,22 +142,22 @@ def test_of_very_many_gaps_the_first_are_named() -> None:
     ],
 )
 def test_ticks_between_starts_are_not_missing(
-    first_start: Sequence[int], made: int, missing: int, unmade: int
+    first_start: Sequence[int], tick_count: int, missing: int, unmade: int
 ) -> None:
     for told_first in (True, False):
         account = Account()
         for number in first_start:
             account.receive(number)
-        account.add_expected(made)
+        account.add_expected(tick_count)
         if told_first:
-            account.mark_unpublished(10, made)
+            account.mark_unpublished(10, tick_count)
         for number in range(10, 13):
             account.receive(number)
         if not told_first:
-            account.mark_unpublished(10, made)
+            account.mark_unpublished(10, tick_count)
         assert (account.missing, account.unpublished) == (missing, unmade)
         assert account.expected == account.received + account.missing == 13 - unmade
-        account.mark_unpublished(10, made)  # said twice, it counts once
+        account.mark_unpublished(10, tick_count)  # said twice, it counts once
         assert account.unpublished == unmade
 
 
@@ -173,14 +183,14 @@ def test_heard_records_of_killed_starts_are_missing(
     for number in range(5):
         account.receive(number)
     gap = StartGap(account, 1)
-    for told in order:
-        if told == "join":
+    for news in order:
+        if news == "join":
             gap.begin_next_start(10, 0)
-        elif told == "records":
+        elif news == "records":
             for number in range(10, 13):
                 account.receive(number)
         else:
-            gap.note_published(int(told[-1]))
+            gap.note_published(int(news[-1]))
     gap.begin_next_start(10, 0)  # said twice, it counts once
     assert (account.gaps, account.missing, account.unpublished) == ([[5, 6]], 2, 3)
     assert account.expected == account.received + account.missing == 10

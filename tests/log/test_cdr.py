@@ -24,13 +24,13 @@ from trilat_net.log.ros2.cdr import (
 )
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-words = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)
+texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=12)
 floats = st.floats(width=64) | st.sampled_from([0.0, -0.0, math.nan, math.inf, 5e-324])
 stamps_ns = st.integers(0, (1 << 31) * 10**9 - 1)
 
 
-def decoded(name: str, data: bytes) -> Any:
-    """By mcap-ros2-support, from the schema text that stands in our files."""
+def decode_cdr(name: str, data: bytes) -> Any:
+    """Returns a message decoded by mcap-ros2-support from the schema text in our files."""
     schema = Schema(id=1, name=name, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[name])
     decoder = DecoderFactory().decoder_for("cdr", schema)
     assert decoder is not None
@@ -38,11 +38,11 @@ def decoded(name: str, data: bytes) -> Any:
 
 
 def by_rosbags(name: str, data: bytes) -> Any:
-    """By rosbags, from its own definition of the type."""
+    """Returns a message decoded by rosbags from its own definition of the type."""
     return STORE.deserialize_cdr(data, name)
 
 
-def serialized(name: str, message: Any) -> bytes:
+def serialize_cdr(name: str, message: Any) -> bytes:
     return bytes(STORE.serialize_cdr(message, name))
 
 
@@ -50,19 +50,19 @@ def type_of(name: str) -> Any:
     return STORE.types[name]
 
 
-def header(stamp_ns: int, frame_id: str) -> Any:
+def make_header(stamp_ns: int, frame_id: str) -> Any:
     time = type_of("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
     return type_of("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
 
 
-def bits(numbers: Any) -> list[bytes]:
-    """So that NaN equals itself and -0.0 is not 0.0."""
+def pack_numbers(numbers: Any) -> list[bytes]:
+    """Returns numbers as bytes, so that NaN equals itself and -0.0 differs from 0.0."""
     return [struct.pack("<d", number) for number in numbers]
 
 
 @pytest.mark.parametrize("name", list(cdr.ROS2_SCHEMAS))
 def test_schema_texts_are_complete_and_hash_right(name: str) -> None:
-    """Its hash, by which ROS 2 tells types apart, is that of the type."""
+    """The hash of a schema text, by which ROS 2 distinguishes types, is that of the type."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(cdr.ROS2_SCHEMAS[name].decode(), name))
     assert store.hash_rihs01(name) == STORE.hash_rihs01(name)
@@ -70,8 +70,9 @@ def test_schema_texts_are_complete_and_hash_right(name: str) -> None:
 
 @st.composite
 def joint_states(draw: st.DrawFn) -> SimpleNamespace:
-    names = draw(st.lists(words, max_size=5))
-    velocity, effort = draw(st.booleans()), draw(st.booleans())
+    names = draw(st.lists(texts, max_size=5))
+    velocity = draw(st.booleans())
+    effort = draw(st.booleans())
     row = st.lists(floats, min_size=len(names), max_size=len(names))
     return SimpleNamespace(
         stamp_ns=draw(stamps_ns),
@@ -86,61 +87,61 @@ def joint_states(draw: st.DrawFn) -> SimpleNamespace:
 @given(joint_states())
 def test_joint_states_are_read_as_they_were_written(case: SimpleNamespace) -> None:
     data = case.packer.pack(case.stamp_ns, case.position, case.velocity, case.effort)
-    for message in (decoded(cdr.JOINT_STATE, data), by_rosbags(cdr.JOINT_STATE, data)):
+    for message in (decode_cdr(cdr.JOINT_STATE, data), by_rosbags(cdr.JOINT_STATE, data)):
         stamp = message.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == case.stamp_ns
         assert (message.header.frame_id, list(message.name)) == ("", case.names)
-        assert bits(message.position) == bits(case.position)
-        assert bits(message.velocity) == bits(case.velocity)
-        assert bits(message.effort) == bits(case.effort)
-    own = type_of(cdr.JOINT_STATE)(
-        header=header(case.stamp_ns, ""),
+        assert pack_numbers(message.position) == pack_numbers(case.position)
+        assert pack_numbers(message.velocity) == pack_numbers(case.velocity)
+        assert pack_numbers(message.effort) == pack_numbers(case.effort)
+    written = type_of(cdr.JOINT_STATE)(
+        header=make_header(case.stamp_ns, ""),
         name=case.names,
         position=np.array(case.position),
         velocity=np.array(case.velocity),
         effort=np.array(case.effort),
     )
-    assert data == serialized(cdr.JOINT_STATE, own)
+    assert data == serialize_cdr(cdr.JOINT_STATE, written)
 
 
 @st.composite
-def arrays(draw: st.DrawFn) -> tuple[list[tuple[str, int]], list[float]]:
-    dimensions = draw(st.lists(st.tuples(words, st.integers(0, 3)), max_size=3))
+def draw_array(draw: st.DrawFn) -> tuple[list[tuple[str, int]], list[float]]:
+    dimensions = draw(st.lists(st.tuples(texts, st.integers(0, 3)), max_size=3))
     count = math.prod(size for _, size in dimensions)
     return dimensions, draw(st.lists(floats, min_size=count, max_size=count))
 
 
-@given(arrays())
+@given(draw_array())
 def test_arrays_are_read_as_they_were_written(
     case: tuple[list[tuple[str, int]], list[float]],
 ) -> None:
     dimensions, numbers = case
     data = make_float_array_packer(*dimensions)(*numbers)
     strides = [math.prod(size for _, size in dimensions[n:]) for n in range(len(dimensions))]
-    for message in (decoded(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
-        assert bits(message.data) == bits(numbers)
+    for message in (decode_cdr(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
+        assert pack_numbers(message.data) == pack_numbers(numbers)
         shape = [(d.label, d.size, d.stride) for d in message.layout.dim]
         assert shape == [(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
-    one = type_of("std_msgs/msg/MultiArrayDimension")
-    dims = [one(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
+    make_dimension = type_of("std_msgs/msg/MultiArrayDimension")
+    dims = [make_dimension(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
     layout = type_of("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
-    own = type_of(cdr.FLOAT64_ARRAY)(layout=layout, data=np.array(numbers))
-    assert data == serialized(cdr.FLOAT64_ARRAY, own)
+    written = type_of(cdr.FLOAT64_ARRAY)(layout=layout, data=np.array(numbers))
+    assert data == serialize_cdr(cdr.FLOAT64_ARRAY, written)
 
 
-@given(words)
+@given(texts)
 def test_a_string_is_read_as_it_was_written(text: str) -> None:
     data = pack_string(text)
-    assert decoded(cdr.STRING, data).data == by_rosbags(cdr.STRING, data).data == text
-    assert data == serialized(cdr.STRING, type_of(cdr.STRING)(data=text))
+    assert decode_cdr(cdr.STRING, data).data == by_rosbags(cdr.STRING, data).data == text
+    assert data == serialize_cdr(cdr.STRING, type_of(cdr.STRING)(data=text))
 
 
-@given(stamps_ns, st.sampled_from(RosLogLevel), words, words)
+@given(stamps_ns, st.sampled_from(RosLogLevel), texts, texts)
 def test_log_lines_are_read_as_written(
     stamp_ns: int, level: RosLogLevel, name: str, text: str
 ) -> None:
     data = pack_log(stamp_ns, level, name, text)
-    for message in (decoded(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
+    for message in (decode_cdr(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
         assert message.stamp.sec * 10**9 + message.stamp.nanosec == stamp_ns
         assert (message.level, message.name, message.msg, message.line) == (
             level,
@@ -150,10 +151,10 @@ def test_log_lines_are_read_as_written(
         )
         assert (message.file, message.function) == ("", "")
     time = type_of("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
-    own = type_of(cdr.LOG)(
+    written = type_of(cdr.LOG)(
         stamp=time, level=level.value, name=name, msg=text, file="", function="", line=0
     )
-    assert data == serialized(cdr.LOG, own)
+    assert data == serialize_cdr(cdr.LOG, written)
 
 
 def test_stamps_beyond_ros_2_become_its_last() -> None:
@@ -163,93 +164,94 @@ def test_stamps_beyond_ros_2_become_its_last() -> None:
     assert message.header.stamp.sec == 2**31 - 1
 
 
-def pose(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
-    point, turn = type_of("geometry_msgs/msg/Point"), type_of("geometry_msgs/msg/Quaternion")
+def make_pose(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
+    point = type_of("geometry_msgs/msg/Point")
+    turn = type_of("geometry_msgs/msg/Quaternion")
     where = type_of("geometry_msgs/msg/Pose")(
         position=point(*numbers[:3]), orientation=turn(*numbers[3:])
     )
-    return type_of("geometry_msgs/msg/PoseStamped")(header=header(stamp_ns, frame), pose=where)
+    return type_of("geometry_msgs/msg/PoseStamped")(
+        header=make_header(stamp_ns, frame), pose=where
+    )
 
 
-def wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
+def make_wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
     vector = type_of("geometry_msgs/msg/Vector3")
     pull = type_of("geometry_msgs/msg/Wrench")(
         force=vector(*numbers[:3]), torque=vector(*numbers[3:])
     )
     return type_of("geometry_msgs/msg/WrenchStamped")(
-        header=header(stamp_ns, frame), wrench=pull
+        header=make_header(stamp_ns, frame), wrench=pull
     )
 
 
-@given(stamps_ns, words, st.lists(floats, min_size=7, max_size=7))
+@given(stamps_ns, texts, st.lists(floats, min_size=7, max_size=7))
 def test_poses_and_wrenches_are_those_of_rosbags(
     stamp_ns: int, frame: str, numbers: list[float]
 ) -> None:
-    for kind, make, count in (("PoseStamped", pose, 7), ("WrenchStamped", wrench, 6)):
+    for kind, make, count in (("PoseStamped", make_pose, 7), ("WrenchStamped", make_wrench, 6)):
         data = cdr.pack_frame_vectors(stamp_ns, frame, *numbers[:count])
-        assert data == serialized(
+        assert data == serialize_cdr(
             f"geometry_msgs/msg/{kind}", make(stamp_ns, frame, numbers[:count])
         )
         named, read = cdr.read_frame_vectors(data, count)
-        assert (named, bits(read)) == (frame, bits(numbers[:count]))
+        assert (named, pack_numbers(read)) == (frame, pack_numbers(numbers[:count]))
 
 
-@given(stamps_ns, words, st.lists(words, max_size=4), st.booleans())
+@given(stamps_ns, texts, st.lists(texts, max_size=4), st.booleans())
 def test_joint_states_of_others_are_read(
     stamp_ns: int, frame: str, names: list[str], moves: bool
 ) -> None:
     speeds = [0.5] * len(names) if moves else []
     message = type_of(cdr.JOINT_STATE)(
-        header=header(stamp_ns, frame),
+        header=make_header(stamp_ns, frame),
         name=names,
         position=np.arange(len(names), dtype=np.float64),
         velocity=np.array(speeds),
         effort=np.zeros(0),
     )
-    found = cdr.read_joint_state(serialized(cdr.JOINT_STATE, message))
-    assert found == (stamp_ns, names, tuple(range(len(names))), tuple(speeds), ())
+    joint_state = cdr.read_joint_state(serialize_cdr(cdr.JOINT_STATE, message))
+    assert joint_state == (stamp_ns, names, tuple(range(len(names))), tuple(speeds), ())
 
 
 @given(
     stamps_ns,
     st.lists(
-        st.tuples(st.integers(0, 3), words, words, st.dictionaries(words, words, max_size=3))
+        st.tuples(st.integers(0, 3), texts, texts, st.dictionaries(texts, texts, max_size=3))
     ),
 )
 def test_diagnostics_are_those_of_rosbags(stamp_ns: int, parts: list[tuple[Any, ...]]) -> None:
-    status, pair = (
-        type_of("diagnostic_msgs/msg/DiagnosticStatus"),
-        type_of("diagnostic_msgs/msg/KeyValue"),
-    )
+    status = type_of("diagnostic_msgs/msg/DiagnosticStatus")
+    pair = type_of("diagnostic_msgs/msg/KeyValue")
     theirs = [
         status(
             level=n,
             name=name,
             message=text,
             hardware_id="",
-            values=[pair(*one) for one in values.items()],
+            values=[pair(*item) for item in values.items()],
         )
         for n, name, text, values in parts
     ]
     kind = "diagnostic_msgs/msg/DiagnosticArray"
-    message = type_of(kind)(header=header(stamp_ns, ""), status=theirs)
-    assert cdr.pack_diagnostics(stamp_ns, [cdr.Diagnosis(*one) for one in parts]) == serialized(
-        kind, message
-    )
+    message = type_of(kind)(header=make_header(stamp_ns, ""), status=theirs)
+    assert cdr.pack_diagnostics(
+        stamp_ns, [cdr.Diagnosis(*part) for part in parts]
+    ) == serialize_cdr(kind, message)
 
 
-@given(st.booleans(), words)
+@given(st.booleans(), texts)
 def test_responses_of_triggers_are_boolean_and_text(success: bool, text: str) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg("bool success\nstring message\n", "std_srvs/msg/Told"))
-    told = store.types["std_srvs/msg/Told"](success=success, message=text)
+    message = store.types["std_srvs/msg/Told"](success=success, message=text)
     assert cdr.pack_trigger_response(success=success, text=text) == bytes(
-        store.serialize_cdr(told, "std_srvs/msg/Told")
+        store.serialize_cdr(message, "std_srvs/msg/Told")
     )
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: b"\0\1\0\0" + rest))
 def test_an_invalid_message_is_a_value_error(data: bytes) -> None:
-    for read in (cdr.read_joint_state, lambda one: cdr.read_frame_vectors(one, 7)):
+    for read in (cdr.read_joint_state, lambda data: cdr.read_frame_vectors(data, 7)):
         with suppress(ValueError):
             read(data)

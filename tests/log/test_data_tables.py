@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.analysis import logs
-from tests.log.dealt import a_file, changed, messages
-from tests.log_editing import edited, opened, recorded
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes, rewrite_log
+from tests.log.split_logs import change_message, make_bytes_of_messages, read_messages
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
@@ -30,11 +30,15 @@ STATE_VECTORS = Layout().lengths()
 
 
 @cache
-def paper() -> Log:
-    return opened(recorded("paper"))
+def make_paper_log() -> Log:
+    return make_log("paper")
 
 
-LOGS = {"paper": paper, "busy": lambda: logs.busy().log, "four": lambda: logs.simulated("four")}
+LOGS = {
+    "paper": make_paper_log,
+    "busy": lambda: make_busy_run().log,
+    "four": lambda: make_short_log("four"),
+}
 
 
 @pytest.mark.parametrize("which", LOGS)
@@ -63,9 +67,9 @@ def test_column_names_are_unique_with_units(which: str) -> None:
     ],
 )
 def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:
-    """In virtual time nothing is under way: a sample's delay there is no network's."""
-    table = build_arrivals_table(paper()["m1"], "run.mcap", live=live)
-    (delay,) = (one for one in table.columns if one.name == "delay_us")
+    """In virtual time the delay of a sample is not that of a network."""
+    table = build_arrivals_table(make_paper_log()["m1"], "run.mcap", live=live)
+    (delay,) = (column for column in table.columns if column.name == "delay_us")
     assert delay.meaning.startswith(said)
 
 
@@ -116,14 +120,14 @@ def test_arrival_rows_equal_a_records_list(which: str) -> None:
 
 
 def test_a_row_of_statistics_is_its_message() -> None:
-    log = logs.busy().log
+    log = make_busy_run().log
     stats = LinkStats(
         v=3, site="a", boot=1, tick=20, t_ns=100_000_000, mode="hold", accepted={"b": 4, "c": 5}, late={},
         age_us={"b": -1, "c": 7}, duplicate={}, refused={}, dropped={"not finite": 2, "malformed": 1},
         late_max_us=8, busy_max_us=9, overruns=10, offset_us={"b": -1}, delay_us={"b": -1, "c": 12},
     )  # fmt: skip
     later = msgspec.structs.replace(stats, tick=40, dropped={})
-    table = logs.rewritten(log, keep=lambda s: s.tick < 3, others=[later, stats]).table(
+    table = rewrite_log(log, keep=lambda s: s.tick < 3, others=[later, stats]).table(
         "a", "link"
     )
     first = {column.name: column.rows(0, 1)[0] for column in table.columns}
@@ -147,8 +151,8 @@ def test_a_row_of_statistics_is_its_message() -> None:
 
 
 def test_empty_statistics_have_the_same_columns() -> None:
-    some = opened(recorded("paper"))
-    none = opened(a_file(recorded("paper"), []))
+    some = make_log("paper")
+    none = open_bytes(make_bytes_of_messages(make_log_bytes("paper"), []))
     for kind in ("state", "link", "arrivals"):
         assert [c.name for c in none.table("m1", kind).columns] == [
             c.name for c in some.table("m1", kind).columns
@@ -158,12 +162,12 @@ def test_empty_statistics_have_the_same_columns() -> None:
 
 
 def test_events_are_in_their_order_of_arrival() -> None:
-    log = paper()
-    told = [
+    log = make_paper_log()
+    events = [
         Event(member="s", boot=2**64 - 1, kind="epoch", text="an epoch", boots={"m1": 5}, n=0),
         Event(member="m1", boot=1, kind="mode", text="holds, and says so", t_ns=7_000_000, n=0),
     ]
-    table = logs.rewritten(log, keep=lambda s: s.tick < 2, others=told).table("events")
+    table = rewrite_log(log, keep=lambda s: s.tick < 2, others=events).table("events")
     rows = {column.name: column.rows(0, 2) for column in table.columns}
     assert table.label == "events"
     assert sorted(zip(rows["member"], rows["t_s"], rows["boot"], strict=True)) == [
@@ -171,13 +175,15 @@ def test_events_are_in_their_order_of_arrival() -> None:
         ("s", None, 2**64 - 1),
     ]
     assert sorted(rows["boots"]) == ["", '{"m1": 5}']
-    every = messages(recorded("paper"))
+    every = read_messages(make_log_bytes("paper"))
     ends = [m for m in every if m[0].endswith("/event")]
     late = [
         (topic, payload, 10**9 - n, sent, number)
         for n, (topic, payload, _, sent, number) in enumerate(ends)
     ]
-    assert opened(a_file(recorded("paper"), late)).table("events")["member"].rows(0, 3) == [
+    assert open_bytes(make_bytes_of_messages(make_log_bytes("paper"), late)).table("events")[
+        "member"
+    ].rows(0, 3) == [
         "s",
         "m2",
         "m1",
@@ -185,7 +191,7 @@ def test_events_are_in_their_order_of_arrival() -> None:
 
 
 def test_missing_tables_name_the_existing_ones() -> None:
-    log = paper()
+    log = make_paper_log()
     with pytest.raises(KeyError, match="m1, m2, s"):
         log.table("m3")
     with pytest.raises(KeyError, match="state, link, arrivals"):
@@ -195,7 +201,9 @@ def test_missing_tables_name_the_existing_ones() -> None:
 
 
 def test_arrivals_of_missing_peers_are_refused() -> None:
-    log = opened(edited(recorded("paper"), record=lambda r: {**r, "rx": [[5, 0, 0]]}))
+    log = open_bytes(
+        edit_log_bytes(make_log_bytes("paper"), record=lambda r: {**r, "rx": [[5, 0, 0]]})
+    )
     with pytest.raises(
         LogError, match="record of m1 lists a sample from a site that is not a peer"
     ):
@@ -203,9 +211,13 @@ def test_arrivals_of_missing_peers_are_refused() -> None:
 
 
 def test_numbers_beyond_64_bits_are_refused() -> None:
-    every = messages(recorded("paper"))
+    every = read_messages(make_log_bytes("paper"))
     event = next(m for m in every if m[0].endswith("/event"))
-    log = opened(a_file(recorded("paper"), [changed(event, ticks=2**64 - 1)]))
+    log = open_bytes(
+        make_bytes_of_messages(
+            make_log_bytes("paper"), [change_message(event, ticks=2**64 - 1)]
+        )
+    )
     with pytest.raises(LogError, match="ticks has a number that is out of range"):
         log.table("events")
 
@@ -224,8 +236,9 @@ def test_missing_numbers_in_columns_are_nan() -> None:
     ("name", "kind"), [("a", ""), ("a", "link"), ("b", "arrivals"), ("events", "")]
 )
 def test_a_frame_is_its_table(name: str, kind: str) -> None:
-    log = logs.busy().log
-    table, frame = log.table(name, kind), log.frame(name, kind)
+    log = make_busy_run().log
+    table = log.table(name, kind)
+    frame = log.frame(name, kind)
     assert frame.columns == [column.name for column in table.columns]
     assert frame.height == len(table)
     for column in table.columns:
@@ -246,7 +259,7 @@ def test_missing_frame_libraries_name_their_installation(
     monkeypatch.setitem(sys.modules, library, None)
     hint = f"data frames need {library}: {format_extra_install('frames')}"
     with pytest.raises(UsageError, match=re.escape(hint)):
-        frame(opened(recorded("paper")))
+        frame(make_log("paper"))
 
 
 ENDINGS = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}

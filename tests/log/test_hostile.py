@@ -20,8 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from tests.log.hostility import CHANGES, chunk, mangled, read_by_all
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes, write_log
+from tests.log.hostility import CHANGES, make_chunk, mangle_log, read_by_all
 from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.verification import verify
@@ -29,8 +29,8 @@ from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_c
 from trilat_net.scenario import load_scenario, parse_embedded
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
-DATA = edited(recorded("paper", SHORT), chunk_bytes=4096)
-WHOLE = recorded("paper", SHORT)
+DATA = edit_log_bytes(make_log_bytes("paper", SHORT), chunk_bytes=4096)
+WHOLE = make_log_bytes("paper", SHORT)
 MEMORY_MIB = 256
 
 
@@ -53,19 +53,20 @@ def test_any_change_gets_a_sentence_as_answer(
 def test_several_changes_get_an_answer(seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "changed.mcap"
-        path.write_bytes(mangled(DATA, random.Random(seed)))
+        path.write_bytes(mangle_log(DATA, random.Random(seed)))
         read_by_all(path)
 
 
-def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
+def _make_file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
     """A log of a mebibyte whose site m1 has these records, and as many of them as a reader may be given."""
-    log = edited(
+    log = edit_log_bytes(
         WHOLE,
         scenario=lambda text: text.replace("duration_s = 0.04", f"duration_s = {seconds}"),
     )
     framing = RecordScanner(io.BytesIO(log))
     first = next(frame for frame in framing.frames() if frame.opcode == Opcode.CHUNK)
-    inside, names = unpack_chunk(framing.content(first)), b""
+    inside = unpack_chunk(framing.content(first))
+    names = b""
     channel = 0
     for opcode, begin, end in iterate_records(inside):
         if opcode != Opcode.MESSAGE:
@@ -79,14 +80,15 @@ def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> byte
         for _, payload in zip(range(most), messages, strict=False)
     ]
     packed = [
-        chunk(names + b"".join(records[k : k + 20_000])) for k in range(0, len(records), 20_000)
+        make_chunk(names + b"".join(records[k : k + 20_000]))
+        for k in range(0, len(records), 20_000)
     ]
     return (
         log[: first.offset] + struct.pack("<BQ", 9, len(content)) + content + b"".join(packed)
     )
 
 
-def _records(**fields: Any) -> Iterator[bytes]:
+def _make_records(**fields: Any) -> Iterator[bytes]:
     """Records of m1 that are valid, small, and say what is given besides."""
     zeros = {"q": 2, "qd": 2, "q_des": 2, "qd_des": 2, "tau": 2, "tau_x": 2, "theta_hat": 5}
     about = {
@@ -111,10 +113,10 @@ def _records(**fields: Any) -> Iterator[bytes]:
 
 
 HUGE: dict[str, Callable[[], bytes]] = {
-    "records that take in what nobody sent": lambda: _file(
-        _records(rx=[[0, 0, 0]] * 30), 23_000
+    "records that take in what nobody sent": lambda: _make_file(
+        _make_records(rx=[[0, 0, 0]] * 30), 23_000
     ),
-    "messages without a byte": lambda: _file(iter(lambda: b"", None), 100_000),
+    "messages without a byte": lambda: _make_file(iter(lambda: b"", None), 100_000),
 }
 
 
@@ -125,8 +127,7 @@ HUGE: dict[str, Callable[[], bytes]] = {
 )
 def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None:
     """Peak resident memory of a process that reads such a file in every way, the interpreter and all."""
-    path = tmp_path / "huge.mcap"
-    path.write_bytes(HUGE[kind]())
+    path = write_log(tmp_path, HUGE[kind](), "huge.mcap")
     assert path.stat().st_size < 1.3 * 2**20
     program = (
         "import sys; from pathlib import Path\n"
@@ -149,8 +150,10 @@ def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None
 
 def test_ticks_outside_the_scenario_are_refused() -> None:
     """Nobody counts up to a number that a stranger wrote, nor keeps a place for every one before it."""
-    data = edited(DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r)
-    log = opened(data)
+    data = edit_log_bytes(
+        DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r
+    )
+    log = open_bytes(data)
     with pytest.raises(
         LogError,
         match=r"has a record of tick 1099511627775, but the scenario has only 40\d* ticks",
@@ -159,7 +162,7 @@ def test_ticks_outside_the_scenario_are_refused() -> None:
 
 
 def test_claims_of_endless_ticks_are_refused() -> None:
-    log = opened(edited(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
+    log = open_bytes(edit_log_bytes(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
     endless = [
         msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events
     ]
@@ -229,6 +232,6 @@ def test_json_is_always_finite(tmp_path: Path) -> None:
     """What a machine is told can be read by it, whatever the file says."""
     path = tmp_path / "strange.mcap"
     path.write_bytes(
-        edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62})
+        edit_log_bytes(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62})
     )
     json.dumps(info(path).facts, allow_nan=False)

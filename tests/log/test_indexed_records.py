@@ -31,14 +31,14 @@ numbers = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: x / 64)
 
 
 @st.composite
-def whole(draw: st.DrawFn, least: int = -(2**58), most: int = 2**58) -> int:
+def draw_integer(draw: st.DrawFn, least: int = -(2**58), most: int = 2**58) -> int:
     bits = draw(sizes)
     number = draw(st.integers(-(2**bits) - 2, 2**bits + 2))
     return min(max(number, least), most)
 
 
 @st.composite
-def written(draw: st.DrawFn, layout: Layout) -> bytes:
+def draw_payload(draw: st.DrawFn, layout: Layout) -> bytes:
     """A record as a site writes it."""
     lengths = layout.lengths()
     vectors = {
@@ -46,14 +46,17 @@ def written(draw: st.DrawFn, layout: Layout) -> bytes:
         for name, count in lengths.items()
     }
     arrivals = draw(
-        st.lists(st.tuples(st.integers(0, 40), whole(0, 2**40 - 1), whole()), max_size=20)
+        st.lists(
+            st.tuples(st.integers(0, 40), draw_integer(0, 2**40 - 1), draw_integer()),
+            max_size=20,
+        )
     )
     record = TickRecord(
-        tick=draw(whole(0, 2**40 - 1)),
-        t_ns=draw(whole()),
+        tick=draw(draw_integer(0, 2**40 - 1)),
+        t_ns=draw(draw_integer()),
         mode=draw(st.sampled_from(list(Mode))),
-        used=[draw(whole()) for _ in PEERS],
-        rx_crc=draw(whole(0, 2**32 - 1)),
+        used=[draw(draw_integer()) for _ in PEERS],
+        rx_crc=draw(draw_integer(0, 2**32 - 1)),
         cmd=draw(st.lists(st.sampled_from(["{}", "x" * 40, "y" * 300]), max_size=2)),
         mem=draw(st.lists(numbers, max_size=20)),
         **vectors,
@@ -64,14 +67,16 @@ def written(draw: st.DrawFn, layout: Layout) -> bytes:
         peers=PEERS,
         output=record,
         arrivals=[Arrival(peer, tick, (), (), latency) for peer, tick, latency in arrivals],
-        late_us=draw(whole()),
-        busy_us=draw(whole()),
-        sent_ns=draw(whole()),
-        echo=draw(st.lists(st.tuples(whole(), whole(), whole()), max_size=3)),
+        late_us=draw(draw_integer()),
+        busy_us=draw(draw_integer()),
+        sent_ns=draw(draw_integer()),
+        echo=draw(
+            st.lists(st.tuples(draw_integer(), draw_integer(), draw_integer()), max_size=3)
+        ),
     )
 
 
-def indexed(payloads: list[bytes], layout: Layout) -> IndexedRecords | None:
+def index_payloads(payloads: list[bytes], layout: Layout) -> IndexedRecords | None:
     return index_records(PackedMessages.pack(payloads), "m1", PEERS, layout)
 
 
@@ -86,9 +91,9 @@ def assert_equal_columns(
     for field, rows in records.vectors([*layout.lengths(), "wrench"]).items():
         assert rows.shape == expected[field].shape
         assert rows.tobytes() == expected[field].tobytes()
-    words = records.vector_words(list(layout.columns()))
+    vector_words = records.vector_words(list(layout.columns()))
     joined = np.concatenate([expected[field] for field in layout.columns()], axis=1)
-    assert words.tobytes() == joined.tobytes()
+    assert vector_words.tobytes() == joined.tobytes()
     used = record_columns.decode_per_peer(payloads, "used", PEERS, -1)
     assert records.used.T.tolist() == [used[peer].tolist() for peer in PEERS]
     for mine, theirs in zip(
@@ -109,8 +114,8 @@ def assert_equal_columns(
 @settings(max_examples=25)
 @given(data=st.data())
 def test_written_records_are_read_without_decoding(layout: Layout, data: st.DataObject) -> None:
-    payloads = data.draw(st.lists(written(layout), min_size=1, max_size=4))
-    records = indexed(payloads, layout)
+    payloads = data.draw(st.lists(draw_payload(layout), min_size=1, max_size=4))
+    records = index_payloads(payloads, layout)
     assert records is not None
     assert_equal_columns(payloads, records, layout)
     order = np.arange(len(payloads))[::-1]
@@ -124,7 +129,7 @@ def test_a_changed_record_is_decoded_alike_or_left(
     layout: Layout, data: st.DataObject, seed: int
 ) -> None:
     """Many bytes of a record are changed, one or a few at a time."""
-    payload = data.draw(written(layout))
+    payload = data.draw(draw_payload(layout))
     draws = random.Random(seed)
     for _ in range(60):
         changed = bytearray(payload)
@@ -139,7 +144,7 @@ def test_a_changed_record_is_decoded_alike_or_left(
                     del changed[place]
                 case _:
                     changed.insert(place, draws.randrange(256))
-        records = indexed([bytes(changed)], layout)
+        records = index_payloads([bytes(changed)], layout)
         if records is None:
             continue
         try:
@@ -154,7 +159,7 @@ GOOD = TickRecord(
 )  # fmt: skip
 
 
-def fields() -> dict[str, object]:
+def decode_good_record() -> dict[str, object]:
     payload = encode_state("m1", 1, PEERS, GOOD, [], 0, 0)
     return dict(msgspec.msgpack.decode(payload))
 
@@ -189,12 +194,12 @@ def fields() -> dict[str, object]:
     ],
 )
 def test_an_unusual_record_is_left_to_the_decoders(change: dict[str, object]) -> None:
-    good = msgspec.msgpack.encode(fields())
-    assert indexed([good], Layout()) is not None
-    unusual = msgspec.msgpack.encode({**fields(), **change})
-    assert indexed([good, unusual], Layout()) is None
+    good = msgspec.msgpack.encode(decode_good_record())
+    assert index_payloads([good], Layout()) is not None
+    unusual = msgspec.msgpack.encode({**decode_good_record(), **change})
+    assert index_payloads([good, unusual], Layout()) is None
 
 
 def test_reordered_fields_are_left_to_the_decoders() -> None:
-    turned = dict(reversed(fields().items()))
-    assert indexed([msgspec.msgpack.encode(turned)], Layout()) is None
+    turned = dict(reversed(decode_good_record().items()))
+    assert index_payloads([msgspec.msgpack.encode(turned)], Layout()) is None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.log_editing import edited
+from tests.log.builders import edit_log_bytes
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at, tick_ns
 from trilat_net.execution import virtual
@@ -34,7 +34,7 @@ def delay_us(peer: str, site: str, tick: int) -> int:
     return -500 if (peer, tick) == ("m1", 40) else int(drawn)
 
 
-def log_bytes() -> bytes:
+def make_delayed_bytes() -> bytes:
     """A session in which every sample of every link but the lost ones came after its known delay."""
     scenario = load_scenario("paper", OVERRIDES)
     peers = {name: scenario.peers(name) for name in scenario.names}
@@ -58,7 +58,7 @@ def log_bytes() -> bytes:
 
 @pytest.fixture(scope="module")
 def data() -> bytes:
-    return log_bytes()
+    return make_delayed_bytes()
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def test_executed_scenarios_do_not_need_the_log(path: Path) -> None:
 def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> None:
     """A gap in the receiver's records hides arrivals: those samples are unknown, not lost."""
     path.write_bytes(
-        edited(
+        edit_log_bytes(
             data, record=lambda r: None if r["site"] == "s" and 200 <= r["tick"] < 220 else r
         )
     )
@@ -153,7 +153,7 @@ def test_links_without_arrivals_have_no_delays(data: bytes, path: Path) -> None:
     def silent(record: dict[str, Any]) -> dict[str, Any]:
         return {**record, "rx": [entry for entry in record["rx"] if entry[0] != 0]}
 
-    path.write_bytes(edited(data, record=silent))
+    path.write_bytes(edit_log_bytes(data, record=silent))
     with pytest.raises(ValueError, match="no sample arrived over m1->s"):
         read_link_delays(path, "m1->s")
 
@@ -171,7 +171,7 @@ def test_losses_at_both_ends_of_a_log_count(data: bytes, path: Path) -> None:
             ]
         return record
 
-    path.write_bytes(edited(data, record=cut))
+    path.write_bytes(edit_log_bytes(data, record=cut))
     delay_ms = {round(t_s * 1000): ms for t_s, ms in read_link_delays(path, "m1->s")}
     known = TICKS - 41
     assert min(delay_ms) == 10

@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
+from tests.log.disks import begin_container, draw_messages, open_file_on
 from trilat_net.errors import LogRefused, NothingSaved, UsageError
 from trilat_net.log import log_file
 from trilat_net.log.log_file import (
@@ -28,14 +29,14 @@ from trilat_net.log.log_file import (
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.recovery import recover
 
-from .disks import Sent, SmallDisk, begun, file_on, sent
+from .disks import Sent, SmallDisk
 
 in_this_folder = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30
 )
 
 
-def messages(path: Path) -> list[Sent]:
+def read_messages(path: Path) -> list[Sent]:
     with path.open("rb") as stream:
         return [
             (m.channel_id, m.log_time, m.data, m.publish_time, m.sequence)
@@ -51,30 +52,32 @@ def messages(path: Path) -> list[Sent]:
 def test_logs_are_renamed_when_whole(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogFile(path) as file:
-        container = begun(file)
+        container = begin_container(file)
         container.add_message(1, 0, b"x", 0)
         container.flush()
         assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap.active"]
         container.finish()
         assert not path.exists()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
-    assert messages(path) == [(1, 0, b"x", 0, 0)]
+    assert read_messages(path) == [(1, 0, b"x", 0, 0)]
 
 
 def test_only_flushed_data_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     file = LogFile(path)
-    container = begun(file)
-    for n, message in enumerate(sent(5)):
+    container = begin_container(file)
+    for n, message in enumerate(draw_messages(5)):
         container.add_message(*message)
         before = active_path(path).stat().st_size
         assert before == file.size
         container.flush()
         assert active_path(path).stat().st_size > before
         with active_path(path).open("rb") as stream:
-            found = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
+            records = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
         assert (
-            sum(isinstance(record, Message) for record in found) == container.messages == n + 1
+            sum(isinstance(record, Message) for record in records)
+            == container.messages
+            == n + 1
         )
     file.close()
 
@@ -84,7 +87,7 @@ def test_unfinished_logs_keep_their_temporary_name(tmp_path: Path) -> None:
 
     def fail() -> None:
         with LogFile(path) as file:
-            begun(file).add_message(1, 0, b"x", 0)
+            begin_container(file).add_message(1, 0, b"x", 0)
             _ = 1 / 0
 
     with pytest.raises(ZeroDivisionError):
@@ -98,7 +101,7 @@ def test_unfinished_logs_keep_their_temporary_name(tmp_path: Path) -> None:
     ):
         pass
     with LogFile(path, force=True) as file:
-        begun(file).finish()
+        begin_container(file).finish()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
 
@@ -119,10 +122,10 @@ def test_existing_logs_are_replaced_by_whole_ones(tmp_path: Path) -> None:
     ):
         pass
     with LogFile(path, force=True) as file:
-        container = begun(file)
+        container = begin_container(file)
         assert path.read_bytes() == b"precious"
         container.finish()
-    assert messages(path) == []
+    assert read_messages(path) == []
 
 
 def test_names_taken_meanwhile_are_left_alone(tmp_path: Path) -> None:
@@ -130,7 +133,7 @@ def test_names_taken_meanwhile_are_left_alone(tmp_path: Path) -> None:
 
     def write() -> None:
         with LogFile(path) as file:
-            begun(file).finish()
+            begin_container(file).finish()
             path.write_bytes(b"precious")
 
     with pytest.raises(
@@ -138,7 +141,7 @@ def test_names_taken_meanwhile_are_left_alone(tmp_path: Path) -> None:
     ):
         write()
     assert path.read_bytes() == b"precious"
-    assert messages(active_path(path)) == []
+    assert read_messages(active_path(path)) == []
 
 
 def test_logs_open_elsewhere_are_kept_as_on_windows(
@@ -153,7 +156,7 @@ def test_logs_open_elsewhere_are_kept_as_on_windows(
 
     def make() -> None:
         with LogFile(path, force=True) as file:
-            begun(file).finish()
+            begin_container(file).finish()
 
     monkeypatch.setattr(Path, "replace", refuse)
     with pytest.raises(
@@ -161,7 +164,7 @@ def test_logs_open_elsewhere_are_kept_as_on_windows(
     ):
         make()
     assert path.read_bytes() == b"earlier"
-    assert messages(active_path(path)) == []
+    assert read_messages(active_path(path)) == []
 
 
 def test_without_hard_links_logs_get_their_name(
@@ -172,7 +175,7 @@ def test_without_hard_links_logs_get_their_name(
 
     monkeypatch.setattr(os, "link", link)
     with LogFile(tmp_path / "run.mcap") as file:
-        begun(file).finish()
+        begin_container(file).finish()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap"]
 
 
@@ -195,23 +198,23 @@ def little_margin(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_slow_disks_take_everything(count: int, most: int, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
-    wanted = sent(count)
-    with file_on(SmallDisk(1 << 20, most=most), path) as file:
-        container = begun(file)
+    wanted = draw_messages(count)
+    with open_file_on(SmallDisk(1 << 20, most=most), path) as file:
+        container = begin_container(file)
         for message in wanted:
             container.add_message(*message)
         container.finish()
-    assert messages(path) == wanted
+    assert read_messages(path) == wanted
 
 
 CHUNK = 5
 
 
-def recorded(file: LogFile, wanted: list[Sent], flushed: list[Sent]) -> None:
+def write_until_full(file: LogFile, wanted: list[Sent], flushed: list[Sent]) -> None:
     """Writes messages until the disk refuses, then the end, as a recorder does; notes what was flushed."""
     container = None
     try:
-        container = begun(file)
+        container = begin_container(file)
         for n, message in enumerate(wanted, 1):
             container.add_message(*message)
             if n % CHUNK == 0:
@@ -230,22 +233,22 @@ def recorded(file: LogFile, wanted: list[Sent], flushed: list[Sent]) -> None:
 def test_logs_end_in_order_at_full_disks(tmp_path: Path) -> None:
     """At every byte of a chunk: the file is whole, with the chunk that did not fit any more."""
     path = tmp_path / "run.mcap"
-    wanted = sent(60 * CHUNK)
+    wanted = draw_messages(60 * CHUNK)
     seen = set()
     for capacity in range(4000, 7000, 17):
         disk = SmallDisk(capacity)
         flushed: list[Sent] = []
-        with pytest.raises(LogRefused) as refusal, file_on(disk, path) as file:
-            recorded(file, wanted, flushed)
+        with pytest.raises(LogRefused) as refusal, open_file_on(disk, path) as file:
+            write_until_full(file, wanted, flushed)
         text = str(refusal.value)
         assert refusal.value.exit_code == 5
         assert f"{path}: the disk is full; the log ends there, finished" in text
         assert "make room" in text
-        found = messages(path)
-        assert found == wanted[: len(flushed) + CHUNK]
-        assert f"{len(found)} other messages" in text
+        stored = read_messages(path)
+        assert stored == wanted[: len(flushed) + CHUNK]
+        assert f"{len(stored)} other messages" in text
         assert not active_path(path).exists()
-        seen.add(len(found))
+        seen.add(len(stored))
         path.unlink()
     assert len(seen) > 4  # the chunk that did not fit was not always the same
 
@@ -255,9 +258,9 @@ def test_logs_end_in_order_at_full_disks(tmp_path: Path) -> None:
 def test_without_room_whole_chunks_are_kept(error: int, tmp_path: Path) -> None:
     """At every byte of a chunk and of the end: cut where the last flush ended."""
     path = tmp_path / "run.mcap"
-    wanted = sent(3 * CHUNK)
-    with file_on(SmallDisk(1 << 20), path) as file:
-        recorded(file, wanted, [])
+    wanted = draw_messages(3 * CHUNK)
+    with open_file_on(SmallDisk(1 << 20), path) as file:
+        write_until_full(file, wanted, [])
     whole = path.stat().st_size
     path.unlink()
     head = 200
@@ -265,8 +268,8 @@ def test_without_room_whole_chunks_are_kept(error: int, tmp_path: Path) -> None:
         active_path(path).unlink(missing_ok=True)
         disk = SmallDisk(capacity, error)
         flushed: list[Sent] = []
-        with pytest.raises(LogRefused) as refusal, file_on(disk, path, room=False) as file:
-            recorded(file, wanted, flushed)
+        with pytest.raises(LogRefused) as refusal, open_file_on(disk, path, room=False) as file:
+            write_until_full(file, wanted, flushed)
         assert refusal.value.exit_code == 5
         assert not path.exists()
         assert active_path(path).stat().st_size == file.size
@@ -276,15 +279,15 @@ def test_without_room_whole_chunks_are_kept(error: int, tmp_path: Path) -> None:
                 recover(active_path(path))
             continue
         assert recover(active_path(path)).lossless
-        assert messages(path) == flushed
+        assert read_messages(path) == flushed
         path.unlink()
 
 
 def test_room_is_kept_for_pending_and_end(tmp_path: Path) -> None:
     disk = SmallDisk(10 << 20)
-    file = file_on(disk, tmp_path / "run.mcap")
-    container = begun(file)
-    for message in sent(500):
+    file = open_file_on(disk, tmp_path / "run.mcap")
+    container = begin_container(file)
+    for message in draw_messages(500):
         container.add_message(*message)
     before = file.size
     container.flush()
@@ -350,8 +353,10 @@ def test_largest_files_are_cut_and_recovered(tmp_path: Path) -> None:
     assert f"{active_path(path)}: the file system takes no longer file" in done.stdout
     assert "split_size" in done.stdout
     assert recover(active_path(path)).lossless
-    assert [message[1] for message in messages(path)] == list(range(len(messages(path))))
-    assert len(messages(path)) > 900
+    assert [message[1] for message in read_messages(path)] == list(
+        range(len(read_messages(path)))
+    )
+    assert len(read_messages(path)) > 900
 
 
 # Loss of power.
@@ -386,14 +391,14 @@ def test_disks_that_lose_accepted_data_end_logs(
 
     def write() -> None:
         with LogFile(path, now_ns=times_ns.__next__) as file:
-            recorded(file, sent(100), [])
+            write_until_full(file, draw_messages(100), [])
 
     with pytest.raises(
         LogRefused, match="the disk fails; the log ends there, finished, with"
     ) as refusal:
         write()
     assert refusal.value.exit_code == 5
-    assert 0 < len(messages(path)) < 100
+    assert 0 < len(read_messages(path)) < 100
 
 
 # The death of a process.
@@ -416,13 +421,14 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_flushed_data_survives_a_kill(tmp_path: Path) -> None:
-    path, count = tmp_path / "run.mcap", 100
+    path = tmp_path / "run.mcap"
+    count = 100
     done = subprocess.run(
         [sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
     result = recover(active_path(path))
     assert result.lossless
-    assert [message[2] for message in messages(path)] == [
+    assert [message[2] for message in read_messages(path)] == [
         b"%d" % n for n in range(count // 7 * 7)
     ]

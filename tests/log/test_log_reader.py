@@ -11,8 +11,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tests.log.dealt import foreign
-from tests.log_editing import edited, opened, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
+from tests.log.split_logs import make_foreign_bytes
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
@@ -38,15 +38,15 @@ def test_equal_virtual_runs_are_the_same_file(name: str) -> None:
 
 
 def test_another_seed_is_another_file() -> None:
-    assert recorded("paper", {"duration_s": 0.05}) != recorded(
+    assert make_log_bytes("paper", {"duration_s": 0.05}) != make_log_bytes(
         "paper", {"duration_s": 0.05, "seed": 2}
     )
 
 
 def test_virtual_logs_have_no_path_or_clock() -> None:
-    data = edited(recorded("paper"))
+    data = edit_log_bytes(make_log_bytes("paper"))
     assert str(Path(__file__).parents[2]).encode() not in data
-    for _, _, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
+    for _, _, message in make_reader(io.BytesIO(make_log_bytes("paper"))).iter_messages():
         assert message.log_time == message.publish_time < 10**9
 
 
@@ -64,7 +64,7 @@ def test_plain_readers_find_every_payload_byte() -> None:
         )
         for site, arrivals, output in virtual.execute_virtual(scenario)
     }
-    reader = make_reader(io.BytesIO(recorded("paper")), validate_crcs=True)
+    reader = make_reader(io.BytesIO(make_log_bytes("paper")), validate_crcs=True)
     found = 0
     for schema, channel, message in reader.iter_messages():
         assert schema is not None
@@ -111,7 +111,9 @@ def required_and_typed(schema: dict, value: object) -> None:
 
 def test_every_message_is_one_that_its_schema_allows() -> None:
     kinds = set()
-    for schema, channel, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
+    for schema, channel, message in make_reader(
+        io.BytesIO(make_log_bytes("paper"))
+    ).iter_messages():
         assert schema is not None
         required_and_typed(json.loads(schema.data), msgpack.unpackb(message.data))
         kinds.add(channel.topic.rpartition("/")[2])
@@ -119,7 +121,7 @@ def test_every_message_is_one_that_its_schema_allows() -> None:
 
 
 def test_files_hold_session_scenario_and_accounts() -> None:
-    reader = make_reader(io.BytesIO(recorded("paper")))
+    reader = make_reader(io.BytesIO(make_log_bytes("paper")))
     metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
     session = metadata["trilat.session"]
     scenario = load_scenario("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
@@ -148,7 +150,7 @@ def test_session_and_scenario_precede_the_first_message() -> None:
     """So that they survive a crash right after the start."""
     stream = io.BytesIO()
     LogWriter(stream, load_scenario("free"), "lab", "live", 10**18, collect_provenance())
-    log = opened(stream.getvalue())
+    log = open_bytes(stream.getvalue())
     assert log.scenario == load_scenario("free")
     assert (log.driver, log.complete, log.accounts) == ("live", False, {})
     assert len(log["m1"]) == 0
@@ -176,7 +178,7 @@ def test_a_live_log_counts_from_its_epoch() -> None:
 
 
 def test_the_reader_gives_arrays_with_time() -> None:
-    log = opened(recorded("paper"))
+    log = open_bytes(make_log_bytes("paper"))
     assert log.sites == ("m1", "m2", "s")
     assert log.complete
     m1 = log["m1"]
@@ -203,11 +205,11 @@ def test_the_reader_gives_arrays_with_time() -> None:
 
 def test_cut_files_open_as_far_as_whole() -> None:
     """It says that it is not complete, or is refused; nothing else comes out."""
-    data = edited(recorded("paper"), chunk_bytes=4096)
+    data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=4096)
     before = 0
     for end in range(0, len(data), len(data) // 60):
         try:
-            log = opened(data[:end])
+            log = open_bytes(data[:end])
             records = len(log["m1"].states)
         except LogError:
             continue
@@ -215,12 +217,12 @@ def test_cut_files_open_as_far_as_whole() -> None:
         assert records >= before
         before = records
     assert before == TICKS
-    assert opened(data).complete
+    assert open_bytes(data).complete
 
 
 def test_an_mcap_file_of_others_is_refused() -> None:
     with pytest.raises(LogError, match=r"not a log of trilat-net"):
-        opened(foreign())
+        open_bytes(make_foreign_bytes())
 
 
 def test_mcap_files_using_our_names_are_refused() -> None:
@@ -233,15 +235,16 @@ def test_mcap_files_using_our_names_are_refused() -> None:
     )
     writer.finish()
     with pytest.raises(LogError):
-        len(opened(stream.getvalue())["m1"])
+        len(open_bytes(stream.getvalue())["m1"])
 
 
 def test_unreadable_events_are_omitted() -> None:
     """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
-    whole = opened(recorded("paper"))
-    odd = opened(
-        edited(
-            recorded("paper"), event=lambda payload: b"\xc1" if b"m1" in payload else payload
+    whole = open_bytes(make_log_bytes("paper"))
+    odd = open_bytes(
+        edit_log_bytes(
+            make_log_bytes("paper"),
+            event=lambda payload: b"\xc1" if b"m1" in payload else payload,
         )
     )
     assert np.array_equal(odd["m1"].q, whole["m1"].q)
@@ -263,4 +266,4 @@ def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
 
 def test_logs_with_empty_scenarios_are_refused() -> None:
     with pytest.raises(LogError, match="scenario"):
-        opened(edited(recorded("paper"), scenario=lambda _: ""))
+        open_bytes(edit_log_bytes(make_log_bytes("paper"), scenario=lambda _: ""))

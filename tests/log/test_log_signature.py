@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from tests.cli.running import trilat
-from tests.log_editing import edited, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes, write_log
 from trilat_net.errors import LogError, LogRefused, UsageError
 from trilat_net.log.log_signature import check_signatures, create_signing_keys, sign_log
 from trilat_net.log.mcap_reader import McapReader
@@ -28,31 +28,30 @@ from trilat_net.log.recovery import recover
 @pytest.fixture
 def signed(tmp_path: Path) -> tuple[Path, Path]:
     """A signed log, and the public key."""
-    path = tmp_path / "run.mcap"
-    path.write_bytes(recorded("paper"))
+    path = write_log(tmp_path, make_log_bytes("paper"))
     private, public = create_signing_keys(tmp_path / "lab")
     assert private.stat().st_mode & 0o777 == 0o600
     assert sign_log(path, private) == tmp_path / "run.mcap.sig"
     return path, public
 
 
-def problem(path: Path, key: Path) -> str:
-    found = check_signatures([path], key)
-    assert found.passed == (not found.places)
-    return "" if found.passed else found.text
+def find_problem(path: Path, key: Path) -> str:
+    report = check_signatures([path], key)
+    assert report.passed == (not report.places)
+    return "" if report.passed else report.text
 
 
 def test_signatures_hold_without_touching_the_log(signed: tuple[Path, Path]) -> None:
     path, key = signed
-    assert path.read_bytes() == recorded("paper")
-    assert problem(path, key) == ""
+    assert path.read_bytes() == make_log_bytes("paper")
+    assert find_problem(path, key) == ""
 
 
 def test_signatures_follow_rfc_8032_over_digests(signed: tuple[Path, Path]) -> None:
     """The file is enough for any other program: the bytes that are signed are made of it alone."""
     path, key = signed
     stated = json.loads(path.with_name("run.mcap.sig").read_text())
-    reader = McapReader(io.BytesIO(recorded("paper")), "log")
+    reader = McapReader(io.BytesIO(make_log_bytes("paper")), "log")
     list(reader.messages())
     assert stated["chain"] == reader.metadata["trilat.chain"]
     text = json.dumps(stated["chain"], sort_keys=True, separators=(",", ":"))
@@ -68,9 +67,11 @@ def test_any_change_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) 
     path, key = signed
     file = path.with_name("run.mcap.sig")
     stated = json.loads(file.read_text())
-    other = recorded("paper", {"seed": 2, "duration_s": 0.05})
+    other = make_log_bytes("paper", {"seed": 2, "duration_s": 0.05})
     if what == "log":
-        path.write_bytes(edited(recorded("paper"), record=lambda r: {**r, "q": [0.0, 0.0]}))
+        path.write_bytes(
+            edit_log_bytes(make_log_bytes("paper"), record=lambda r: {**r, "q": [0.0, 0.0]})
+        )
     elif what == "chain":
         file.write_text(json.dumps({**stated, "chain": {**stated["chain"], "messages": "1"}}))
     elif what == "signature":
@@ -86,19 +87,18 @@ def test_any_change_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) 
         file.unlink()
     else:
         file.write_text("signed, honestly")
-    assert problem(path, key)
+    assert find_problem(path, key)
 
 
 def test_only_logs_agreeing_with_chains_are_signed(tmp_path: Path) -> None:
     private, key = create_signing_keys(tmp_path / "lab")
-    path = tmp_path / "run.mcap"
-    path.write_bytes(recorded("paper")[:-200])
+    path = write_log(tmp_path, make_log_bytes("paper")[:-200])
     with pytest.raises(LogError, match=r"is not signed: .*trilat log recover"):
         sign_log(path, private)
-    made = recover(path).output
-    assert problem(made, key) == f"there is no signature file {made}.sig"
-    sign_log(made, private)
-    assert problem(made, key) == ""
+    recovered = recover(path).output
+    assert find_problem(recovered, key) == f"there is no signature file {recovered}.sig"
+    sign_log(recovered, private)
+    assert find_problem(recovered, key) == ""
 
 
 def test_invalid_or_open_keys_are_refused(signed: tuple[Path, Path], tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_keys_are_private_and_full_disks_leave_none(tmp_path: Path) -> None:
 
 
 def test_the_command_exits_0_or_1(tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(recorded("paper"))
+    write_log(tmp_path, make_log_bytes("paper"))
     trilat("keys", "pair", "lab", cwd=tmp_path).succeeds()
     trilat("log", "sign", "run.mcap", "--key", "lab.key", cwd=tmp_path).succeeds()
     assert (
@@ -148,6 +148,6 @@ def test_the_command_exits_0_or_1(tmp_path: Path) -> None:
     (tmp_path / "run.mcap.sig").unlink()
     done = trilat("log", "check", "run.mcap", "--key", "lab.pub", "--json", cwd=tmp_path)
     assert done.code == 1
-    assert [one["check"] for one in json.loads(done.out)["checks"] if not one["passed"]] == [
-        "signature"
-    ]
+    assert [
+        check["check"] for check in json.loads(done.out)["checks"] if not check["passed"]
+    ] == ["signature"]

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from tests.log.disks import open_file_on
 from trilat_net.app.cli.members import parse_split
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_file import LogFile
@@ -20,7 +21,7 @@ from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.scenario import load_scenario
 
-from .disks import SmallDisk, file_on
+from .disks import SmallDisk
 
 SCENARIO = load_scenario("two_sites")
 KEYS = [topics.key("t", site, channel) for site in ("m", "s") for channel in ("state", "event")]
@@ -31,27 +32,29 @@ Message = tuple[str, bytes, int, int]
 pytestmark = pytest.mark.usefixtures("unsynced")
 
 
-def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+def begin_writer(stream: Sink, part: Mapping[str, str]) -> LogWriter:
     return LogWriter(stream, SCENARIO, "t", "live", 10**18, collect_provenance(), part=part)
 
 
-def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
+def read_file(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert [attachment.name for attachment in reader.iter_attachments()] == [
             "scenario.toml"
         ]
         metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
-        found: list[Message] = []
+        messages: list[Message] = []
         for schema, channel, message in reader.iter_messages(log_time_order=False):
             assert schema is not None
             assert schema.encoding == "jsonschema"
-            found.append((channel.topic[1:], message.data, message.log_time, message.sequence))
-    return found, metadata
+            messages.append(
+                (channel.topic[1:], message.data, message.log_time, message.sequence)
+            )
+    return messages, metadata
 
 
-def written(place: LogStorage, messages: list[Message], flush_every: int = 7) -> None:
-    with LogParts(place, begin) as log:
+def write_messages(place: LogStorage, messages: list[Message], flush_every: int = 7) -> None:
+    with LogParts(place, begin_writer) as log:
         log.current_accounts = lambda: {"so far": "yes"}
         for n, (key, payload, log_ns, number) in enumerate(messages):
             log.add(key, payload, 0, log_ns, number)
@@ -60,7 +63,7 @@ def written(place: LogStorage, messages: list[Message], flush_every: int = 7) ->
         log.finish({"in all": str(len(messages))})
 
 
-def cleared(folder: Path) -> Path:
+def make_empty_folder(folder: Path) -> Path:
     for path in folder.iterdir():
         path.unlink()
     return folder / "run.mcap"
@@ -82,26 +85,26 @@ STEPS = st.lists(
 def test_joined_parts_are_the_unsplit_file(
     steps: list[tuple[str, int, int]], size: int | None, duration_ns: int | None, tmp_path: Path
 ) -> None:
-    path = cleared(tmp_path)
+    path = make_empty_folder(tmp_path)
     messages: list[Message] = []
     log_ns = 10**18
     for n, (key, length, step_ns) in enumerate(steps):
         log_ns += step_ns
         messages.append((key, os.urandom(length), log_ns, n))
     place = LogStorage(path, split_bytes=size, split_ns=duration_ns)
-    written(place, messages)
+    write_messages(place, messages)
     parts = find_parts(path)
     if not place.splits:
         assert list(tmp_path.iterdir()) == [path]
-        assert read(path)[0] == messages
-        assert "trilat.part" not in read(path)[1]
+        assert read_file(path)[0] == messages
+        assert "trilat.part" not in read_file(path)[1]
         return
     assert sorted(tmp_path.iterdir()) == [part_path(path, n) for n in range(1, len(parts) + 1)]
-    found: list[Message] = []
+    joined: list[Message] = []
     previous = digest = ""
     for number, part in sorted(parts.items()):
-        own, metadata = read(part)
-        found += own
+        part_messages, metadata = read_file(part)
+        joined += part_messages
         assert metadata["trilat.session"]["session"] == "t"
         follows = {"previous_records": digest} if digest else {}
         assert metadata["trilat.part"] == {
@@ -109,22 +112,25 @@ def test_joined_parts_are_the_unsplit_file(
             "previous": previous,
             **follows,
         }
-        previous, digest = part.name, metadata["trilat.chain"]["records"]
+        previous = part.name
+        digest = metadata["trilat.chain"]["records"]
         last = number == len(parts)
         assert metadata["trilat.accounts"] == (
             {"in all": str(len(messages))} if last else {"so far": "yes"}
         )
         if size is not None:
-            assert part.stat().st_size <= size or len(own) <= 1
-        if duration_ns is not None and own:
-            assert all(message[2] - own[0][2] < duration_ns for message in own)
-    assert found == messages
+            assert part.stat().st_size <= size or len(part_messages) <= 1
+        if duration_ns is not None and part_messages:
+            assert all(
+                message[2] - part_messages[0][2] < duration_ns for message in part_messages
+            )
+    assert joined == messages
 
 
 def test_parts_open_alone_and_together(tmp_path: Path) -> None:
     messages = [(KEYS[0], b"\x80" * 900, 10**18 + k * 10**8, k) for k in range(40)]
     path = tmp_path / "run.mcap"
-    written(LogStorage(path, split_ns=10**9), messages)
+    write_messages(LogStorage(path, split_ns=10**9), messages)
     names = ["run-001.mcap", "run-002.mcap", "run-003.mcap", "run-004.mcap"]
     assert [part.name for part in sorted(tmp_path.iterdir())] == names
     for name in names:
@@ -132,7 +138,7 @@ def test_parts_open_alone_and_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("there", "splits", "expected", "previous"),
+    ("present", "splits", "expected", "previous"),
     [
         ([], False, "run.mcap", None),
         ([], True, "run-001.mcap", ""),
@@ -149,31 +155,31 @@ def test_parts_open_alone_and_together(tmp_path: Path) -> None:
     ],
 )
 def test_continuing_writes_the_next_part(
-    there: list[str], splits: bool, expected: str, previous: str | None, tmp_path: Path
+    present: list[str], splits: bool, expected: str, previous: str | None, tmp_path: Path
 ) -> None:
-    for name in there:
+    for name in present:
         (tmp_path / name).write_bytes(b"precious")
     place = LogStorage(
         tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None
     )
-    written(place, [(KEYS[0], b"\x80", 10**18, 0)])
-    _, metadata = read(tmp_path / expected)
+    write_messages(place, [(KEYS[0], b"\x80", 10**18, 0)])
+    _, metadata = read_file(tmp_path / expected)
     assert metadata.get("trilat.part", {}).get("previous") == previous
-    for name in there:
+    for name in present:
         assert (tmp_path / name).read_bytes() == b"precious"
 
 
 @pytest.mark.parametrize(
-    "there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"]
+    "present", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"]
 )
-def test_taken_names_are_refused_unless_replaceable(there: str, tmp_path: Path) -> None:
-    (tmp_path / there).write_bytes(b"precious")
+def test_taken_names_are_refused_unless_replaceable(present: str, tmp_path: Path) -> None:
+    (tmp_path / present).write_bytes(b"precious")
     place = LogStorage(tmp_path / "run.mcap", split_ns=1)
-    with pytest.raises(UsageError, match=f"{there}.* exists.*force=True"):
-        LogParts(place, begin)
-    assert (tmp_path / there).read_bytes() == b"precious"
+    with pytest.raises(UsageError, match=f"{present}.* exists.*force=True"):
+        LogParts(place, begin_writer)
+    assert (tmp_path / present).read_bytes() == b"precious"
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
-    written(LogStorage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
+    write_messages(LogStorage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
     assert [path.name for path in sorted(tmp_path.iterdir())] == [
         f"run-00{n}.mcap" for n in (1, 2, 3)
     ]
@@ -182,7 +188,9 @@ def test_taken_names_are_refused_unless_replaceable(there: str, tmp_path: Path) 
 def test_unsplit_logs_leave_other_parts_alone(tmp_path: Path) -> None:
     (tmp_path / "run-002.mcap").write_bytes(b"precious")
     for force in (False, True):
-        written(LogStorage(tmp_path / "run.mcap", force=force), [(KEYS[0], b"\x80", 10**18, 0)])
+        write_messages(
+            LogStorage(tmp_path / "run.mcap", force=force), [(KEYS[0], b"\x80", 10**18, 0)]
+        )
     assert (tmp_path / "run-002.mcap").read_bytes() == b"precious"
 
 
@@ -191,10 +199,10 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
     place = LogStorage(tmp_path / name, split_ns=1)
     (tmp_path / "run1-001.mcap").write_bytes(b"")
-    written(place, messages)
+    write_messages(place, messages)
     assert sorted(find_parts(place.path)) == [1, 2, 3]
     assert [
-        message for path in find_parts(place.path).values() for message in read(path)[0]
+        message for path in find_parts(place.path).values() for message in read_file(path)[0]
     ] == messages
 
 
@@ -209,17 +217,17 @@ def test_continuing_and_replacing_at_once_is_refused(tmp_path: Path) -> None:
         LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).find_first_part()
 
 
-def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]:
+def write_on_disk(room: int, path: Path, messages: list[Message]) -> list[Message]:
     """Writes messages in parts onto a disk with so much room; returns those that were given to it."""
     taken: list[Message] = []
     disks = [SmallDisk(room)]
 
     def opened(part: Path) -> LogFile:
         disks.append(SmallDisk(disks[-1].capacity - disks[-1].written))
-        return file_on(disks[-1], part)
+        return open_file_on(disks[-1], part)
 
     def record() -> None:
-        with LogParts(LogStorage(path, split_ns=5 * 10**8), begin, opened) as log:
+        with LogParts(LogStorage(path, split_ns=5 * 10**8), begin_writer, opened) as log:
             try:
                 for message in messages:
                     key, payload, log_ns, number = message
@@ -241,19 +249,21 @@ def test_full_disks_at_seams_keep_earlier_parts(tmp_path: Path) -> None:
     """At every step of a log in parts: all parts are whole, and hold all that was given to them."""
     messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
     for room in range(80_000, 200_000, 7900):
-        path = cleared(tmp_path)
-        taken = recorded_on(room, path, messages)
-        found = [
-            message for _, part in sorted(find_parts(path).items()) for message in read(part)[0]
+        path = make_empty_folder(tmp_path)
+        taken = write_on_disk(room, path, messages)
+        stored = [
+            message
+            for _, part in sorted(find_parts(path).items())
+            for message in read_file(part)[0]
         ]
-        assert found == taken
+        assert stored == taken
         assert all(part.name.endswith(".mcap") for part in tmp_path.iterdir())
 
 
 def test_adding_after_the_end_is_refused(tmp_path: Path) -> None:
-    with LogParts(LogStorage(tmp_path / "run.mcap"), begin) as log:
+    with LogParts(LogStorage(tmp_path / "run.mcap"), begin_writer) as log:
         log.finish({})
         with pytest.raises(LogRefused, match="is finished"):
             log.add(KEYS[0], b"", 0, 0, 0)
         log.finish({})
-    assert read(tmp_path / "run.mcap")[0] == []
+    assert read_file(tmp_path / "run.mcap")[0] == []

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from tests.log.hostility import chunk
-from tests.log_editing import edited, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.log.hostility import make_chunk
 from trilat_net.errors import LogError
-from trilat_net.execution import virtual
 from trilat_net.log import mcap_reader, mcap_records
 from trilat_net.log.mcap_reader import McapMessage, McapReader
 from trilat_net.log.mcap_records import (
@@ -26,24 +25,23 @@ from trilat_net.log.mcap_records import (
     UnreadableRecord,
     unpack_chunk,
 )
-from trilat_net.scenario import load_scenario
 
-DATA = edited(recorded("paper"), chunk_bytes=4096)
+DATA = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=4096)
 FRAMES = list(RecordScanner(io.BytesIO(DATA)).frames())
 CHUNKS = [frame for frame in FRAMES if frame.opcode == Opcode.CHUNK]
 
 
-def walked(data: bytes) -> tuple[McapReader, list[McapMessage]]:
+def read_walked(data: bytes) -> tuple[McapReader, list[McapMessage]]:
     walk = McapReader(io.BytesIO(data), "file")
     return walk, list(walk.messages())
 
 
-WALK, ITEMS = walked(DATA)
+WALK, ITEMS = read_walked(DATA)
 
 
 def in_chunk(frame: RecordFrame) -> list[McapMessage]:
     """The messages of one chunk: what is in the file with it, without those without it."""
-    _, others = walked(DATA[: frame.offset] + DATA[frame.end :])
+    _, others = read_walked(DATA[: frame.offset] + DATA[frame.end :])
     return [item for item in ITEMS if item not in others]
 
 
@@ -70,16 +68,16 @@ def test_torn_files_give_every_whole_chunk(size: int) -> None:
     whole = [frame for frame in CHUNKS if frame.end <= size]
     if size < 8:
         with pytest.raises(LogError, match="not an MCAP file"):
-            walked(DATA[:size])
+            read_walked(DATA[:size])
         return
-    walk, items = walked(DATA[:size])
+    walk, items = read_walked(DATA[:size])
     assert not walk.complete
     assert walk.torn is not None or size == FRAMES[-1].end
     assert sum(walk.chunks.values()) == len(whole)
     assert items == ITEMS[: len(items)]
 
 
-def overwritten(offset: int, foreign: bytes) -> bytes:
+def overwrite_bytes(offset: int, foreign: bytes) -> bytes:
     return DATA[:offset] + foreign + DATA[offset + len(foreign) :]
 
 
@@ -91,16 +89,18 @@ FOREIGN = st.binary(min_size=1, max_size=300)
 @given(OFFSETS, FOREIGN)
 def test_scans_omit_no_byte(offset: int, foreign: bytes) -> None:
     """Records and damaged parts follow each other without a gap up to the end mark."""
-    data = overwritten(offset, foreign)
+    data = overwrite_bytes(offset, foreign)
     scanner = RecordScanner(io.BytesIO(data))
     damaged = []
     covered = len(MAGIC)
     for item in scanner.scan():
         if isinstance(item, Damage):
             damaged.append(item)
-            begin, end = item.offset, item.offset + item.length
+            begin = item.offset
+            end = item.offset + item.length
         else:
-            begin, end = item.frame.offset, item.frame.end
+            begin = item.frame.offset
+            end = item.frame.end
             assert item.content == data[begin + RECORD_HEAD_BYTES : end]
         assert begin <= covered
         covered = max(covered, end)
@@ -119,8 +119,8 @@ def test_scans_omit_no_byte(offset: int, foreign: bytes) -> None:
 @given(OFFSETS, FOREIGN)
 def test_both_ways_of_reading_agree(offset: int, foreign: bytes) -> None:
     """Who reads the messages alone, and who scans the records, finds the same in a damaged file."""
-    data = overwritten(offset, foreign)
-    walk, items = walked(data)
+    data = overwrite_bytes(offset, foreign)
+    walk, items = read_walked(data)
     scan = McapReader(io.BytesIO(data), "file")
     scanned = [
         message
@@ -146,7 +146,7 @@ def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObje
     )
     changed = bytearray(DATA)
     changed[place] ^= 1 << data.draw(st.integers(0, 7))
-    walk, items = walked(bytes(changed))
+    walk, items = read_walked(bytes(changed))
     if not walk.damaged:  # a bit that the compression does not look at
         assert items == ITEMS
         return
@@ -164,13 +164,13 @@ def test_a_false_record_length_hides_few_chunks(frame: RecordFrame, length: int)
     changed = bytearray(DATA)
     struct.pack_into("<Q", changed, frame.offset + 1, length)
     try:
-        walk, items = walked(bytes(changed))
+        walk, items = read_walked(bytes(changed))
     except LogError:
         return
-    told = length in (frame.length,) or walk.damaged or walk.torn is not None
+    is_reported = length in (frame.length,) or walk.damaged or walk.torn is not None
     # within the file it may skip what is whole, or look like a longer record
     near = length < len(DATA)
-    assert told or near
+    assert is_reported or near
     if length > len(DATA) and frame.opcode != Opcode.FOOTER:
         hidden = in_chunk(frame) if frame.opcode == Opcode.CHUNK else []
         assert [item for item in ITEMS if item not in items] == hidden
@@ -179,14 +179,17 @@ def test_a_false_record_length_hides_few_chunks(frame: RecordFrame, length: int)
 def test_chunks_unpack_within_their_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """However it is packed, and whatever it says: nothing is unpacked beyond the limit."""
     monkeypatch.setattr(mcap_records, "MAX_UNPACKED_BYTES", 10_000)
-    fine, bomb = bytes(10_000), bytes(1_000_000)
+    fine = bytes(10_000)
+    bomb = bytes(1_000_000)
     for compression in ("zstd", "lz4", ""):
-        assert unpack_chunk(chunk(fine, compression=compression)[RECORD_HEAD_BYTES:]) == fine
+        assert (
+            unpack_chunk(make_chunk(fine, compression=compression)[RECORD_HEAD_BYTES:]) == fine
+        )
     for compression in ("zstd", "lz4"):
         for size in (len(bomb), 10_000, 1 << 62, 0):
             with pytest.raises(UnreadableRecord):
                 unpack_chunk(
-                    chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:]
+                    make_chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:]
                 )
 
 
@@ -220,14 +223,14 @@ def test_absurd_contents_are_refused_with_place(
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
     bombs = b"".join(
-        chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6)
+        make_chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6)
     )
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(
         LogError,
         match=r"file: needs too much memory for a file of \d+ bytes: the data up to byte \d+",
     ):
-        walked(data)
+        read_walked(data)
     streaming = McapReader(io.BytesIO(data), "file", kept=False)
     assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 240_000
 
@@ -237,7 +240,7 @@ def test_an_absurdly_large_channel_ends_there_alone(
 ) -> None:
     """One odd channel does not make a log unreadable; what is left out of it is said, once."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 16 << 20)
-    bomb = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 80_000)
+    bomb = make_chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 80_000)
     data = DATA[: CHUNKS[1].offset] + bomb + bomb + DATA[CHUNKS[1].offset :]
     reader = McapReader(io.BytesIO(data), "file")
     read = list(reader.messages())
@@ -255,16 +258,14 @@ def test_resting_arms_are_never_absurd(
 ) -> None:
     """The hands of `outage` do not push before 3 s, and its arms know their weight."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 0)
-    stream = io.BytesIO()
-    virtual.write_virtual_log(load_scenario("outage", {"duration_s": 1.0}), stream)
-    stream.seek(0)
+    stream = io.BytesIO(make_log_bytes("outage", {"duration_s": 1.0}))
     assert sum(1 for _ in McapReader(stream, "log").messages()) > 3000
 
 
 def test_a_chunk_within_a_chunk_is_not_read() -> None:
-    inner = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0))
-    data = DATA[: CHUNKS[1].offset] + chunk(inner) + DATA[CHUNKS[1].offset :]
-    assert walked(data)[1] == ITEMS
+    inner = make_chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0))
+    data = DATA[: CHUNKS[1].offset] + make_chunk(inner) + DATA[CHUNKS[1].offset :]
+    assert read_walked(data)[1] == ITEMS
 
 
 def test_channels_keep_their_first_definition() -> None:
@@ -277,10 +278,10 @@ def test_channels_keep_their_first_definition() -> None:
 
     message = struct.pack("<BQHIQQ", 5, 23, 7, 1, 2, 3) + b"x"
     lost = struct.pack("<BQHIQQ", 5, 22, 9, 1, 2, 3)
-    data = DATA[: CHUNKS[0].offset] + chunk(
+    data = DATA[: CHUNKS[0].offset] + make_chunk(
         channel(7, b"/a") + message + channel(7, b"/b") + message + lost
     )
-    _, items = walked(data)
+    _, items = read_walked(data)
     assert items == [
         McapMessage("/a", b"x", 2, 3, 1),
         McapMessage("/a", b"x", 2, 3, 1),
@@ -292,18 +293,18 @@ def test_an_attachment_whose_checksum_differs_is_damaged() -> None:
     frame = next(frame for frame in FRAMES if frame.opcode == Opcode.ATTACHMENT)
     changed = bytearray(DATA)
     changed[frame.end - 100] ^= 1
-    walk, items = walked(bytes(changed))
+    walk, items = read_walked(bytes(changed))
     assert "scenario.toml" not in walk.attachments
     assert [part.offset for part in walk.damaged] == [frame.offset]
     assert items == ITEMS
 
 
 def test_progress_is_reported_up_to_the_end() -> None:
-    told: list[tuple[int, int]] = []
-    list(McapReader(io.BytesIO(DATA), "file", lambda *sizes: told.append(sizes)).messages())
-    assert told == sorted(told)
-    assert {total for _, total in told} == {len(DATA)}
-    assert told[-1][0] >= len(DATA) - 8
+    progress: list[tuple[int, int]] = []
+    list(McapReader(io.BytesIO(DATA), "file", lambda *sizes: progress.append(sizes)).messages())
+    assert progress == sorted(progress)
+    assert {total for _, total in progress} == {len(DATA)}
+    assert progress[-1][0] >= len(DATA) - 8
 
 
 def test_zstd_frames_without_size_are_read() -> None:

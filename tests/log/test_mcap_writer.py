@@ -35,17 +35,17 @@ CALLS = st.lists(
 )
 
 
-def begun(file: Any) -> None:
+def begin_container(file: Any) -> None:
     """Gives a file of either writer the same channels."""
     schema = file.register_schema("S", "jsonschema", b'{"type": "object"}')
     for name in "abc":
         file.register_channel(f"/{name}", "msgpack", schema, {"what": name})
 
 
-def ours(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
+def write_by_ours(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
     stream = io.BytesIO()
     file = McapWriter(stream, "lib", chunk_bytes=chunk_bytes)
-    begun(file)
+    begin_container(file)
     for name, *arguments in calls:
         getattr(file, name)(*arguments)
         assert file.position == stream.tell()
@@ -55,18 +55,18 @@ def ours(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
     return stream.getvalue()
 
 
-def theirs(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
+def write_by_mcap(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
     stream = io.BytesIO()
     file = Writer(stream, chunk_size=chunk_bytes)
     file.start(library="lib")
-    begun(file)
+    begin_container(file)
     for name, *arguments in calls:
         getattr(file, name)(*arguments)
     file.finish()
     return stream.getvalue()
 
 
-def read(data: bytes) -> dict[str, Any]:
+def read_content(data: bytes) -> dict[str, Any]:
     """All that the `mcap` package finds, by way of the index."""
     reader = make_reader(io.BytesIO(data), validate_crcs=True)
     summary = reader.get_summary()
@@ -92,8 +92,9 @@ def read(data: bytes) -> dict[str, Any]:
 def test_files_equal_those_of_mcaps_writer(
     calls: list[tuple[Any, ...]], chunk_bytes: int
 ) -> None:
-    found, expected = read(ours(calls, chunk_bytes)), read(theirs(calls, chunk_bytes))
-    assert found == expected
+    content = read_content(write_by_ours(calls, chunk_bytes))
+    expected = read_content(write_by_mcap(calls, chunk_bytes))
+    assert content == expected
 
 
 @settings(max_examples=20)
@@ -101,8 +102,8 @@ def test_files_equal_those_of_mcaps_writer(
 def test_the_same_calls_give_the_same_bytes(
     calls: list[tuple[Any, ...]],
 ) -> None:
-    data = ours(calls, 200)
-    assert ours(calls, 200) == data
+    data = write_by_ours(calls, 200)
+    assert write_by_ours(calls, 200) == data
     records = list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
     payloads = [call[3] for call in calls if call[0] == "add_message"]
     assert [record.data for record in records if type(record).__name__ == "Message"] == payloads
@@ -111,14 +112,14 @@ def test_the_same_calls_give_the_same_bytes(
 def test_late_channels_precede_waiting_messages() -> None:
     stream = io.BytesIO()
     file = McapWriter(stream, "lib")
-    begun(file)
+    begin_container(file)
     file.add_message(1, 5, b"x", 5)
     late = file.register_channel("/late", "json", 0)
     file.add_message(late, 6, b"{}", 6)
     file.finish()
     reader = make_reader(io.BytesIO(stream.getvalue()))
-    found = [(channel.topic, message.data) for _, channel, message in reader.iter_messages()]
-    assert found == [("/a", b"x"), ("/late", b"{}")]
+    messages = [(channel.topic, message.data) for _, channel, message in reader.iter_messages()]
+    assert messages == [("/a", b"x"), ("/late", b"{}")]
 
 
 def test_chunk_indices_take_bytes_without_objects() -> None:

@@ -9,8 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.log.dealt import Message, a_file, changed, dealt, messages
-from tests.log_editing import opened, recorded
+from tests.log.builders import make_log_bytes, open_bytes
+from tests.log.split_logs import (
+    Message,
+    change_message,
+    make_bytes_of_messages,
+    make_parts,
+    read_messages,
+)
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log, open_log
@@ -23,20 +29,20 @@ from trilat_net.scenario import load_scenario
 
 
 @cache
-def whole() -> bytes:
-    return recorded("paper")
+def make_whole_bytes() -> bytes:
+    return make_log_bytes("paper")
 
 
 @cache
-def count() -> int:
-    return len(messages(whole()))
+def count_records() -> int:
+    return len(read_messages(make_whole_bytes()))
 
 
-def joined(*parts: bytes) -> Log:
+def open_parts(*parts: bytes) -> Log:
     return open_log(*map(io.BytesIO, parts))
 
 
-def holds(log: Log) -> dict[str, object]:
+def list_content(log: Log) -> dict[str, object]:
     """All that a log holds, as its file has it."""
     return {
         "records": {name: list(log[name].payloads) for name in log.sites},
@@ -48,34 +54,38 @@ def holds(log: Log) -> dict[str, object]:
 
 
 @st.composite
-def hands(draw: st.DrawFn) -> list[set[int]]:
+def deal_places(draw: st.DrawFn) -> list[set[int]]:
     """Every message in one of the hands at least, some in several."""
     n = draw(st.integers(1, 4))
-    bounds = sorted(draw(st.lists(st.integers(0, count()), min_size=n - 1, max_size=n - 1)))
-    edges = [0, *bounds, count()]
-    overlap = st.sets(st.integers(0, count() - 1), max_size=20)
+    bounds = sorted(
+        draw(st.lists(st.integers(0, count_records()), min_size=n - 1, max_size=n - 1))
+    )
+    edges = [0, *bounds, count_records()]
+    overlap = st.sets(st.integers(0, count_records() - 1), max_size=20)
     return [set(range(edges[k], edges[k + 1])) | draw(overlap) for k in range(n)]
 
 
 @settings(max_examples=12)
-@given(hands(), st.randoms(use_true_random=False))
+@given(deal_places(), st.randoms(use_true_random=False))
 def test_parts_in_any_order_read_as_the_whole(dealing, chance) -> None:
-    parts = dealt(whole(), dealing)
+    parts = make_parts(make_whole_bytes(), dealing)
     chance.shuffle(parts)
-    log = joined(*parts)
-    assert holds(log) == holds(opened(whole()))
+    log = open_parts(*parts)
+    assert list_content(log) == list_content(open_bytes(make_whole_bytes()))
     assert log.complete
 
 
 def test_a_log_of_parts_verifies_as_the_whole() -> None:
-    parts = dealt(whole(), [range(200), range(150, count())])
-    verdict = verify(joined(*parts))
+    parts = make_parts(make_whole_bytes(), [range(200), range(150, count_records())])
+    verdict = verify(open_parts(*parts))
     assert (verdict.identical, verdict.first) == (360, None)
     assert verdict.gaps == []
 
 
 def place_of(topic_end: str, number: int = 0) -> int:
-    return [n for n, m in enumerate(messages(whole())) if m[0].endswith(topic_end)][number]
+    return [
+        n for n, m in enumerate(read_messages(make_whole_bytes())) if m[0].endswith(topic_end)
+    ][number]
 
 
 @pytest.mark.parametrize(
@@ -89,11 +99,11 @@ def place_of(topic_end: str, number: int = 0) -> int:
 def test_contradicting_parts_are_refused_by_name(
     where: str, fields: dict[str, object], named: str, tmp_path: Path
 ) -> None:
-    every = messages(whole())
-    other: list[Message] = [changed(every[place_of(where)], **fields)]
+    every = read_messages(make_whole_bytes())
+    other: list[Message] = [change_message(every[place_of(where)], **fields)]
     paths = [tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"]
-    paths[0].write_bytes(whole())
-    paths[1].write_bytes(a_file(whole(), other))
+    paths[0].write_bytes(make_whole_bytes())
+    paths[1].write_bytes(make_bytes_of_messages(make_whole_bytes(), other))
     with pytest.raises(LogError, match=named) as raised:
         open_log(*paths)
     assert all(str(path) in str(raised.value) for path in paths)
@@ -111,45 +121,51 @@ def test_contradicting_parts_are_refused_by_name(
 def test_other_sessions_are_refused_with_differences(
     session: dict[str, str], scenario: str | None, named: str, tmp_path: Path
 ) -> None:
-    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
-    one.write_bytes(whole())
-    two.write_bytes(a_file(whole(), [], session=session, scenario=scenario))
+    first = tmp_path / "one.mcap"
+    two = tmp_path / "two.mcap"
+    first.write_bytes(make_whole_bytes())
+    two.write_bytes(
+        make_bytes_of_messages(make_whole_bytes(), [], session=session, scenario=scenario)
+    )
     with pytest.raises(
         LogError, match=rf"two\.mcap: is not a part of the session in .*one\.mcap: {named}"
     ):
-        open_log(one, two)
+        open_log(first, two)
 
 
 def test_parts_fill_holes_of_torn_parts() -> None:
-    every = messages(whole())
-    torn = a_file(whole(), every[:150], finished=False)
-    carried_on = a_file(whole(), every[100:], part=2)
-    assert not opened(torn).complete
-    assert not opened(carried_on).complete
-    assert joined(torn, carried_on).complete
+    every = read_messages(make_whole_bytes())
+    torn = make_bytes_of_messages(make_whole_bytes(), every[:150], finished=False)
+    carried_on = make_bytes_of_messages(make_whole_bytes(), every[100:], part=2)
+    assert not open_bytes(torn).complete
+    assert not open_bytes(carried_on).complete
+    assert open_parts(torn, carried_on).complete
 
 
 def test_a_record_missing_in_all_parts_is_missing() -> None:
-    every = messages(whole())
-    torn = a_file(whole(), every[:150], finished=False)
-    log = joined(torn, a_file(whole(), every[151:], part=2))
+    every = read_messages(make_whole_bytes())
+    torn = make_bytes_of_messages(make_whole_bytes(), every[:150], finished=False)
+    log = open_parts(torn, make_bytes_of_messages(make_whole_bytes(), every[151:], part=2))
     assert not log.complete
     assert sum(map(log.missing, log.sites)) == 1
     assert sum("missing 1" in log.account(name) for name in log.sites) == 1
 
 
 def test_unfinished_parts_leave_the_whole_incomplete() -> None:
-    parts = dealt(whole(), [range(100), range(100, 200), range(200, count())])
-    assert joined(*parts).complete
-    assert not joined(parts[0], parts[2]).complete
-    assert not opened(parts[2]).complete
-    every = messages(whole())
-    assert not joined(
-        a_file(whole(), every[:50]), a_file(whole(), every[50:], finished=False)
+    parts = make_parts(
+        make_whole_bytes(), [range(100), range(100, 200), range(200, count_records())]
+    )
+    assert open_parts(*parts).complete
+    assert not open_parts(parts[0], parts[2]).complete
+    assert not open_bytes(parts[2]).complete
+    every = read_messages(make_whole_bytes())
+    assert not open_parts(
+        make_bytes_of_messages(make_whole_bytes(), every[:50]),
+        make_bytes_of_messages(make_whole_bytes(), every[50:], finished=False),
     ).complete
 
 
-def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
+def make_recorder_part(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
     """A part that a recorder wrote, with what it counted so far."""
     stream = io.BytesIO()
     scenario = load_scenario("free")
@@ -174,10 +190,10 @@ def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
 
 
 def test_drops_counted_across_parts_are_counted_once() -> None:
-    log = joined(
-        by(1, at_ns=0, dropped=2, part=1),
-        by(1, at_ns=10, dropped=5, part=2),
-        by(2, at_ns=20, dropped=1, part=3),
+    log = open_parts(
+        make_recorder_part(1, at_ns=0, dropped=2, part=1),
+        make_recorder_part(1, at_ns=10, dropped=5, part=2),
+        make_recorder_part(2, at_ns=20, dropped=1, part=3),
     )
     assert log.accounts["dropped: stranger"] == "6"
     assert log.account("m1").startswith("expected 0, received 0")
@@ -186,34 +202,38 @@ def test_drops_counted_across_parts_are_counted_once() -> None:
 
 
 def test_unnumbered_events_differ_by_content() -> None:
-    every = messages(whole())
+    every = read_messages(make_whole_bytes())
     place = place_of("m1/event")
-    old = [changed(every[place], n=-1, text=text) for text in ("a", "b")]
-    log = joined(
-        a_file(whole(), old), a_file(whole(), [*old, every[place_of("m1/state")]], part=2)
+    old = [change_message(every[place], n=-1, text=text) for text in ("a", "b")]
+    log = open_parts(
+        make_bytes_of_messages(make_whole_bytes(), old),
+        make_bytes_of_messages(make_whole_bytes(), [*old, every[place_of("m1/state")]], part=2),
     )
     assert [event.text for event in log.events] == ["a", "b"]
 
 
 def test_progress_covers_all_parts(tmp_path: Path) -> None:
-    parts = dealt(whole(), [range(200), range(200, count())])
+    parts = make_parts(make_whole_bytes(), [range(200), range(200, count_records())])
     paths = [tmp_path / f"run-{n}.mcap" for n in range(2)]
     for path, data in zip(paths, parts, strict=True):
         path.write_bytes(data)
-    told: list[tuple[int, int]] = []
-    open_log(*paths, progress=lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int]] = []
+    open_log(*paths, progress=lambda done, total: reported.append((done, total)))
     total = sum(map(len, parts))
-    assert {of for _, of in told} == {total}
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert total - 100 < told[-1][0] <= total
+    assert {of for _, of in reported} == {total}
+    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
+    assert total - 100 < reported[-1][0] <= total
 
 
 def test_parts_with_invalid_messages_are_named(tmp_path: Path) -> None:
-    every = messages(whole())
-    first, second = tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"
-    first.write_bytes(a_file(whole(), every[:100]))
+    every = read_messages(make_whole_bytes())
+    first = tmp_path / "run-001.mcap"
+    second = tmp_path / "run-002.mcap"
+    first.write_bytes(make_bytes_of_messages(make_whole_bytes(), every[:100]))
     second.write_bytes(
-        a_file(whole(), [(every[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2)
+        make_bytes_of_messages(
+            make_whole_bytes(), [(every[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2
+        )
     )
     with pytest.raises(
         LogError, match=r"run-002\.mcap: a message on /trilat/paper/m1/state cannot be read"
@@ -222,8 +242,8 @@ def test_parts_with_invalid_messages_are_named(tmp_path: Path) -> None:
 
 
 def test_an_opened_session_states_its_parts() -> None:
-    parts = dealt(whole(), [range(200), range(200, count())])
-    log = joined(*parts)
+    parts = make_parts(make_whole_bytes(), [range(200), range(200, count_records())])
+    log = open_parts(*parts)
     assert repr(log) == (
         "<Log log and 1 more part: virtual session paper of m1, m2, s; 0.119 s, 360 records, none missing>"
     )

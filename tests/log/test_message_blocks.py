@@ -10,18 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from tests.log.hostility import CHANGES, mangled
-from tests.log_editing import edited, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes
+from tests.log.hostility import CHANGES, mangle_log
 from trilat_net.errors import LogError
 from trilat_net.log import mcap_reader
 from trilat_net.log.mcap_reader import ChannelMessages, McapReader
 
-WHOLE = recorded("paper")
-MANY_CHUNKS = edited(WHOLE, chunk_bytes=8192)
+WHOLE = make_log_bytes("paper")
+MANY_CHUNKS = edit_log_bytes(WHOLE, chunk_bytes=8192)
 Contents = dict[str, list[tuple[bytes, int, int]]]
 
 
-def outcome(reader: McapReader, messages: Contents, problem: str) -> tuple[Any, ...]:
+def describe_outcome(reader: McapReader, messages: Contents, problem: str) -> tuple[Any, ...]:
     """All that a reader has found out."""
     return (
         list(messages.items()),
@@ -45,7 +45,7 @@ def read_singly(data: bytes) -> tuple[Any, ...]:
                 messages[topic].append((payload, log_ns, publish_ns))
     except LogError as error:
         problem = str(error)
-    return outcome(reader, messages, problem)
+    return describe_outcome(reader, messages, problem)
 
 
 def read_in_blocks(data: bytes) -> tuple[Any, ...]:
@@ -61,7 +61,7 @@ def read_in_blocks(data: bytes) -> tuple[Any, ...]:
         topic: list(zip(channel.payloads, channel.log_ns, channel.publish_ns, strict=True))
         for topic, channel in channels.items()
     }
-    return outcome(reader, messages, problem)
+    return describe_outcome(reader, messages, problem)
 
 
 @pytest.mark.parametrize("change", dict.fromkeys(CHANGES), ids=lambda change: change.__name__)
@@ -71,11 +71,11 @@ def test_blocks_of_a_changed_file_are_its_messages(change: Any, seed: int) -> No
     for data in (WHOLE, MANY_CHUNKS):
         changed = change(data, random.Random(seed))
         assert read_in_blocks(changed) == read_singly(changed)
-    changed = mangled(WHOLE, random.Random(seed))
+    changed = mangle_log(WHOLE, random.Random(seed))
     assert read_in_blocks(changed) == read_singly(changed)
 
 
-def written(messages: list[tuple[str, int, bytes]], topics: list[str]) -> bytes:
+def make_message_bytes(messages: list[tuple[str, int, bytes]], topics: list[str]) -> bytes:
     """A file in which every topic of a list has a channel, and may have several."""
     stream = io.BytesIO()
     writer = Writer(stream)
@@ -95,16 +95,16 @@ def written(messages: list[tuple[str, int, bytes]], topics: list[str]) -> bytes:
 def test_two_channels_of_a_topic_keep_their_order() -> None:
     topics = ["/trilat/s/m1/state", "/trilat/s/m2/state", "/trilat/s/m1/state", "/other"]
     messages = [("", n, b"%d" % n + bytes(n % 50)) for n in range(4000)]
-    data = written(messages, topics)
+    data = make_message_bytes(messages, topics)
     assert read_in_blocks(data) == read_singly(data)
 
 
 def test_a_channel_may_begin_within_a_chunk() -> None:
     messages = [("/late" if n == 2000 else "", n, bytes(20)) for n in range(4000)]
-    data = written(messages, ["/trilat/s/m1/state", "/other"])
-    found = read_in_blocks(data)
-    assert found == read_singly(data)
-    assert {topic for topic, _ in found[0]} == {"/trilat/s/m1/state", "/trilat/late/m1/state"}
+    data = make_message_bytes(messages, ["/trilat/s/m1/state", "/other"])
+    content = read_in_blocks(data)
+    assert content == read_singly(data)
+    assert {topic for topic, _ in content[0]} == {"/trilat/s/m1/state", "/trilat/late/m1/state"}
 
 
 def test_too_large_channel_is_cut_alike(
@@ -112,9 +112,9 @@ def test_too_large_channel_is_cut_alike(
 ) -> None:
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
     monkeypatch.setattr(mcap_reader, "KEPT_RATIO", 1)
-    found = read_in_blocks(WHOLE)
-    assert found == read_singly(WHOLE)
-    damaged = found[2]
+    content = read_in_blocks(WHOLE)
+    assert content == read_singly(WHOLE)
+    damaged = content[2]
     assert any("needs too much memory" in text for text in damaged)
 
 

@@ -16,19 +16,21 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
+from tests.execution.builders import execute_ticks
+from tests.log.split_logs import read_messages
+from tests.log.standard_files import write_standard_files
+from tests.programs import PYMCAP, RERUN, list_rerun_faults, run_program
 from trilat_net.core.step.ticks import Mode
 from trilat_net.log.log_reader import Log, open_log
 
-from .dealt import messages
-from .programs import PYMCAP, RERUN, printed, rerun_faults
-from .standard_files import EPOCH_NS, KINDS, SCENARIO, made, outputs
+from .standard_files import EPOCH_NS, KINDS, SCENARIO
 
 BUCKET = 20
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return made(tmp_path_factory.mktemp("files"))
+    return write_standard_files(tmp_path_factory.mktemp("files"))
 
 
 @pytest.fixture(params=KINDS)
@@ -36,7 +38,7 @@ def log_file(files: dict[str, Path], request: pytest.FixtureRequest) -> Path:
     return files[request.param]
 
 
-def decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
+def iterate_decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
     """Topic, message and the plain record of every standard message, by mcap-ros2-support."""
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
@@ -59,7 +61,7 @@ def test_mcap_reads_equal_data_without_index(log_file: Path) -> None:
     assert Counter(
         (channel.topic, *vars(message).values()) for _, channel, message in by_index
     ) == Counter(in_order)
-    times = [message.log_ns for message in messages(data)]
+    times = [message.log_ns for message in read_messages(data)]
     assert times == sorted(times)
 
 
@@ -81,7 +83,7 @@ def test_every_channel_has_a_full_schema(log_file: Path) -> None:
 def test_every_view_has_exact_numbers(files: dict[str, Path]) -> None:
     """Of every bucket the extremes, and at the header's stamp as at the publish time a tick of it."""
     shown: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
-    for topic, ros, message in decoded(files["live"]):
+    for topic, ros, message in iterate_decoded(files["live"]):
         if topic.endswith("/joint_states"):
             stamp_ns = ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec
             assert stamp_ns == message.publish_time <= message.log_time
@@ -90,7 +92,7 @@ def test_every_view_has_exact_numbers(files: dict[str, Path]) -> None:
             assert all(map(math.isnan, [*ros.velocity[2:], *ros.effort[2:]]))
             number = (message.publish_time - EPOCH_NS) // (BUCKET * 10**6)
             shown[site, number].append([*ros.position, *ros.velocity[:2], *ros.effort[:2]])
-    for site, made_by in outputs().items():
+    for site, made_by in execute_ticks(SCENARIO).items():
         for first in range(0, len(made_by), BUCKET):
             rows = np.array(
                 [[*o.q, *o.q_des, *o.qd, *o.tau] for o in made_by[first : first + BUCKET]]
@@ -106,19 +108,25 @@ def test_statistics_and_events_equal_the_sites(files: dict[str, Path]) -> None:
     log = open_log(files["live"])
     stats = {(site, s.t_ns + EPOCH_NS): s for site in log.sites for s in log.link_stats(site)}
     seen = Counter[str]()
-    for topic, ros, message in decoded(files["live"]):
+    for topic, ros, message in iterate_decoded(files["live"]):
         name = topic.rpartition("/")[2]
         seen[name] += 1
         if name in ("link_delay", "link_age", "link_offset"):
             (site,) = topic.split("/")[2:-1]
-            one = stats[site, message.publish_time]
+            statistics = stats[site, message.publish_time]
             (peer,) = log.scenario.peers(site)
             assert (
                 ros.data
                 == {
-                    "link_delay": [one.delay_us[peer] / 1e3, one.delay_max_us[peer] / 1e3],
-                    "link_age": [one.age_us[peer] / 1e3],
-                    "link_offset": [one.offset_us[peer] / 1e3, one.bound_us[peer] / 1e3],
+                    "link_delay": [
+                        statistics.delay_us[peer] / 1e3,
+                        statistics.delay_max_us[peer] / 1e3,
+                    ],
+                    "link_age": [statistics.age_us[peer] / 1e3],
+                    "link_offset": [
+                        statistics.offset_us[peer] / 1e3,
+                        statistics.bound_us[peer] / 1e3,
+                    ],
                 }[name]
             )
             assert peer in ros.layout.dim[0].label
@@ -148,10 +156,8 @@ def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log)
                 others[connection.topic].append(message.data.tolist())
     for site in log.sites:
         part = log[site]
-        states, references = (
-            joints[f"/lab/{site}/joint_states"],
-            joints[f"/lab/{site}/reference"],
-        )
+        states = joints[f"/lab/{site}/joint_states"]
+        references = joints[f"/lab/{site}/reference"]
         assert [log_ns for log_ns, _ in states] == part.log_time_ns.tolist()
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in states]
         assert stamps == [EPOCH_NS + k * 10**6 for k in part.tick.tolist()]
@@ -171,7 +177,7 @@ def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log)
 
 def test_the_bag_keeps_publish_times(files: dict[str, Path], log: Log) -> None:
     times: dict[str, list[int]] = defaultdict(list)
-    for topic, _, message in decoded(files["bag"], "/"):
+    for topic, _, message in iterate_decoded(files["bag"], "/"):
         times[topic].append(message.publish_time)
     for site in log.sites:
         for name in (
@@ -210,8 +216,8 @@ def test_the_bag_conforms_to_ros_2(files: dict[str, Path]) -> None:
                 "robot_description",
             )
             durability = "TRANSIENT_LOCAL" if latched else "VOLATILE"
-            found = profile.depth, profile.reliability.name, profile.durability.name
-            assert found == (1 if latched else 10, "RELIABLE", durability)
+            qualities = profile.depth, profile.reliability.name, profile.durability.name
+            assert qualities == (1 if latched else 10, "RELIABLE", durability)
 
 
 LONG = [
@@ -222,7 +228,7 @@ LONG = [
 
 @pytest.mark.parametrize("kind", ["live", "recovered", "bag", *LONG])
 def test_rerun_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
-    assert rerun_faults(files[kind], "--full") == []
+    assert list_rerun_faults(files[kind], "--full") == []
 
 
 @pytest.mark.long
@@ -231,8 +237,8 @@ def test_rerun_has_curves_with_the_names_of_joints(
 ) -> None:
     """Of a recording as it converts it, the names of the series and their numbers."""
     recording = tmp_path / "run.rrd"
-    printed(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
-    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
+    run_program(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
+    text = run_program(*RERUN, "rrd", "print", "-vvv", str(recording))
     for site in SCENARIO.names:
         for entity in (
             f"/viz/{site}/joint_states/position",
@@ -252,6 +258,8 @@ def test_rerun_has_curves_with_the_names_of_joints(
 @pytest.mark.push
 def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     """A program of others under another license: run, never imported."""
-    assert "passed" in printed(*PYMCAP, "doctor", "--strict-message-order", str(files[kind]))
+    assert "passed" in run_program(
+        *PYMCAP, "doctor", "--strict-message-order", str(files[kind])
+    )
     if kind == "live":
-        assert "/viz/m/joint_states" in printed(*PYMCAP, "info", str(files[kind]))
+        assert "/viz/m/joint_states" in run_program(*PYMCAP, "info", str(files[kind]))

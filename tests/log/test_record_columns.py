@@ -26,7 +26,7 @@ stamps = st.lists(
 
 
 @st.composite
-def records(draw: st.DrawFn) -> dict[str, object]:
+def draw_fields(draw: st.DrawFn) -> dict[str, object]:
     vectors = {
         field: draw(st.lists(numbers, min_size=n, max_size=n))
         for field, n in STATE_VECTORS.items()
@@ -57,13 +57,14 @@ def site_log(payloads: list[bytes]) -> SiteLog:
 
 
 @settings(max_examples=40)
-@given(st.lists(records(), max_size=5))
+@given(st.lists(draw_fields(), max_size=5))
 def test_every_column_is_its_field_of_every_record(entries: list[dict[str, object]]) -> None:
     payloads = [msgpack.packb(entry) for entry in entries]
     states = sorted(
         (decode(payload, State, READABLE) for payload in payloads), key=lambda s: s.tick
     )
-    part, together = site_log(payloads), site_log(payloads)
+    part = site_log(payloads)
+    together = site_log(payloads)
     together.prepare(*STATE_VECTORS)
     assert list(part.states) == states
     assert part.tick.tolist() == [s.tick for s in states]
@@ -142,8 +143,8 @@ def test_an_overlong_payload_is_refused() -> None:
 
 def test_disordered_records_are_sorted_with_their_times() -> None:
     payloads = [msgpack.packb({**GOOD, "tick": tick}) for tick in (4, 2, 3)]
-    came = np.array([40, 20, 30])
-    part = SiteLog("m1", PEERS, 1000, payloads, "log", (came, came + 1))
+    arrivals_ns = np.array([40, 20, 30])
+    part = SiteLog("m1", PEERS, 1000, payloads, "log", (arrivals_ns, arrivals_ns + 1))
     assert part.tick.tolist() == [2, 3, 4]
     assert part.log_time_ns.tolist() == [20, 30, 40]
     assert part.publish_time_ns.tolist() == [21, 31, 41]

@@ -13,14 +13,20 @@ from typing import Any, NamedTuple
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tests.cli.running import trilat
-from tests.log.dealt import Message, foreign, messages
-from tests.log.hostility import chunk as packed_chunk
-from tests.log_editing import edited, opened, recorded, without
+from tests.log.builders import (
+    drop_records,
+    edit_log_bytes,
+    make_log,
+    make_log_bytes,
+    write_log,
+)
+from tests.log.hostility import make_chunk as packed_chunk
+from tests.log.split_logs import Message, make_foreign_bytes, read_messages
 from trilat_net.errors import LogError, NothingSaved, UsageError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_layout import active_path
@@ -46,30 +52,32 @@ class Chunk(NamedTuple):
     messages: list[Message]
 
 
-def chunks(data: bytes) -> list[Chunk]:
+def list_chunks(data: bytes) -> list[Chunk]:
     """The chunks of a whole file, by its index."""
     summary = make_reader(io.BytesIO(data)).get_summary()
     assert summary is not None
-    every = iter(messages(data))
-    found = []
+    every = iter(read_messages(data))
+    all_chunks = []
     for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
-        begin, length = index.chunk_start_offset, index.chunk_length
+        begin = index.chunk_start_offset
+        length = index.chunk_length
         entries = 0
         at = begin + length
         while at < begin + length + index.message_index_length:
             (size,) = struct.unpack_from("<Q", data, at + 1)
             entries += (size - 6) // 16
             at += 9 + size
-        found.append(Chunk(begin, begin + length, [next(every) for _ in range(entries)]))
-    return found
+        all_chunks.append(Chunk(begin, begin + length, [next(every) for _ in range(entries)]))
+    return all_chunks
 
 
 @cache
-def log() -> bytes:
+def make_chunked_bytes() -> bytes:
     """A log of twenty chunks, as it is written today."""
-    whole, stream = opened(recorded("paper")), io.BytesIO()
+    whole = make_log("paper")
+    stream = io.BytesIO()
     writer = LogWriter(stream, whole.scenario, "paper", "virtual", 0, collect_provenance())
-    for n, message in enumerate(messages(recorded("paper"))):
+    for n, message in enumerate(read_messages(make_log_bytes("paper"))):
         topic, payload, log_ns, publish_ns, sequence = message
         writer.add(topic[1:], payload, publish_ns, log_ns, sequence)
         if n % 18 == 17:
@@ -79,16 +87,18 @@ def log() -> bytes:
 
 
 @cache
-def earlier_log() -> bytes:
+def make_earlier_bytes() -> bytes:
     """The same by `mcap.Writer`: schemas and channels stand in the first chunk and at the end."""
-    return edited(recorded("paper"), chunk_bytes=8000)
+    return edit_log_bytes(make_log_bytes("paper"), chunk_bytes=8000)
 
 
-LOGS = st.sampled_from([log, earlier_log])
+LOGS = st.sampled_from([make_chunked_bytes, make_earlier_bytes])
 
 
-def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Recovery, bytes]:
-    """What becomes of a file with these bytes."""
+def recover_bytes(
+    data: bytes, folder: Path, name: str = "run.mcap.active"
+) -> tuple[Recovery, bytes]:
+    """Returns the recovery of a file with the given bytes, and the bytes of the new file."""
     for path in folder.iterdir():
         path.unlink()
     path = folder / name
@@ -101,31 +111,31 @@ def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Reco
 
 @anywhere
 @given(made_by=LOGS, share=positions)
-@example(made_by=log, share=0.0)
-@example(made_by=earlier_log, share=0.65625)
+@example(made_by=make_chunked_bytes, share=0.0)
+@example(made_by=make_earlier_bytes, share=0.65625)
 def test_cut_files_keep_every_whole_chunk(
     made_by: Callable[[], bytes], share: float, tmp_path: Path
 ) -> None:
     data = made_by()
     end = int(share * len(data))
-    whole = [chunk for chunk in chunks(data) if chunk.end <= end]
+    whole = [chunk for chunk in list_chunks(data) if chunk.end <= end]
     kept = [message for chunk in whole for message in chunk.messages]
     try:
-        result, saved = made(data[:end], tmp_path)
+        result, saved = recover_bytes(data[:end], tmp_path)
     except NothingSaved:
         assert not kept
         return
-    found = messages(saved)
-    assert found[: len(kept)] == kept
-    assert found == messages(data)[: len(found)]
-    assert result.salvaged == len(found) - len(kept)
-    if any(chunk.begin < end < chunk.end for chunk in chunks(data)):
+    recovered = read_messages(saved)
+    assert recovered[: len(kept)] == kept
+    assert recovered == read_messages(data)[: len(recovered)]
+    assert result.salvaged == len(recovered) - len(kept)
+    if any(chunk.begin < end < chunk.end for chunk in list_chunks(data)):
         assert not result.lossless
     # before the accounts
-    elif chunks(data)[0].end <= end <= data.find(b"trilat.accounts") - 13:
+    elif list_chunks(data)[0].end <= end <= data.find(b"trilat.accounts") - 13:
         assert result.lossless, result.lost
     assert result.finished == (end == len(data))
-    if len(found):
+    if len(recovered):
         again = open_log(tmp_path / "run.mcap")
         assert again.complete
         verdict = verify(again)
@@ -148,30 +158,46 @@ def test_damaged_files_keep_every_intact_chunk(
         data[place] ^= flip
     intact = [
         message
-        for chunk in chunks(whole)
+        for chunk in list_chunks(whole)
         if not any(chunk.begin <= place < chunk.end for place in places)
         for message in chunk.messages
     ]
-    result, saved = made(bytes(data), tmp_path, "run.mcap")
-    found = messages(saved)
-    summary_begins = chunks(whole)[-1].end
+    result, saved = recover_bytes(bytes(data), tmp_path, "run.mcap")
+    recovered = read_messages(saved)
+    summary_begins = list_chunks(whole)[-1].end
     # what names the channels may be damaged twice
     if any(place >= summary_begins for place in places):
         intact = [message._replace(topic="") for message in intact]
-        found = [message._replace(topic="") for message in found]
-    rest = iter(found)
+        recovered = [message._replace(topic="") for message in recovered]
+    rest = iter(recovered)
     assert all(message in rest for message in intact)  # in order
-    assert {message[1:] for message in found} <= {message[1:] for message in messages(whole)}
-    if len(found) < len(messages(whole)):
+    assert {message[1:] for message in recovered} <= {
+        message[1:] for message in read_messages(whole)
+    }
+    if len(recovered) < len(read_messages(whole)):
         assert not result.lossless
 
 
+def list_definitions(reader: McapReader) -> tuple[list[Any], list[Any]]:
+    """Returns the channels and the schemas in the summary of a file."""
+    summary = reader.get_summary()
+    assert summary is not None
+    channels = [
+        (channel.topic, channel.message_encoding, sorted(channel.metadata.items()))
+        for channel in summary.channels.values()
+    ]
+    schemas = [
+        (schema.name, schema.encoding, schema.data) for schema in summary.schemas.values()
+    ]
+    return sorted(channels), sorted(schemas)
+
+
 def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
-    data = log()
-    result, saved = made(data, tmp_path, "run.mcap")
+    data = make_chunked_bytes()
+    result, saved = recover_bytes(data, tmp_path, "run.mcap")
     assert (result.lossless, result.finished, result.missing) == (True, True, [])
     assert result.output == tmp_path / "run.recovered.mcap"
-    assert messages(saved) == messages(data)
+    assert read_messages(saved) == read_messages(data)
     assert result.coverage.judged == {"m1": 120, "m2": 120, "s": 120}
     old, new = (make_reader(io.BytesIO(each)) for each in (data, saved))
     assert list(old.iter_attachments()) == list(new.iter_attachments())
@@ -183,24 +209,15 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
     )
     assert set(after["trilat.accounts"]) == set(before["trilat.accounts"])
     assert all("missing 0" in account for account in after["trilat.accounts"].values())
-    defined = [
-        (
-            sorted(
-                (c.topic, c.message_encoding, sorted(c.metadata.items()))
-                for c in s.channels.values()
-            ),
-            sorted((c.name, c.encoding, c.data) for c in s.schemas.values()),
-        )
-        for s in (old.get_summary(), new.get_summary())
-        if s is not None
-    ]
-    assert defined[0] == defined[1]
+    assert list_definitions(old) == list_definitions(new)
 
 
 def test_missing_records_are_counted_by_site(tmp_path: Path) -> None:
     gone = set(range(30, 50)) | {70}
-    data = edited(recorded("paper"), record=without("m2", gone), chunk_bytes=8000)
-    result, saved = made(data, tmp_path, "run.mcap")
+    data = edit_log_bytes(
+        make_log_bytes("paper"), record=drop_records("m2", gone), chunk_bytes=8000
+    )
+    result, saved = recover_bytes(data, tmp_path, "run.mcap")
     assert result.lossless  # what was never in the file was not lost with it
     assert result.missing == ["m2: 21 of 120 records: 30-49 70-70"]
     metadata = {e.name: e.metadata for e in make_reader(io.BytesIO(saved)).iter_metadata()}
@@ -211,16 +228,18 @@ def test_missing_records_are_counted_by_site(tmp_path: Path) -> None:
 
 
 def test_lost_chunks_are_reported_with_their_ticks(tmp_path: Path) -> None:
-    data = bytearray(log())
-    chunk = chunks(log())[5]
+    data = bytearray(make_chunked_bytes())
+    chunk = list_chunks(make_chunked_bytes())[5]
     data[(chunk.begin + chunk.end) // 2] ^= 1
-    result, saved = made(bytes(data), tmp_path, "run.mcap")
+    result, saved = recover_bytes(bytes(data), tmp_path, "run.mcap")
     assert len(result.lost) == 1
     assert f"at byte {chunk.begin}" in result.lost[0]
     assert result.lost_bytes == chunk.end - chunk.begin
     ticks = [m.sequence for m in chunk.messages if m.topic == "/trilat/paper/m1/state"]
     assert f"m1: {len(ticks)} of 120 records: {ticks[0]}-{ticks[-1]}" in result.missing
-    assert len(messages(saved)) == len(messages(log())) - len(chunk.messages)
+    assert len(read_messages(saved)) == len(read_messages(make_chunked_bytes())) - len(
+        chunk.messages
+    )
 
 
 def of_others(compression: CompressionType, chunked: bool) -> bytes:
@@ -250,18 +269,18 @@ def test_foreign_files_are_recovered_at_any_cut(
     compression: CompressionType, chunked: bool, tmp_path: Path
 ) -> None:
     data = of_others(compression, chunked)
-    everything = messages(data)
+    everything = read_messages(data)
     before = 0
     for end in [*range(20, len(data), 41), len(data)]:
         try:
-            _, saved = made(data[:end], tmp_path)
+            _, saved = recover_bytes(data[:end], tmp_path)
         except NothingSaved:
             assert not before
             continue
-        found = messages(saved)
-        assert found == everything[: len(found)]
-        assert len(found) >= before
-        before = len(found)
+        recovered = read_messages(saved)
+        assert recovered == everything[: len(recovered)]
+        assert len(recovered) >= before
+        before = len(recovered)
     assert before == 60
     reader = make_reader(io.BytesIO(saved))
     header = reader.get_header()
@@ -277,44 +296,46 @@ def test_foreign_files_are_recovered_at_any_cut(
 def test_complete_records_of_cut_chunks_are_kept(
     compression: CompressionType, tmp_path: Path
 ) -> None:
-    data = foreign([os.urandom(300) for _ in range(2000)], compression=compression)
-    (chunk,) = chunks(data)
-    result, saved = made(data[: (chunk.begin + chunk.end) // 2], tmp_path)
-    found = messages(saved)
-    assert found == messages(data)[: len(found)]
-    assert len(found) == result.salvaged > 600
+    data = make_foreign_bytes([os.urandom(300) for _ in range(2000)], compression=compression)
+    (chunk,) = list_chunks(data)
+    result, saved = recover_bytes(data[: (chunk.begin + chunk.end) // 2], tmp_path)
+    recovered = read_messages(saved)
+    assert recovered == read_messages(data)[: len(recovered)]
+    assert len(recovered) == result.salvaged > 600
     assert not result.lossless
-    assert f"{len(found)} messages could be saved" in result.lost[0]
+    assert f"{len(recovered)} messages could be saved" in result.lost[0]
 
 
 # What is hostile.
 
 
-def record(opcode: int, content: bytes, length: int | None = None) -> bytes:
+def make_record(opcode: int, content: bytes, length: int | None = None) -> bytes:
     return struct.pack("<BQ", opcode, len(content) if length is None else length) + content
 
 
 BOMB = packed_chunk(bytes(1 << 28))
-HEAD = b"\x89MCAP0\r\n" + record(1, bytes(8))
-META = record(12, struct.pack("<I", 1) + b"m" + bytes(4))
+HEAD = b"\x89MCAP0\r\n" + make_record(1, bytes(8))
+META = make_record(12, struct.pack("<I", 1) + b"m" + bytes(4))
 
 
 @pytest.mark.parametrize(
     "data",
     [
-        HEAD + META + record(6, bytes(100), 1 << 62),
-        HEAD + META + record(9, bytes(100), 1 << 40),
+        HEAD + META + make_record(6, bytes(100), 1 << 62),
+        HEAD + META + make_record(9, bytes(100), 1 << 40),
         HEAD + META + BOMB,
         HEAD + META + BOMB[:-100],
-        HEAD + META + record(6, bytes(16) + struct.pack("<QII", 1 << 60, 0, 1 << 31) + b"zstd"),
-        HEAD + META + record(4, struct.pack("<HHI", 1, 1, 1 << 31)) * 100,
+        HEAD
+        + META
+        + make_record(6, bytes(16) + struct.pack("<QII", 1 << 60, 0, 1 << 31) + b"zstd"),
+        HEAD + META + make_record(4, struct.pack("<HHI", 1, 1, 1 << 31)) * 100,
     ],
     ids=["chunk", "attachment", "bomb", "cut bomb", "sizes", "texts"],
 )
 def test_no_number_in_a_file_is_trusted(data: bytes, tmp_path: Path) -> None:
     tracemalloc.start()
     try:
-        result, _ = made(data, tmp_path)
+        result, _ = recover_bytes(data, tmp_path)
         assert tracemalloc.get_traced_memory()[1] < 150 << 20
     finally:
         tracemalloc.stop()
@@ -324,11 +345,11 @@ def test_no_number_in_a_file_is_trusted(data: bytes, tmp_path: Path) -> None:
 @anywhere
 @given(data=st.binary(max_size=300), at=positions)
 def test_any_file_is_recovered_or_refused(data: bytes, at: float, tmp_path: Path) -> None:
-    whole = log()
+    whole = make_chunked_bytes()
     place = int(at * len(whole))
     for content in (data, HEAD + data, whole[:place] + data + whole[place:]):
         try:
-            _, saved = made(content, tmp_path)
+            _, saved = recover_bytes(content, tmp_path)
         except NothingSaved:
             continue
         assert list(StreamReader(io.BytesIO(saved), validate_crcs=True).records)
@@ -349,23 +370,23 @@ def test_recovered_names_follow_their_file() -> None:
 
 
 def test_only_permitted_files_are_replaced(tmp_path: Path) -> None:
-    torn = tmp_path / "run.mcap.active"
-    torn.write_bytes(log()[:-100])
-    (tmp_path / "run.mcap").write_bytes(b"precious")
+    torn = write_log(tmp_path, make_chunked_bytes()[:-100], "run.mcap.active")
+    write_log(tmp_path, b"precious")
     with pytest.raises(UsageError, match=r"run\.mcap: already exists"):
         recover(torn)
     with pytest.raises(UsageError, match="is the source file"):
         recover(torn, torn, force=True)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
     recover(torn, force=True)
-    assert messages((tmp_path / "run.mcap").read_bytes()) == messages(log())
-    assert torn.read_bytes() == log()[:-100]
+    assert read_messages((tmp_path / "run.mcap").read_bytes()) == read_messages(
+        make_chunked_bytes()
+    )
+    assert torn.read_bytes() == make_chunked_bytes()[:-100]
 
 
 @pytest.mark.parametrize("content", [b"", b"no log at all", HEAD])
 def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(content)
+    path = write_log(tmp_path, content, "x.mcap")
     with pytest.raises(NothingSaved, match="nothing in this file could be saved"):
         recover(path)
     assert list(tmp_path.iterdir()) == [path]
@@ -377,7 +398,7 @@ def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("change", "code", "told"),
+    ("change", "code", "phrases"),
     [
         (
             lambda data: data[:-60],
@@ -390,12 +411,12 @@ def test_without_messages_no_file_is_made(content: bytes, tmp_path: Path) -> Non
     ids=["lossless", "lossy", "nothing to save"],
 )
 def test_exit_codes_give_the_outcome(
-    change: Callable[[bytes], bytes], code: int, told: list[str], tmp_path: Path
+    change: Callable[[bytes], bytes], code: int, phrases: list[str], tmp_path: Path
 ) -> None:
-    (tmp_path / "run.mcap.active").write_bytes(change(log()))
+    write_log(tmp_path, change(make_chunked_bytes()), "run.mcap.active")
     done = trilat("log", "recover", "run.mcap.active", cwd=tmp_path)
     assert done.code == code, done
-    for fact in told:
+    for fact in phrases:
         assert fact in done.out
     if code == 1:
         done.refuses("nothing in this file could be saved", code=1)
@@ -410,11 +431,13 @@ def test_exit_codes_give_the_outcome(
     assert done.code == code
     assert facts["lossless"] == (code == 0)
     assert facts["coverage"].keys() == {"m1", "m2", "s"}
-    assert all(one["ticks"] == 120 for one in facts["coverage"].values())
-    assert all((one["records"] == 120) == (code == 0) for one in facts["coverage"].values())
+    assert all(coverage["ticks"] == 120 for coverage in facts["coverage"].values())
+    assert all(
+        (coverage["records"] == 120) == (code == 0) for coverage in facts["coverage"].values()
+    )
     assert facts["digest_chain"] == ("intact" if code == 0 else "not closed")
     assert facts["output"] == "other.mcap"
-    assert facts["messages"] == len(messages((tmp_path / "other.mcap").read_bytes()))
+    assert facts["messages"] == len(read_messages((tmp_path / "other.mcap").read_bytes()))
     assert not active_path(tmp_path / "other.mcap").exists()
     trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses(
         "run.mcap: already exists", "--force"
@@ -423,6 +446,6 @@ def test_exit_codes_give_the_outcome(
 
 @pytest.mark.parametrize("command", [["log", "recover"], ["verify"]])
 def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Path) -> None:
-    (tmp_path / "run.mcap.active").write_bytes(log()[:-60])
+    write_log(tmp_path, make_chunked_bytes()[:-60], "run.mcap.active")
     done = trilat(*command, "run.mcap", cwd=tmp_path)
     done.refuses("run.mcap: cannot be read", "trilat log recover run.mcap.active")

@@ -8,8 +8,8 @@ import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.chains import two_arms
 from tests.core.chain_references import ARMS, chain_references
+from tests.scenario.builders import two_arm_text
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import (
     SPACING_M,
@@ -23,23 +23,26 @@ from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5, 0.1, 1.6, 0.2]}
 
 
-def scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
-    text = two_arms(f"{arm}.urdf", POSES[arm]).replace("[control]", f"down = {down}\n[control]")
+def make_robot_scenario(arm: str = "arm6", down: str = "[0.0, 0.0, -1.0]") -> Scenario:
+    text = two_arm_text(f"{arm}.urdf", POSES[arm]).replace(
+        "[control]", f"down = {down}\n[control]"
+    )
     return parse_scenario(text, "two.toml")
 
 
 def end_of(model: RobotModel, q) -> tuple:
     """The last frame in that of the base, by what is sent."""
-    at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-    for origin, own in model.compute_transforms(q)[1:]:
+    at = (0.0, 0.0, 0.0)
+    turned = (0.0, 0.0, 0.0, 1.0)
+    for origin, rotation in model.compute_transforms(q)[1:]:
         at = tuple(a + b for a, b in zip(at, rotate_vector(turned, origin), strict=True))
-        turned = multiply_quaternions(turned, own)
+        turned = multiply_quaternions(turned, rotation)
     return at, turned
 
 
 @pytest.mark.parametrize("arm", POSES)
 def test_last_frames_equal_pinocchios_end(arm):
-    model = RobotModel(scenario(arm), "m")
+    model = RobotModel(make_robot_scenario(arm), "m")
     reference = chain_references()[arm]
     assert model.frames[-1][1] == f"m/{reference_tip(arm)}"
     for state in reference.states:
@@ -60,7 +63,7 @@ def reference_tip(arm: str) -> str:
     "down", [(0.0, 0.0, -1.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)]
 )
 def test_bases_stand_apart_and_gravity_points_down(down):
-    models = [RobotModel(scenario(down=str([*down])), site) for site in ("m", "s")]
+    models = [RobotModel(make_robot_scenario(down=str([*down])), site) for site in ("m", "s")]
     (m, turned), (s, _) = (model.compute_transforms(POSES["arm6"])[0] for model in models)
     assert math.dist(m, s) == SPACING_M
     assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx(
@@ -69,29 +72,30 @@ def test_bases_stand_apart_and_gravity_points_down(down):
 
 
 def test_ros_decoders_read_the_message():
-    model = RobotModel(scenario(), "m")
+    model = RobotModel(make_robot_scenario(), "m")
     schema = Schema(
         id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS]
     )
     q = POSES["arm6"]
     message = DecoderFactory().decoder_for("cdr", schema)(model.pack(5_000_000_007, q))
     assert [(t.header.frame_id, t.child_frame_id) for t in message.transforms] == model.frames
-    for one, (origin, turned) in zip(
+    for stamped, (origin, turned) in zip(
         message.transforms, model.compute_transforms(q), strict=True
     ):
-        t, r = one.transform.translation, one.transform.rotation
+        t = stamped.transform.translation
+        r = stamped.transform.rotation
         assert ((t.x, t.y, t.z), (r.x, r.y, r.z, r.w)) == (origin, turned)
-        assert (one.header.stamp.sec, one.header.stamp.nanosec) == (5, 7)
+        assert (stamped.header.stamp.sec, stamped.header.stamp.nanosec) == (5, 7)
     assert {channel.kind for channel in ROBOT_CHANNELS.values()} == {cdr.STRING, cdr.TRANSFORMS}
 
 
 def test_the_robot_description_has_the_links_and_shapes():
-    root = ElementTree.fromstring(RobotModel(scenario(), "s").description)
-    given = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
+    root = ElementTree.fromstring(RobotModel(make_robot_scenario(), "s").description)
+    source = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
     names = [link.get("name") for link in root.findall("link")]
-    assert names == [f"s/{link.get('name')}" for link in given.findall("link")]
+    assert names == [f"s/{link.get('name')}" for link in source.findall("link")]
     assert [j.get("name") for j in root.findall("joint")] == [
-        j.get("name") for j in given.findall("joint")
+        j.get("name") for j in source.findall("joint")
     ]
     arm = next(link for link in root.findall("link") if link.get("name") == "s/upper_arm")
     assert float(arm.find("visual/geometry/cylinder").get("length")) == pytest.approx(0.425)
@@ -102,10 +106,11 @@ def test_unlike_arms_end_where_sites_say():
     unlike = load_scenario("unlike_arms")
     for n, (site, spec) in enumerate(unlike.sites.items()):
         model = RobotModel(unlike, site)
-        at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-        for origin, own in model.compute_transforms(spec.q0_rad):
+        at = (0.0, 0.0, 0.0)
+        turned = (0.0, 0.0, 0.0, 1.0)
+        for origin, rotation in model.compute_transforms(spec.q0_rad):
             at = np.add(at, rotate_vector(turned, origin))
-            turned = multiply_quaternions(turned, own)
+            turned = multiply_quaternions(turned, rotation)
         wanted = unlike.arms[site].shared_pose(spec.q0_rad)
         assert spec.task.scale * (at - [0.0, n * SPACING_M, 0.0]) == pytest.approx(
             wanted, abs=1e-12

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from tests.log.dealt import foreign, split
-from tests.log.hostility import chunk
-from tests.log_editing import edited, recorded, without
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, write_log
+from tests.log.hostility import make_chunk
+from tests.log.split_logs import make_foreign_bytes, write_late_parts
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
@@ -30,13 +30,13 @@ from trilat_net.log.mcap_records import (
 from trilat_net.log.recovery import recover
 from trilat_net.log.session_check import LogCheckResult, check_file
 
-WHOLE = recorded("paper")
-DATA = edited(WHOLE, chunk_bytes=8192)
+WHOLE = make_log_bytes("paper")
+DATA = edit_log_bytes(WHOLE, chunk_bytes=8192)
 BUILT = {"whole", "checksums", "records", "index"}
 OURS = {"sequence", "accounts", "chain", "schema", "times", "rates", "scenario"}
 
 
-def judged(folder: Path, *files: bytes) -> LogCheckResult:
+def check_bytes(folder: Path, *files: bytes) -> LogCheckResult:
     paths = []
     for n, data in enumerate(files):
         paths.append(folder / f"part{n}.mcap")
@@ -44,66 +44,84 @@ def judged(folder: Path, *files: bytes) -> LogCheckResult:
     return check_file(*paths)
 
 
-def failed(found: LogCheckResult) -> set[str]:
-    return {finding.check for finding in found.findings if not finding.passed}
+def list_failed_checks(result: LogCheckResult) -> set[str]:
+    return {finding.check for finding in result.findings if not finding.passed}
 
 
-def first(opcode: int) -> RecordFrame:
+def find_first_record(opcode: int) -> RecordFrame:
     return next(
         frame for frame in RecordScanner(io.BytesIO(DATA)).frames() if frame.opcode == opcode
     )
 
 
-def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
+def flip_byte(data: bytes, offset: int, flip: int = 1) -> bytes:
     changed = bytearray(data)
     changed[offset] ^= flip
     return bytes(changed)
 
 
-def within(opcode: int, place: int = 0) -> bytes:
+def flip_in_first_record(opcode: int, place: int = 0) -> bytes:
     """The log with a bit flipped in the content of its first record of a kind."""
-    return poked(DATA, first(opcode).offset + RECORD_HEAD_BYTES + place)
+    return flip_byte(DATA, find_first_record(opcode).offset + RECORD_HEAD_BYTES + place)
 
 
-@pytest.mark.parametrize("data", [WHOLE, DATA, recorded("jitter", {"duration_s": 0.1})])
+@pytest.mark.parametrize("data", [WHOLE, DATA, make_log_bytes("jitter", {"duration_s": 0.1})])
 def test_a_log_as_it_was_written_is_sound(data: bytes, tmp_path: Path) -> None:
-    found = judged(tmp_path, data)
-    assert found.passed, found
-    assert found.ours
-    assert {finding.check for finding in found.findings} == BUILT | OURS
+    result = check_bytes(tmp_path, data)
+    assert result.passed, result
+    assert result.ours
+    assert {finding.check for finding in result.findings} == BUILT | OURS
 
 
 ZSTD = bytes.fromhex("28b52ffd")
 """How what Zstandard has packed begins."""
-CHUNK = first(Opcode.CHUNK)
+CHUNK = find_first_record(Opcode.CHUNK)
 WRONG: dict[str, tuple[bytes, set[str]]] = {
     "cut off": (DATA[:-3000], {"whole"}),
     "without its last mark": (DATA[:-8], {"whole"}),
     "more behind the end": (DATA + b"more", {"whole"}),
-    "a byte of a chunk": (poked(DATA, DATA.index(ZSTD, CHUNK.offset)), {"records"}),
-    "the checksum of a chunk": (within(Opcode.CHUNK, 24), {"checksums"}),
-    "a byte of the scenario": (poked(DATA, first(Opcode.ATTACHMENT).end - 99), {"checksums"}),
-    "a number in the statistics": (within(Opcode.STATISTICS), {"index", "checksums"}),
-    "the place of a chunk": (within(Opcode.CHUNK_INDEX, 16), {"index", "checksums"}),
-    "the length of a chunk": (within(Opcode.CHUNK_INDEX, 24), {"index", "checksums"}),
-    "the place of metadata": (within(Opcode.METADATA_INDEX), {"index", "checksums"}),
-    "where the index begins": (within(Opcode.FOOTER), {"checksums"}),
-    "the checksum of the index": (poked(DATA, first(Opcode.FOOTER).end - 1), {"checksums"}),
+    "a byte of a chunk": (flip_byte(DATA, DATA.index(ZSTD, CHUNK.offset)), {"records"}),
+    "the checksum of a chunk": (flip_in_first_record(Opcode.CHUNK, 24), {"checksums"}),
+    "a byte of the scenario": (
+        flip_byte(DATA, find_first_record(Opcode.ATTACHMENT).end - 99),
+        {"checksums"},
+    ),
+    "a number in the statistics": (
+        flip_in_first_record(Opcode.STATISTICS),
+        {"index", "checksums"},
+    ),
+    "the place of a chunk": (
+        flip_in_first_record(Opcode.CHUNK_INDEX, 16),
+        {"index", "checksums"},
+    ),
+    "the length of a chunk": (
+        flip_in_first_record(Opcode.CHUNK_INDEX, 24),
+        {"index", "checksums"},
+    ),
+    "the place of metadata": (
+        flip_in_first_record(Opcode.METADATA_INDEX),
+        {"index", "checksums"},
+    ),
+    "where the index begins": (flip_in_first_record(Opcode.FOOTER), {"checksums"}),
+    "the checksum of the index": (
+        flip_byte(DATA, find_first_record(Opcode.FOOTER).end - 1),
+        {"checksums"},
+    ),
     "an entry of a message index": (
-        poked(DATA, first(Opcode.MESSAGE_INDEX).end - 1),
+        flip_byte(DATA, find_first_record(Opcode.MESSAGE_INDEX).end - 1),
         {"index"},
     ),
-    "the times of a chunk": (within(Opcode.CHUNK, 8), {"index"}),
+    "the times of a chunk": (flip_in_first_record(Opcode.CHUNK, 8), {"index"}),
 }
 
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_file_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks = WRONG[kind]
-    found = judged(tmp_path, data)
-    built = failed(found) & BUILT
-    assert built == checks, found.findings
-    named = [finding for finding in found.findings if finding.check in built]
+    result = check_bytes(tmp_path, data)
+    built = list_failed_checks(result) & BUILT
+    assert built == checks, result.findings
+    named = [finding for finding in result.findings if finding.check in built]
     assert all(finding.places[0].offset is not None for finding in named)
 
 
@@ -111,7 +129,7 @@ def test_file_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
 @given(st.integers(0, len(WHOLE) - 1), st.integers(0, 7))
 def test_no_changed_bit_stays_unseen(place: int, bit: int) -> None:
     """Every byte is under a checksum, an index or a rule; what MCAP itself leaves open is said here."""
-    found = _of(poked(WHOLE, place, 1 << bit))
+    result = _check_bytes(flip_byte(WHOLE, place, 1 << bit))
     frame = next((f for f in _FRAMES if f.offset <= place < f.end), None)
     inside = place - (frame.offset + RECORD_HEAD_BYTES) if frame is not None else 0
     free = frame is not None and (
@@ -121,60 +139,68 @@ def test_no_changed_bit_stays_unseen(place: int, bit: int) -> None:
         or (frame.opcode == Opcode.CHUNK and inside > 40)
         or inside < 0
     )
-    assert free or not found.passed
+    assert free or not result.passed
 
 
 _FRAMES = list(RecordScanner(io.BytesIO(WHOLE)).frames())
 
 
-def _of(data: bytes) -> LogCheckResult:
+def _check_bytes(data: bytes) -> LogCheckResult:
     with tempfile.TemporaryDirectory() as folder:
-        return judged(Path(folder), data)
+        return check_bytes(Path(folder), data)
 
 
 SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "records are missing": (
-        lambda: edited(DATA, record=without("m1", {7, 8, 9, 40})),
+        lambda: edit_log_bytes(DATA, record=drop_records("m1", {7, 8, 9, 40})),
         {"sequence", "accounts"},
         "4 missing in 2 ranges",
     ),
     "the last records are missing": (
-        lambda: edited(DATA, record=without("s", {118, 119})),
+        lambda: edit_log_bytes(DATA, record=drop_records("s", {118, 119})),
         {"sequence", "accounts"},
         "2 missing in 1 range",
     ),
     "a number twice": (
-        lambda: edited(DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r
+        ),
         {"sequence", "accounts"},
         "message 5 occurs twice",
     ),
     "a message of another site": (
-        lambda: edited(DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r
+        ),
         {"schema"},
         "a message states the sender 'm2'",
     ),
     "a message that is none": (
-        lambda: edited(DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r
+        ),
         {"schema", "sequence", "accounts"},
         "q has 1 number, not 2",
     ),
     "sent at another time": (
-        lambda: edited(DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r),
+        lambda: edit_log_bytes(
+            DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r
+        ),
         {"times"},
         "was sent at 5 ns, but is stored with 3000000",
     ),
     "another scenario": (
-        lambda: edited(DATA, scenario=lambda text: text + "# and more\n"),
+        lambda: edit_log_bytes(DATA, scenario=lambda text: text + "# and more\n"),
         {"scenario"},
         "SHA-256",
     ),
     "another seed": (
-        lambda: edited(DATA, session={"seed": "7"}),
+        lambda: edit_log_bytes(DATA, session={"seed": "7"}),
         {"scenario"},
         "has the seed 1",
     ),
     "another version": (
-        lambda: edited(DATA, session={"schema_version": "2"}),
+        lambda: edit_log_bytes(DATA, session={"schema_version": "2"}),
         {"schema"},
         "has the schema trilat.State.v4, not trilat.State.v2",
     ),
@@ -184,82 +210,81 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
 @pytest.mark.parametrize("kind", SAID)
 def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks, text = SAID[kind]
-    found = judged(tmp_path, data())
-    assert failed(found) == checks, found.findings
-    assert any(text in f"{f.text} {f.places}" for f in found.findings if not f.passed), (
-        found.findings
+    result = check_bytes(tmp_path, data())
+    assert list_failed_checks(result) == checks, result.findings
+    assert any(text in f"{f.text} {f.places}" for f in result.findings if not f.passed), (
+        result.findings
     )
 
 
 def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
     """Each alone lacks what the other has; together nothing is missing."""
-    early = edited(DATA, record=lambda r: r if r["tick"] < 60 else None)
-    late = edited(DATA, record=lambda r: r if r["tick"] >= 60 else None)
-    assert "sequence" in failed(judged(tmp_path, early))
-    both = judged(tmp_path, early, late)
-    assert "sequence" not in failed(both), both.findings
+    early = edit_log_bytes(DATA, record=lambda r: r if r["tick"] < 60 else None)
+    late = edit_log_bytes(DATA, record=lambda r: r if r["tick"] >= 60 else None)
+    assert "sequence" in list_failed_checks(check_bytes(tmp_path, early))
+    both = check_bytes(tmp_path, early, late)
+    assert "sequence" not in list_failed_checks(both), both.findings
 
 
 def test_parts_with_late_records_are_whole(tmp_path: Path) -> None:
     """Nothing is missing over the seams; what a site's memory filled is there, and executes like the rest."""
-    parts = split(tmp_path, refilled=range(30, 50))
+    parts = write_late_parts(tmp_path, refilled=range(30, 50))
     assert len(parts) >= 3
-    found = check_file(*parts)
-    assert found.passed, found.findings
-    assert "20 came late" in next(f.text for f in found.findings if f.check == "sequence")
+    result = check_file(*parts)
+    assert result.passed, result.findings
+    assert "20 came late" in next(f.text for f in result.findings if f.check == "sequence")
     verdict = verify(open_log(*parts))
     assert (verdict.records, verdict.identical, verdict.gaps) == (360, 360, [])
 
 
 def test_parts_are_judged_from_their_beginning(tmp_path: Path) -> None:
-    """What came before is in the parts before; what it lacks itself is missing all the same."""
-    parts = split(tmp_path, refilled=range(0))
+    """Records of earlier parts are expected there; records that the part itself lacks are missing."""
+    parts = write_late_parts(tmp_path, refilled=range(0))
     assert check_file(*parts[1:2]).passed
     first_and_last = check_file(parts[0], parts[2])
-    assert failed(first_and_last) == {"sequence", "accounts"}
+    assert list_failed_checks(first_and_last) == {"sequence", "accounts"}
     assert verify(open_log(parts[0], parts[2])).gaps
 
 
 def test_recovered_files_lack_only_lost_records(tmp_path: Path) -> None:
-    torn = tmp_path / "run.mcap.active"
-    torn.write_bytes(DATA[: len(DATA) // 2])
+    torn = write_log(tmp_path, DATA[: len(DATA) // 2], "run.mcap.active")
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):
-        made = recover(torn).output
-    assert "whole" in failed(check_file(torn))
-    found = check_file(made)
-    assert failed(found) & BUILT == set(), found.findings
-    assert "accounts" not in failed(found), found.findings
-    verdict = verify(open_log(made))
+        recovered = recover(torn).output
+    assert "whole" in list_failed_checks(check_file(torn))
+    result = check_file(recovered)
+    assert list_failed_checks(result) & BUILT == set(), result.findings
+    assert "accounts" not in list_failed_checks(result), result.findings
+    verdict = verify(open_log(recovered))
     assert verdict.agreed
     assert verdict.records == sum(len(open_log(torn)[site]) for site in ("m1", "m2", "s"))
 
 
 def test_files_of_different_sessions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="another session"):
-        judged(tmp_path, DATA, edited(DATA, session={"session": "other"}))
+        check_bytes(tmp_path, DATA, edit_log_bytes(DATA, session={"session": "other"}))
 
 
 def test_foreign_files_are_judged_by_structure(tmp_path: Path) -> None:
-    found = judged(tmp_path, foreign())
-    assert found.passed
-    assert not found.ours
-    assert {finding.check for finding in found.findings} == BUILT
+    result = check_bytes(tmp_path, make_foreign_bytes())
+    assert result.passed
+    assert not result.ours
+    assert {finding.check for finding in result.findings} == BUILT
 
 
 def test_forbidden_chunk_contents_are_reported(tmp_path: Path) -> None:
     """A chunk in a chunk, a message of no channel, a channel that is two things."""
     records = unpack_chunk(RecordScanner(io.BytesIO(DATA)).content(CHUNK))
     lost = struct.pack("<BQHIQQ", 5, 22, 999, 0, 0, 0)
-    for more, text in ((lost, "channel 999"), (chunk(b""), "kind 6")):
-        new = chunk(records + more)
-        found = judged(tmp_path, DATA[: CHUNK.offset] + new + DATA[CHUNK.end :])
-        assert "records" in failed(found)
-        assert any(text in str(f.places) for f in found.findings)
+    for more, text in ((lost, "channel 999"), (make_chunk(b""), "kind 6")):
+        new = make_chunk(records + more)
+        result = check_bytes(tmp_path, DATA[: CHUNK.offset] + new + DATA[CHUNK.end :])
+        assert "records" in list_failed_checks(result)
+        assert any(text in str(f.places) for f in result.findings)
 
 
 @pytest.mark.parametrize("data", [b"", b"text", MAGIC])
 def test_files_without_mcap_are_not_sound(data: bytes, tmp_path: Path) -> None:
-    assert "whole" in failed(judged(tmp_path, data))
+    assert "whole" in list_failed_checks(check_bytes(tmp_path, data))
 
 
 def test_missing_files_are_errors(tmp_path: Path) -> None:
@@ -286,12 +311,16 @@ def test_pymcap_cli_agrees_about_errors(tmp_path: Path) -> None:
             [executable, "doctor", path], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
     theirs = {kind: process.wait() == 0 for kind, process in running.items()}
-    ours = {kind: not failed(_of(data)) & BUILT for kind, data in cases.items()}
+    ours = {
+        kind: not list_failed_checks(_check_bytes(data)) & BUILT for kind, data in cases.items()
+    }
     assert theirs == ours
 
 
 def test_existing_data_checksums_are_compared(tmp_path: Path) -> None:
     """Our writer makes none; of a file that has one it is told when a byte of the data changed."""
-    data = foreign([b"{}"] * 100, enable_data_crcs=True)
-    assert judged(tmp_path, data).passed
-    assert failed(judged(tmp_path, poked(data, data.index(b"mcap") + 2))) == {"checksums"}
+    data = make_foreign_bytes([b"{}"] * 100, enable_data_crcs=True)
+    assert check_bytes(tmp_path, data).passed
+    assert list_failed_checks(
+        check_bytes(tmp_path, flip_byte(data, data.index(b"mcap") + 2))
+    ) == {"checksums"}

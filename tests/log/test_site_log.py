@@ -22,12 +22,12 @@ EMPTY = State(
 )  # fmt: skip
 
 
-def state(tick: int) -> State:
+def make_state(tick: int) -> State:
     return msgspec.structs.replace(EMPTY, tick=tick)
 
 
-def decoded(payloads: Sequence[bytes]) -> list[State]:
-    return [state(int(payload)) for payload in payloads]
+def decode_ticks(payloads: Sequence[bytes]) -> list[State]:
+    return [make_state(int(payload)) for payload in payloads]
 
 
 @pytest.fixture(autouse=True)
@@ -42,8 +42,8 @@ counts = st.integers(0, 30)
 @given(counts, st.lists(st.one_of(st.integers(-35, 35), st.slices(30)), max_size=10))
 def test_site_logs_equal_lists_of_records(count: int, looks: list[int | slice]) -> None:
     payloads = [str(n).encode() for n in range(count)]
-    every = decoded(payloads)
-    some = LazyRecords(payloads, decoded)
+    every = decode_ticks(payloads)
+    some = LazyRecords(payloads, decode_ticks)
     assert (len(some), list(some), list(reversed(some))) == (count, every, every[::-1])
     for look in looks:
         try:
@@ -56,21 +56,21 @@ def test_site_logs_equal_lists_of_records(count: int, looks: list[int | slice]) 
 
 
 def test_only_recent_blocks_are_held() -> None:
-    asked: list[int] = []
+    first_ticks: list[int] = []
 
     def counted(payloads: Sequence[bytes]) -> list[State]:
-        asked.append(int(payloads[0]))
-        return decoded(payloads)
+        first_ticks.append(int(payloads[0]))
+        return decode_ticks(payloads)
 
     some = LazyRecords([str(n).encode() for n in range(16)], counted)
     for n in (0, 1, 4, 0, 8, 0, 4):  # 4 was looked at longest ago when 8 came
         assert some[n].tick == n
-    assert asked == [0, 4, 8, 4]
+    assert first_ticks == [0, 4, 8, 4]
 
 
 def test_few_records_are_a_list() -> None:
-    assert isinstance(site_log.decode_records([b"1"] * 8, decoded), list)
-    assert isinstance(site_log.decode_records([b"1"] * 9, decoded), LazyRecords)
+    assert isinstance(site_log.decode_records([b"1"] * 8, decode_ticks), list)
+    assert isinstance(site_log.decode_records([b"1"] * 9, decode_ticks), LazyRecords)
 
 
 @pytest.mark.parametrize("field", ["rx", "echo", "cmd", "mem", "used"])
@@ -86,7 +86,9 @@ def test_long_records_are_held_few_at_once(field: str, monkeypatch: pytest.Monke
 
 @given(st.lists(st.integers(0, 20), max_size=20).map(sorted))
 def test_records_by_tick_equal_their_dictionary(ticks: list[int]) -> None:
-    states = [msgspec.structs.replace(state(tick), late_us=n) for n, tick in enumerate(ticks)]
+    states = [
+        msgspec.structs.replace(make_state(tick), late_us=n) for n, tick in enumerate(ticks)
+    ]
     by_tick = RecordsByTick(states, np.array(ticks, dtype=np.int64))
     assert dict(by_tick) == {s.tick: s for s in states}
     assert len(by_tick) == len(set(ticks))
@@ -101,12 +103,13 @@ def test_orientation_errors_equal_scipys_turns() -> None:
     x_des[:100, 3:] = x[:100, 3:] + 10.0 ** rng.uniform(-12.0, -1.0, (100, 1)) * rng.normal(
         size=(100, 3)
     )
-    x_des[100:110, 3:], x[110:120, 3:] = x[100:110, 3:], 0.0
+    x_des[100:110, 3:] = x[100:110, 3:]
+    x[110:120, 3:] = 0.0
     # half a turn
     x[120:140, 3:] *= np.pi / np.linalg.norm(x[120:140, 3:], axis=1, keepdims=True)
-    there, here = (Rotation.from_rotvec(one[:, 3:]) for one in (x_des, x))
+    reference, actual = (Rotation.from_rotvec(poses[:, 3:]) for poses in (x_des, x))
     e = compute_task_errors(x, x_des, [1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
-    assert np.abs(e[:, 3:] - (here * there.inv()).as_rotvec()).max() <= 1e-14
+    assert np.abs(e[:, 3:] - (actual * reference.inv()).as_rotvec()).max() <= 1e-14
     assert not e[100:110, 3:].any()
     assert np.array_equal(e[:, :2], x[:, :2] - x_des[:, :2])
     assert not e[:, 2].any()

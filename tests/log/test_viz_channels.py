@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.log.dealt import messages
+from tests.execution.builders import execute_ticks
+from tests.log.builders import simulate_bytes
+from tests.log.split_logs import read_messages
 from trilat_net.core.step.ticks import Mode, TickRecord
-from trilat_net.execution import virtual
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.ros2.ros2_messages import stack_signals
@@ -77,7 +78,7 @@ class Desk:
 
 
 @cache
-def _decoder(kind: str) -> Any:
+def _make_decoder(kind: str) -> Any:
     from mcap.records import Schema
 
     from trilat_net.log.ros2 import cdr
@@ -87,13 +88,13 @@ def _decoder(kind: str) -> Any:
 
 
 def numbers_of(kind: str, data: bytes) -> list[float]:
-    message = _decoder(kind)(data)
+    message = _make_decoder(kind)(data)
     if kind == "sensor_msgs/msg/JointState":
         return [*message.position, *message.velocity, *message.effort]
     return list(message.data)
 
 
-def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRecord:
+def make_record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRecord:
     """A record whose numbers are these, from q to theta_hat."""
     n = iter(numbers)
     vectors = [[next(n) for _ in range(size)] for size in (2, 2, 2, 2, 2, 2, 5)]
@@ -103,16 +104,16 @@ def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRe
     )
 
 
-def joint_row(one: TickRecord) -> list[float]:
-    return [x for name in CURVES for x in getattr(one, name)]
+def joint_row(record: TickRecord) -> list[float]:
+    return [x for name in CURVES for x in getattr(record, name)]
 
 
-def error_row(one: TickRecord) -> list[float]:
-    return [a - b for a, b in zip(one.q, one.q_des, strict=True)]
+def error_row(record: TickRecord) -> list[float]:
+    return [a - b for a, b in zip(record.q, record.q_des, strict=True)]
 
 
-def slow_row(one: TickRecord) -> list[float]:
-    return [*one.tau_x, *one.theta_hat, float(one.mode)]
+def slow_row(record: TickRecord) -> list[float]:
+    return [*record.tau_x, *record.theta_hat, float(record.mode)]
 
 
 def error_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
@@ -129,7 +130,7 @@ def slow_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
 
 
 def joint_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
-    """Of the joint states what `joint_row` has; of a reference there are angles alone."""
+    """Returns the numbers of `joint_row` in the joint states; a reference has angles only."""
     rows = desk.arrays("/viz/m/joint_states")
     assert all(math.isnan(x) for _, row in rows for x in row[6:8] + row[10:])
     return [(t_ns, row[:6] + row[8:10]) for t_ns, row in rows]
@@ -147,8 +148,8 @@ def test_an_envelope_is_the_extremes_in_their_order(
 
 
 @st.composite
-def runs(draw: st.DrawFn) -> list[TickRecord]:
-    """Some ticks of a second, in any order, with small or arbitrary numbers."""
+def draw_records(draw: st.DrawFn) -> list[TickRecord]:
+    """Draws records of some ticks of a second, in any order, with small or arbitrary numbers."""
     ticks = draw(st.lists(st.integers(0, 450), unique=True, min_size=1, max_size=120))
     if draw(st.booleans()):
         ticks.sort()
@@ -156,21 +157,21 @@ def runs(draw: st.DrawFn) -> list[TickRecord]:
     numbers = rng.integers(-3, 4, (len(ticks), 17)) * rng.choice([1.0, 1e-9, 1e5], 17)
     modes = rng.choice([Mode.RUN, Mode.HOLD, Mode.DIVERGED], len(ticks), p=[0.9, 0.05, 0.05])
     return [
-        record(tick, row.tolist(), Mode(mode))
+        make_record(tick, row.tolist(), Mode(mode))
         for tick, row, mode in zip(ticks, numbers, modes, strict=True)
     ]
 
 
-def buckets(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRecord]]:
+def group_records(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRecord]]:
     by: dict[int, list[TickRecord]] = defaultdict(list)
-    for one in records:
-        by[one.tick // length].append(one)
+    for record in records:
+        by[record.tick // length].append(record)
     return by
 
 
-@given(runs())
+@given(draw_records())
 def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> None:
-    """In whatever order the records come."""
+    """The extremes appear in whatever order the records come."""
     desk = Desk(100.0)
     desk.take(records)
     desk.finish()
@@ -182,7 +183,7 @@ def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> No
         put: dict[int, list[list[float]]] = defaultdict(list)
         for t_ns, row in arrays_of(desk):
             put[t_ns // (length * 10**6)].append(row)
-        wanted = buckets(records, length)
+        wanted = group_records(records, length)
         assert set(put) == set(wanted)
         for number, ones in wanted.items():
             columns = zip(*map(row_of, ones), strict=True)
@@ -192,27 +193,27 @@ def test_exactly_all_extremes_of_buckets_appear(records: list[TickRecord]) -> No
                 assert set(shown) <= set(column)
 
 
-@given(runs())
+@given(draw_records())
 def test_view_messages_keep_log_time_order(records: list[TickRecord]) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.take(records)
     desk.finish()
-    have = {EPOCH_NS + one.t_ns for one in records}
+    have = {EPOCH_NS + record.t_ns for record in records}
     assert {seen.publish_ns for seen in desk.seen} <= have
     log_ns = [seen.log_ns for seen in desk.seen]
     assert log_ns == sorted(log_ns)
-    if [one.tick for one in records] == sorted(one.tick for one in records):
+    if [record.tick for record in records] == sorted(record.tick for record in records):
         for topic in ("/viz/m/joint_states", "/viz/m/error", "/viz/m/theta_hat"):
             times = [t_ns for t_ns, _ in desk.arrays(topic)]
             assert times == sorted(set(times))
 
 
-@given(runs(), st.randoms(use_true_random=False))
+@given(draw_records(), st.randoms(use_true_random=False))
 def test_disorder_within_a_bucket_is_invisible(
     records: list[TickRecord], chance: random.Random
 ) -> None:
-    in_order = sorted(records, key=lambda one: one.tick)
-    shuffled = sorted(in_order, key=lambda one: (one.tick // BUCKET, chance.random()))
+    in_order = sorted(records, key=lambda record: record.tick)
+    shuffled = sorted(in_order, key=lambda record: (record.tick // BUCKET, chance.random()))
     desks = Desk(100.0), Desk(100.0)
     for desk, ones in zip(desks, (in_order, shuffled), strict=True):
         desk.take(ones)
@@ -224,7 +225,7 @@ def test_disorder_within_a_bucket_is_invisible(
 def test_live_views_have_100_messages_a_second() -> None:
     """The second message of a bucket waits half a bucket, so that curves are even over the log time, too."""
     desk = Desk(100.0)
-    desk.take(record(k, [float(k)] * 17) for k in range(1000))
+    desk.take(make_record(k, [float(k)] * 17) for k in range(1000))
     seen = [s for s in desk.seen if s.topic == "/viz/m/joint_states"]
     assert [s.publish_ns // 10**6 for s in seen] == list(range(0, 980, 10))
     assert [s.log_ns for s in seen] == list(range(20, 1000, 10))
@@ -232,31 +233,33 @@ def test_live_views_have_100_messages_a_second() -> None:
 
 @pytest.mark.parametrize("views_hz", [1000.0, 5000.0, FULL_RATE_HZ])
 def test_full_views_hold_every_record(views_hz: float) -> None:
-    records = [record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
+    records = [make_record(k, [math.sin(k * (n + 1)) for n in range(17)]) for k in range(101)]
     desk = Desk(views_hz)
     desk.take(records)
     desk.finish()
-    assert joint_arrays(desk) == [(one.t_ns, joint_row(one)) for one in records]
+    assert joint_arrays(desk) == [(record.t_ns, joint_row(record)) for record in records]
     if views_hz == FULL_RATE_HZ:
-        assert slow_arrays(desk) == [(one.t_ns, slow_row(one)) for one in records]
+        assert slow_arrays(desk) == [(record.t_ns, slow_row(record)) for record in records]
 
 
-@given(runs())
+@given(draw_records())
 def test_wire_and_simulated_records_look_equal(records: list[TickRecord]) -> None:
-    states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
+    states = [
+        decode(encode_state("m", 1, ["s"], record, [], 0, 0), State) for record in records
+    ]
     assert stack_signals(states) == stack_signals(records)
 
 
 def test_waiting_records_are_bounded_by_buckets() -> None:
     """A sender that counts its ticks in leaps, back and forth, leaves nothing behind."""
     desk = Desk(100.0)
-    desk.take(record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
+    desk.take(make_record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
     (site,) = [buckets for buckets in desk.views._buckets if buckets._first_tick]
     assert len(site._records) + len(site._late_records) <= 2 * BUCKET
     assert len(site._slow_rows) <= SLOW // BUCKET * 2
 
 
-def stats(**facts: Any) -> LinkStats:
+def make_stats(**facts: Any) -> LinkStats:
     counts = {
         "accepted": {"s": 1},
         "late": {"s": 0},
@@ -276,7 +279,7 @@ def test_statistics_have_units_and_unmeasured_are_nan() -> None:
     desk = Desk(100.0)
     clocks = {"offset_us": {"s": -2000}, "bound_us": {"s": 40}}
     delays = {"delay_us": {"s": 800}, "delay_max_us": {"s": 2500}}
-    desk.take([stats(**clocks, **delays)], "trilat/lab/m/link")
+    desk.take([make_stats(**clocks, **delays)], "trilat/lab/m/link")
     shown = {seen.topic.rpartition("/")[2]: numbers_of(*seen.message) for seen in desk.seen}
     assert shown == {
         "link_age": [1.5],
@@ -286,7 +289,7 @@ def test_statistics_have_units_and_unmeasured_are_nan() -> None:
     }
     nothing = Desk(100.0)
     nothing.take(
-        [stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})],
+        [make_stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})],
         "trilat/lab/m/link",
     )
     by_topic = {
@@ -298,7 +301,7 @@ def test_statistics_have_units_and_unmeasured_are_nan() -> None:
 
 def test_virtual_time_shows_no_clocks_or_network() -> None:
     desk = Desk(100.0)
-    desk.take([stats()], "trilat/lab/m/link")
+    desk.take([make_stats()], "trilat/lab/m/link")
     assert [seen.topic for seen in desk.seen] == ["/viz/m/link_age"]
 
 
@@ -308,11 +311,11 @@ def test_events_become_text_with_levels(kind: str, level: int) -> None:
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
     desk.views.receivers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
     text, line = desk.seen
-    assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == (
+    assert (text.topic, _make_decoder(text.message[0])(text.message[1]).data) == (
         "/viz/events",
         "m: ü happened",
     )
-    shown = _decoder(line.message[0])(line.message[1])
+    shown = _make_decoder(line.message[0])(line.message[1])
     assert (line.topic, shown.level, shown.name, shown.msg) == (
         "/viz/log",
         level,
@@ -329,30 +332,28 @@ def test_early_events_have_their_arrival_time() -> None:
         Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9
     )
     kind, data = desk.seen[1].message
-    stamp = _decoder(kind)(data).stamp
+    stamp = _make_decoder(kind)(data).stamp
     assert stamp.sec * 10**9 + stamp.nanosec == EPOCH_NS - 9
 
 
 def test_views_leave_other_messages_unchanged() -> None:
-    own, shown = [], []
+    other_messages = []
+    shown = []
     for views_hz in (0.0, 100.0):
-        stream = io.BytesIO()
-        virtual.write_virtual_log(
-            load_scenario("paper", {"duration_s": 0.5}), stream, views_hz=views_hz
+        scenario = load_scenario("paper", {"duration_s": 0.5})
+        every = read_messages(simulate_bytes(scenario, views_hz=views_hz))
+        other_messages.append(
+            [message for message in every if not message.topic.startswith("/viz")]
         )
-        every = messages(stream.getvalue())
-        own.append([message for message in every if not message.topic.startswith("/viz")])
-        shown.append(len(every) > len(own[-1]))
-    assert own[0] == own[1]
+        shown.append(len(every) > len(other_messages[-1]))
+    assert other_messages[0] == other_messages[1]
     assert shown == [False, True]
 
 
 def test_parts_end_with_all_extremes() -> None:
-    """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
+    """The extremes of the parts are those of the whole, so that none is lost between parts."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
-    outputs = [
-        step.output for step in virtual.execute_virtual(scenario) if step.site.name == "m"
-    ]
+    outputs = execute_ticks(scenario)["m"]
     shown = []
     for part in (outputs[:77], outputs[77:]):
         stream = io.BytesIO()
@@ -365,10 +366,10 @@ def test_parts_end_with_all_extremes() -> None:
             collect_provenance(),
             make_views=offer_views(scenario, 100.0),
         )
-        for one in part:
-            payload = encode_state("m", 1, ["s"], one, [], 0, 0)
+        for output in part:
+            payload = encode_state("m", 1, ["s"], output, [], 0, 0)
             state = decode(payload, State)
-            writer.add(KEY, payload, one.t_ns, EPOCH_NS + one.t_ns, one.tick, state)
+            writer.add(KEY, payload, output.t_ns, EPOCH_NS + output.t_ns, output.tick, state)
         writer.finish({})
         reader = make_reader(
             io.BytesIO(stream.getvalue()), decoder_factories=[DecoderFactory()]
@@ -377,7 +378,7 @@ def test_parts_end_with_all_extremes() -> None:
             [*ros.position, *ros.velocity[:2], *ros.effort[:2]]
             for _, _, _, ros in reader.iter_decoded_messages("/viz/m/joint_states")
         ]
-    whole = np.array([joint_row(one) for one in outputs])
+    whole = np.array([joint_row(output) for output in outputs])
     assert np.array_equal(np.max(shown, axis=0), whole.max(axis=0))
     assert np.array_equal(np.min(shown, axis=0), whole.min(axis=0))
 
@@ -385,6 +386,6 @@ def test_parts_end_with_all_extremes() -> None:
 def test_odd_rates_are_shown_as_asked() -> None:
     scenario = load_scenario("two_sites", {"sites.m.rate_hz": 333})
     desk = Desk(100.0, scenario)
-    desk.take(record(k, [0.0] * 17) for k in range(333))
+    desk.take(make_record(k, [0.0] * 17) for k in range(333))
     desk.finish()
     assert 100 <= len(desk.arrays("/viz/m/joint_states")) <= 112

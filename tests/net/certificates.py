@@ -1,4 +1,4 @@
-"""Certificates of one test: an authority, and a key for this machine that the authority has signed."""
+"""Certificates for one test: an authority, and a key of this machine that the authority has signed."""
 
 import shutil
 import subprocess
@@ -20,15 +20,36 @@ class Certificates:
         extension = folder / "machine.ext"
         extension.write_text(NAMES)
         new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
-        openssl(
-            *("req", "-x509", *new, "-days", "2", "-subj", "/CN=trilat test authority"),
-            *("-keyout", folder / "ca.key", "-out", self.authority),
+        run_openssl(
+            "req",
+            "-x509",
+            *new,
+            "-days",
+            "2",
+            "-subj",
+            "/CN=trilat test authority",
+            "-keyout",
+            folder / "ca.key",
+            "-out",
+            self.authority,
         )
-        openssl("req", *new, "-subj", "/CN=machine", "-keyout", self.key, "-out", request)
-        openssl(
-            *("x509", "-req", "-in", request, "-days", "2"),
-            *("-CA", self.authority, "-CAkey", folder / "ca.key"),
-            *("-CAcreateserial", "-extfile", extension, "-out", self.certificate),
+        run_openssl("req", *new, "-subj", "/CN=machine", "-keyout", self.key, "-out", request)
+        run_openssl(
+            "x509",
+            "-req",
+            "-in",
+            request,
+            "-days",
+            "2",
+            "-CA",
+            self.authority,
+            "-CAkey",
+            folder / "ca.key",
+            "-CAcreateserial",
+            "-extfile",
+            extension,
+            "-out",
+            self.certificate,
         )
 
     def zenoh_file(self) -> Path:
@@ -43,5 +64,5 @@ class Certificates:
         return file
 
 
-def openssl(*arguments: str | Path) -> None:
+def run_openssl(*arguments: str | Path) -> None:
     subprocess.run(["openssl", *arguments], check=True, capture_output=True, timeout=30)

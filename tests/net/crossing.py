@@ -1,4 +1,4 @@
-"""Two clocks and a network between them, made up by a test: readings and truth are known."""
+"""Two simulated clocks and a network between them, whose readings and true times are known."""
 
 import random
 from collections.abc import Callable
@@ -10,8 +10,8 @@ S = 1_000_000_000
 Delay = Callable[[random.Random], int]
 
 
-def queueing(floor_us: float, mean_us: float) -> Delay:
-    """A way with a minimum delay and random queues."""
+def make_queueing_delay(floor_us: float, mean_us: float) -> Delay:
+    """Returns a delay with a minimum and random queues."""
     return lambda rnd: int(1000 * (floor_us + rnd.expovariate(1.0 / mean_us)))
 
 
@@ -28,19 +28,19 @@ class Other:
         return round(own_ns + self.offset(own_ns))
 
 
-def ceiling(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
+def make_ceiling(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
     """Returns the bound that a message sent from here gives, for its travel time."""
     return OffsetLimit(sent_ns, other.reads(sent_ns + delay_ns) - sent_ns)
 
 
-def floor(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
+def make_floor(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
     """Returns the bound that a message sent from there gives, for an instant of the own clock
     and its travel time.
     """
     return OffsetLimit(sent_ns + delay_ns, other.reads(sent_ns) - sent_ns - delay_ns)
 
 
-def second(
+def exchange_second(
     other: Other,
     begin_ns: int,
     way: Delay,
@@ -51,10 +51,11 @@ def second(
     """Returns the tightest bounds of a second of messages both ways, all of which have arrived
     within that second.
     """
-    ceilings, floors = [], []
+    ceilings = []
+    floors = []
     for n in range(messages):
         at_ns = begin_ns + n * (S // 2) // messages
-        ceilings.append(ceiling(other, at_ns, way(rnd)))
-        floors.append(floor(other, at_ns, back(rnd)))
+        ceilings.append(make_ceiling(other, at_ns, way(rnd)))
+        floors.append(make_floor(other, at_ns, back(rnd)))
     level = lambda limit: limit.offset_ns - other.drift_ppb * limit.local_ns / S  # noqa: E731
     return min(ceilings, key=level), max(floors, key=level)

@@ -40,12 +40,12 @@ class Flipping:
         with suppress(OSError):
             while True:
                 self._ends += (
-                    one := self._door.accept()[0],
+                    inner := self._door.accept()[0],
                     other := socket.create_connection(self._to),
                 )
                 self.connections += 1
-                self._begin(self._carry, one, other)
-                self._begin(self._carry, other, one)
+                self._begin(self._carry, inner, other)
+                self._begin(self._carry, other, inner)
 
     def _carry(self, source: socket.socket, sink: socket.socket) -> None:
         with suppress(OSError):
@@ -77,7 +77,8 @@ def main(folder: Path) -> None:
     sender = ZenohBus([], [wire.place], settings=read_member_keys(folder / "m2").settings)
     key = topics.key("x", "m2", topics.EVENT)
     try:
-        inbox, say = receiver.inbox(key), sender.publisher(key)
+        inbox = receiver.inbox(key)
+        say = sender.publisher(key)
 
         def comes() -> bool:
             say(b"true")
@@ -86,7 +87,8 @@ def main(folder: Path) -> None:
             return "true" in payloads
 
         until(comes)
-        before, wire.flips = wire.connections, 1
+        before = wire.connections
+        wire.flips = 1
         until(lambda: comes() and wire.connections > before)
         assert wire.flipped == 1
         print("again", flush=True)

@@ -20,7 +20,7 @@ class Network(Protocol):
         """Returns the connection of a new member, which has met the earlier members."""
 
     def close(self) -> None:
-        """All members leave."""
+        """Closes all members."""
 
 
 class Local:
@@ -40,7 +40,7 @@ class Connected:
         self._members: list[Bus] = []
 
     def _enter(self, bus: Bus) -> Bus:
-        greet(bus, self._members)
+        greet_members(bus, self._members)
         self._members.append(bus)
         return bus
 
@@ -50,9 +50,11 @@ class Connected:
 
 
 class Mesh(Connected):
-    def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, protocol: str = "tcp", settings: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__()
-        self.own = own
+        self.settings = settings
         self._endpoints = [
             endpoint.replace("tcp", protocol) for endpoint in find_free_endpoints(SEATS)
         ]
@@ -61,7 +63,7 @@ class Mesh(Connected):
         seat = len(self._members)
         return self._enter(
             ZenohBus(
-                self._endpoints[seat : seat + 1], self._endpoints[:seat], settings=self.own
+                self._endpoints[seat : seat + 1], self._endpoints[:seat], settings=self.settings
             )
         )
 
@@ -84,19 +86,19 @@ class Routed(Connected):
         self._router.close()
 
 
-def encrypted(protocol: str, folder: Path) -> Mesh:
+def make_encrypted_mesh(protocol: str, folder: Path) -> Mesh:
     """Returns a mesh whose members authenticate each other, by a person's own configuration."""
     return Mesh(protocol, read_zenoh_file(Certificates(folder).zenoh_file()).settings)
 
 
-def greet(newcomer: Bus, members: Sequence[Bus]) -> None:
+def greet_members(newcomer: Bus, members: Sequence[Bus]) -> None:
     """Returns once the earlier members hear a newcomer."""
     greeting = newcomer.publisher("greeting")
     for member in members:
-        meet(greeting, member, "greeting")
+        wait_for_meeting(greeting, member, "greeting")
 
 
-def meet(publish: Callable[[bytes], None], receiver: Bus, key: str) -> None:
+def wait_for_meeting(publish: Callable[[bytes], None], receiver: Bus, key: str) -> None:
     """Returns once published messages reach a receiver."""
     inbox = receiver.inbox(key)
 
@@ -111,6 +113,6 @@ NETWORKS: dict[str, Callable[[Path], Network]] = {
     "local": lambda _: Local(),
     "zenoh": lambda _: Mesh(),
     "router": lambda _: Routed(),
-    "tls": lambda folder: encrypted("tls", folder),
+    "tls": lambda folder: make_encrypted_mesh("tls", folder),
 }
-"""All that keep the contract; each is made in a folder of its own."""
+"""The networks that fulfil the contract; each one is created in its own folder."""

@@ -1,4 +1,4 @@
-"""Members on their way into a session, in one process, on a clock that a test moves."""
+"""Members that join a session, in one process, on a clock that a test moves."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -6,6 +6,7 @@ from contextlib import suppress
 import msgspec
 
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.errors import WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -35,7 +36,7 @@ def answer_info(name: str, boot: int, **facts: object) -> Info:
 
 
 class Elsewhere(ManualClock):
-    """The clock of another machine: both of its readings differ from those here."""
+    """The clock of another machine, which differs in both of its readings."""
 
     def __init__(self, start_ns: int, unix_ns: int, name: str) -> None:
         super().__init__(start_ns, unix_ns)
@@ -119,7 +120,7 @@ class Party:
         for name in names or tuple(self.members):
             self.members[name].poll()
         for clock in self._clocks:
-            clock.sleep_until(clock.monotonic_ns() + STEP_NS)
+            sleep_for_ns(clock, STEP_NS)
 
     def rounds(self, count: int) -> None:
         for _ in range(count):

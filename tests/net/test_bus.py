@@ -28,7 +28,9 @@ def pair(network: Network) -> tuple[Bus, Bus]:
     return network.join(), network.join()
 
 
-def opened(publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[bytes]) -> None:
+def wait_until_heard(
+    publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[bytes]
+) -> None:
     deaf = list(inboxes)
 
     def heard() -> bool:
@@ -47,8 +49,9 @@ NUMBERS = [n.to_bytes(2, "big") for n in range(500)]
 
 def test_rings_give_messages_in_order(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
-    opened(publish, inbox)
+    inbox = receiver.inbox("t/a")
+    publish = sender.publisher("t/a")
+    wait_until_heard(publish, inbox)
     for number in NUMBERS:
         publish(number)
     assert received(inbox, len(NUMBERS)) == [("t/a", number) for number in NUMBERS]
@@ -56,35 +59,39 @@ def test_rings_give_messages_in_order(pair: tuple[Bus, Bus]) -> None:
 
 def test_expressions_match_only_their_keys(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    one, any_number = receiver.inbox("t/*/x"), receiver.inbox("t/**")
+    narrow = receiver.inbox("t/*/x")
+    any_number = receiver.inbox("t/**")
     publishers = {
         key: sender.publisher(key)
         for key in ("t/b/y", "t/a/x", "t/b/b/x", "other/a/x", "t/b/x")
     }
-    opened(publishers["t/b/x"], one, any_number)
+    wait_until_heard(publishers["t/b/x"], narrow, any_number)
     for key, publish in publishers.items():
         publish(key.encode())
-    assert [key for key, _ in received(one, 2)] == ["t/a/x", "t/b/x"]
+    assert [key for key, _ in received(narrow, 2)] == ["t/a/x", "t/b/x"]
     assert [key for key, _ in received(any_number, 4)] == ["t/b/y", "t/a/x", "t/b/b/x", "t/b/x"]
 
 
 def test_own_messages_never_return(pair: tuple[Bus, Bus]) -> None:
     sender, other = pair
-    own, theirs, publish = sender.inbox("t/a"), other.inbox("t/a"), sender.publisher("t/a")
-    opened(publish, theirs)
-    opened(other.publisher("t/a"), own)
+    own_inbox = sender.inbox("t/a")
+    theirs = other.inbox("t/a")
+    publish = sender.publisher("t/a")
+    wait_until_heard(publish, theirs)
+    wait_until_heard(other.publisher("t/a"), own_inbox)
     publish(b"mine")
     other.publisher("t/a")(b"theirs")
-    assert received(own, 1) == [("t/a", b"theirs")]
+    assert received(own_inbox, 1) == [("t/a", b"theirs")]
     assert received(theirs, 1) == [("t/a", b"mine")]
 
 
 def test_taps_get_every_message_in_order(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     heard: list[tuple[str, bytes]] = []
-    inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
+    inbox = receiver.inbox("t/a")
+    publish = sender.publisher("t/a")
     receiver.tap("t/*", lambda key, payload: heard.append((key, payload)))
-    opened(publish, inbox)
+    wait_until_heard(publish, inbox)
     until(lambda: heard and heard[-1][1] == b"last probe")
     heard.clear()
     for number in NUMBERS:
@@ -99,9 +106,10 @@ def test_patient_publishers_lose_nothing(
     """A multiple of the connection's capacity; the receiver is slower."""
     sender, receiver = pair
     heard: list[bytes] = []
-    inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a", patient=True)
+    inbox = receiver.inbox("t/a")
+    publish = sender.publisher("t/a", patient=True)
     receiver.tap("t/a", lambda _, payload: heard.append(payload))
-    opened(publish, inbox)
+    wait_until_heard(publish, inbox)
     until(lambda: heard and heard[-1] == b"last probe")
     heard.clear()
     said = [n.to_bytes(2, "big") * 500 for n in range(6000)]
@@ -113,12 +121,10 @@ def test_patient_publishers_lose_nothing(
 
 def test_full_rings_lose_only_their_oldest(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    small, large, publish = (
-        receiver.inbox("t/a", 16),
-        receiver.inbox("t/a"),
-        sender.publisher("t/a"),
-    )
-    opened(publish, small, large)
+    small = receiver.inbox("t/a", 16)
+    large = receiver.inbox("t/a")
+    publish = sender.publisher("t/a")
+    wait_until_heard(publish, small, large)
     for number in NUMBERS:
         publish(number)
     assert len(received(large, len(NUMBERS))) == len(NUMBERS)
@@ -157,13 +163,13 @@ def test_questions_carry_their_payload(pair: tuple[Bus, Bus]) -> None:
     questions = other.query_inbox("t/a/info")
     for sent in (b"", b"\x00\xff" * 2000, b"again"):
 
-        def asked(sent: bytes = sent) -> bool:
+        def hears_question(sent: bytes = sent) -> bool:
             asker.query("t/*/info", sent)
             question = questions.poll()
             # or one that was asked before
             return question is not None and question.payload == sent
 
-        until(asked)
+        until(hears_question)
 
 
 def test_responders_answer_at_once_without_polling(pair: tuple[Bus, Bus]) -> None:
@@ -192,13 +198,13 @@ def test_silent_responders_let_others_be_heard(network: Network) -> None:
 
 
 def test_no_member_answers_itself(pair: tuple[Bus, Bus]) -> None:
-    own, other = pair
-    own.respond("t/a/ping", lambda _: b"own")
-    own_questions = own.query_inbox("t/b/ping")
+    member, other = pair
+    member.respond("t/a/ping", lambda _: b"own")
+    own_questions = member.query_inbox("t/b/ping")
     other.respond("t/c/ping", lambda _: b"theirs")
 
     def answers() -> list[tuple[str, bytes]]:
-        replies = own.query("t/*/ping")
+        replies = member.query("t/*/ping")
         try:
             return [until(replies.poll, timeout_s=0.5), *drained(replies)]
         except AssertionError:
@@ -222,8 +228,9 @@ class Ticking:
 def test_every_message_is_stamped_once_at_arrival(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     clock = Ticking()
-    inbox, publish = receiver.stamped_inbox("t/a", clock, bytes), sender.publisher("t/a")
-    opened(publish, inbox)
+    inbox = receiver.stamped_inbox("t/a", clock, bytes)
+    publish = sender.publisher("t/a")
+    wait_until_heard(publish, inbox)
     before = clock.readings
     for number in NUMBERS:
         publish(number)
@@ -234,13 +241,12 @@ def test_every_message_is_stamped_once_at_arrival(pair: tuple[Bus, Bus]) -> None
 
 def test_full_stamped_rings_lose_the_oldest(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    inbox, publish = (
-        receiver.stamped_inbox("t/a", Ticking(), bytes, 16),
-        sender.publisher("t/a"),
-    )
-    done, finish = receiver.inbox("t/done"), sender.publisher("t/done")
-    opened(publish, inbox)
-    opened(finish, done)
+    inbox = receiver.stamped_inbox("t/a", Ticking(), bytes, 16)
+    publish = sender.publisher("t/a")
+    done = receiver.inbox("t/done")
+    finish = sender.publisher("t/done")
+    wait_until_heard(publish, inbox)
+    wait_until_heard(finish, done)
     for number in NUMBERS:
         publish(number)
     finish(b"all")
@@ -270,11 +276,11 @@ def test_late_answers_harm_nobody(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
     questions = other.query_inbox("t/a/info")
 
-    def asked() -> object:
+    def ask_again() -> object:
         asker.query("t/*/info")
         return questions.poll()
 
-    question = until(asked)
+    question = until(ask_again)
     asker.close()
     question.reply(b"too late")
     other.publisher("t/a")(b"still here")
@@ -301,9 +307,9 @@ def test_existing_tokens_come_first(pair: tuple[Bus, Bus]) -> None:
 
 
 def test_members_do_not_see_their_own_token(pair: tuple[Bus, Bus]) -> None:
-    own, other = pair
-    presence = own.presence("t/*/alive/*")
-    own.announce("t/a/alive/1")
+    member, other = pair
+    presence = member.presence("t/*/alive/*")
+    member.announce("t/a/alive/1")
     other.announce("t/b/alive/2")
     assert until(presence.poll) == ("t/b/alive/2", True)
 
@@ -320,7 +326,8 @@ def test_leaving_twice_is_leaving_once(pair: tuple[Bus, Bus]) -> None:
 
 
 def test_members_of_two_networks_never_meet() -> None:
-    first, other = LocalNetwork().join(), LocalNetwork().join()
+    first = LocalNetwork().join()
+    other = LocalNetwork().join()
     inbox = other.inbox("**")
     first.publisher("t/a")(b"1")
     assert inbox.poll() is None

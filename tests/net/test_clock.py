@@ -74,7 +74,8 @@ def test_a_signal_does_not_shorten_a_sleep() -> None:
 
 def test_windows_clocks_have_fine_resolution() -> None:
     """Python 3.12 reads GetTickCount64 for `monotonic` on Windows, which goes in steps of 16 ms."""
-    fine, coarse = time.get_clock_info("perf_counter"), time.get_clock_info("monotonic")
+    fine = time.get_clock_info("perf_counter")
+    coarse = time.get_clock_info("monotonic")
     assert SystemClock.monotonic_ns is time.perf_counter_ns
     if os.name == "posix":
         assert fine == coarse

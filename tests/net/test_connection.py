@@ -27,15 +27,18 @@ from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
 
 from .local_bus import LocalNetwork
 
-HERE, THERE = ["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"]
-A, B, C = "tcp/a:1", "tcp/b:1", "tcp/c:1"
+HERE = ["tcp/127.0.0.1:1"]
+THERE = ["tcp/127.0.0.1:2"]
+A = "tcp/a:1"
+B = "tcp/b:1"
+C = "tcp/c:1"
 
 
-def file(**stated: object) -> ZenohFile:
+def check_file(**stated: object) -> ZenohFile:
     return check_zenoh_file("mine.json5", stated, lambda _: "")
 
 
-def member(
+def make_member_connection(
     listen: list[str] | None = None,
     connect: list[str] | None = None,
     routers: list[str] | None = None,
@@ -45,31 +48,35 @@ def member(
 
 
 def test_defaults_stay_on_this_machine() -> None:
-    assert member() == Connection(HERE, THERE, "peer", {})
-    assert member(own=file(namespace="n")) == Connection(
+    assert make_member_connection() == Connection(HERE, THERE, "peer", {})
+    assert make_member_connection(own=check_file(namespace="n")) == Connection(
         HERE, THERE, "peer", {"namespace": "n"}
     )
 
 
 def test_named_places_replace_the_local_ones() -> None:
-    assert member(listen=[A]) == Connection([A], THERE)
-    assert member(connect=[A, B]) == Connection(HERE, [A, B])
-    assert member(listen=[], connect=[]) == Connection([], [])
-    assert member(own=file(listen={"endpoints": [A]})).listen == [A]
-    assert member(own=file(connect={"endpoints": [A]})).connect == [A]
+    assert make_member_connection(listen=[A]) == Connection([A], THERE)
+    assert make_member_connection(connect=[A, B]) == Connection(HERE, [A, B])
+    assert make_member_connection(listen=[], connect=[]) == Connection([], [])
+    assert make_member_connection(own=check_file(listen={"endpoints": [A]})).listen == [A]
+    assert make_member_connection(own=check_file(connect={"endpoints": [A]})).connect == [A]
     # --connect first
-    assert member(connect=[B], own=file(connect={"endpoints": [A, B]})).connect == [
+    assert make_member_connection(
+        connect=[B], own=check_file(connect={"endpoints": [A, B]})
+    ).connect == [
         B,
         A,
     ]
 
 
 def test_clients_of_routers_listen_nowhere() -> None:
-    assert member(routers=[A, B]) == Connection((), [A, B], "client", {})
-    stated = file(mode="client", connect={"endpoints": [C]})
-    assert member(routers=[A], own=stated) == Connection((), [A, C], "client", {"connect": {}})
-    assert member(own=stated) == Connection((), [C], "client", {"connect": {}})
-    assert member(connect=[A], own=stated).connect == [A, C]
+    assert make_member_connection(routers=[A, B]) == Connection((), [A, B], "client", {})
+    stated = check_file(mode="client", connect={"endpoints": [C]})
+    assert make_member_connection(routers=[A], own=stated) == Connection(
+        (), [A, C], "client", {"connect": {}}
+    )
+    assert make_member_connection(own=stated) == Connection((), [C], "client", {"connect": {}})
+    assert make_member_connection(connect=[A], own=stated).connect == [A, C]
 
 
 @pytest.mark.parametrize(
@@ -83,26 +90,28 @@ def test_clients_of_routers_listen_nowhere() -> None:
     ],
 )
 def test_any_address_of_zenoh_may_be_a_router(endpoint: str) -> None:
-    assert member(routers=[endpoint]).connect == [endpoint]
+    assert make_member_connection(routers=[endpoint]).connect == [endpoint]
 
 
-def router(
+def make_router_connection(
     listen: list[str] | None, connect: list[str] | None, zenoh_file: ZenohFile | None
 ) -> Connection:
     return Connection.of_member(listen, connect, None, zenoh_file, HERE, routes=True)
 
 
 def test_routers_listen_and_connect_as_configured() -> None:
-    assert router(None, None, None) == Connection(HERE, (), "router", {})
-    lines = router([A], [B], file(mode="router"))
+    assert make_router_connection(None, None, None) == Connection(HERE, (), "router", {})
+    lines = make_router_connection([A], [B], check_file(mode="router"))
     assert lines == Connection([A], [B], "router", {})
     places = {"router": [C], "peer": [B]}
-    assert router(None, None, file(listen={"endpoints": places})).listen == [C]
+    assert make_router_connection(
+        None, None, check_file(listen={"endpoints": places})
+    ).listen == [C]
     for mode in ("peer", "client"):
         with pytest.raises(
             UsageError, match=f"mine.json5: the mode must be router here, not {mode}"
         ):
-            router(None, None, file(mode=mode))
+            make_router_connection(None, None, check_file(mode=mode))
 
 
 class Answering(ManualClock):
@@ -114,11 +123,9 @@ class Answering(ManualClock):
         super().__init__()
         self.sleeps = 0
         self.router: ZenohBus | None = None
-        self._endpoints, self._comes_after, self._stops_after = (
-            endpoints,
-            comes_after,
-            stops_after,
-        )
+        self._endpoints = endpoints
+        self._comes_after = comes_after
+        self._stops_after = stops_after
 
     def sleep_until(self, deadline_ns: int) -> None:
         super().sleep_until(deadline_ns)
@@ -132,7 +139,8 @@ class Answering(ManualClock):
 
 def test_late_routers_are_awaited() -> None:
     endpoints = find_free_endpoints(1)
-    clock, said = Answering(endpoints, comes_after=3), []
+    clock = Answering(endpoints, comes_after=3)
+    said = []
     bus = Connection((), endpoints, "client").open_bus(clock, clock.stopped, 5.0, said.append)
     assert bus is not None
     bus.close()
@@ -169,7 +177,7 @@ def test_peers_wait_for_nobody() -> None:
 NAMES = st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=40)
 
 
-def port(endpoint: str) -> int:
+def find_port(endpoint: str) -> int:
     match = re.fullmatch(r"tcp/127\.0\.0\.1:(\d+)", endpoint)
     assert match, endpoint
     return int(match[1])
@@ -177,7 +185,7 @@ def port(endpoint: str) -> int:
 
 @given(NAMES, st.integers(0, 1000))
 def test_default_ports_are_below_the_ephemeral_ones(session: str, index: int) -> None:
-    assert 1024 <= port(default_endpoint(session, index)) < 32_768
+    assert 1024 <= find_port(default_endpoint(session, index)) < 32_768
 
 
 @given(NAMES, st.lists(NAMES, min_size=2, max_size=64, unique=True))
@@ -198,7 +206,7 @@ def test_free_endpoints_can_be_used_together() -> None:
     assert len(set(endpoints)) == 8
     with ExitStack() as stack:
         for endpoint in endpoints:
-            stack.enter_context(socket.socket()).bind(("127.0.0.1", port(endpoint)))
+            stack.enter_context(socket.socket()).bind(("127.0.0.1", find_port(endpoint)))
 
 
 def test_sessions_keep_free_ports() -> None:
@@ -208,7 +216,7 @@ def test_sessions_keep_free_ports() -> None:
     with reserve_session_endpoints("endpoints-test", sites) as reserved:
         assert reserved == places
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", port(places[1])))
+        taken.bind(("127.0.0.1", find_port(places[1])))
         taken.listen()
         with reserve_session_endpoints("endpoints-test", sites) as others:
             assert len(set(others)) == 3
@@ -248,7 +256,7 @@ class Played(ManualClock):
         return self.over
 
 
-def routed(
+def run_router_until_idle(
     clock: Played, network: LocalNetwork, until_idle_s: float | None = None
 ) -> list[str]:
     said: list[str] = []
@@ -256,7 +264,7 @@ def routed(
     return said
 
 
-def announced(network: LocalNetwork, key: str) -> Bus:
+def announce_member(network: LocalNetwork, key: str) -> Bus:
     bus = network.join()
     bus.announce(key)
     return bus
@@ -264,10 +272,10 @@ def announced(network: LocalNetwork, key: str) -> Bus:
 
 def test_routers_report_members_in_every_session() -> None:
     network = LocalNetwork()
-    other_token = announced(network, "trilat/one/m1/alive/1")
-    announced(network, "other/one/m1/alive/1")
-    clock = Played(lambda: announced(network, "trilat/two/s/alive/2"), other_token.close)
-    assert routed(clock, network) == [
+    other_token = announce_member(network, "trilat/one/m1/alive/1")
+    announce_member(network, "other/one/m1/alive/1")
+    clock = Played(lambda: announce_member(network, "trilat/two/s/alive/2"), other_token.close)
+    assert run_router_until_idle(clock, network) == [
         "session one: m1 is here",
         "session two: s is here",
         "session one: m1 has left",
@@ -277,13 +285,13 @@ def test_routers_report_members_in_every_session() -> None:
 def test_two_starts_of_a_member_count_twice() -> None:
     """A token may be heard twice, as after a link that healed; it is reported once."""
     network = LocalNetwork()
-    first = announced(network, "trilat/t/m1/alive/1")
+    first = announce_member(network, "trilat/t/m1/alive/1")
     clock = Played(
         lambda: first.announce("trilat/t/m1/alive/1"),
-        lambda: announced(network, "trilat/t/m1/alive/2"),
+        lambda: announce_member(network, "trilat/t/m1/alive/2"),
         first.close,
     )
-    assert routed(clock, network) == [
+    assert run_router_until_idle(clock, network) == [
         "session t: m1 is here",
         "session t: m1 is here",
         "session t: m1 has left",
@@ -295,7 +303,7 @@ def test_a_router_stays_until_all_members_have_left() -> None:
     members: list[Bus] = []
 
     def comes() -> None:
-        members.append(announced(network, f"trilat/t/m1/alive/{len(members)}"))
+        members.append(announce_member(network, f"trilat/t/m1/alive/{len(members)}"))
 
     def goes() -> None:
         members[-1].close()
@@ -304,7 +312,7 @@ def test_a_router_stays_until_all_members_have_left() -> None:
     nothing = [lambda: None] * 10
     pause = [lambda: None] * 2
     clock = Played(*nothing, comes, *nothing, goes, *pause, comes, *nothing, goes, rest=100)
-    said = routed(clock, network, idle_ns * 1e-9)
+    said = run_router_until_idle(clock, network, idle_ns * 1e-9)
     assert said[-1] == "no member for 0.2 s"
     assert len(said) == 5
     assert not clock.over
@@ -313,7 +321,7 @@ def test_a_router_stays_until_all_members_have_left() -> None:
 
 def test_without_a_time_it_stays_for_ever() -> None:
     network = LocalNetwork()
-    other_token = announced(network, "trilat/t/m1/alive/1")
+    other_token = announce_member(network, "trilat/t/m1/alive/1")
     clock = Played(other_token.close, rest=1000)
-    routed(clock, network)
+    run_router_until_idle(clock, network)
     assert clock.over

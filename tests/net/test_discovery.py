@@ -57,7 +57,7 @@ class Answering:
         self._thread.join()
         self._bus.close()
 
-    def asked(self, site: str, **order: object) -> ChangeReply:
+    def request_change(self, site: str, **order: object) -> ChangeReply:
         wanted = msgspec.convert({"to": {}, **order}, ChangeRequest)
         return RunningSession(SESSION, Connection(connect=[self.endpoint])).change(site, wanted)
 
@@ -74,21 +74,21 @@ def running() -> Iterator[Answering]:
 
 
 def test_the_affected_site_answers_a_change(running: Answering) -> None:
-    reply = running.asked("s", link="m1->s", to={"delay_ms": 350.0})
+    reply = running.request_change("s", link="m1->s", to={"delay_ms": 350.0})
     assert (reply.member, reply.accepted, reply.tick) == ("s", True, 200)
-    refused = running.asked("s", link="m1->s", to={"delay_ms": -1.0})
+    refused = running.request_change("s", link="m1->s", to={"delay_ms": -1.0})
     assert (refused.accepted, refused.tick) == (False, -1)
     assert "delay_ms" in refused.text
 
 
 def test_changes_for_unknown_sites_name_the_others(running: Answering) -> None:
     with pytest.raises(SessionError, match="m1, m2, s"):
-        running.asked("x", dominance="x", to={"m1": 1.0})
+        running.request_change("x", dominance="x", to={"m1": 1.0})
 
 
 def test_absent_sites_do_not_answer(running: Answering) -> None:
     with pytest.raises(SessionError, match="'m1' of session 'o' does not answer"):
-        running.asked("m1", dominance="m1", to={"s": 1.0})
+        running.request_change("m1", dominance="m1", to={"s": 1.0})
 
 
 def test_sessions_take_no_changes_before_their_start() -> None:
@@ -96,7 +96,7 @@ def test_sessions_take_no_changes_before_their_start() -> None:
         closing(Answering(running=False)) as site,
         pytest.raises(SessionError, match="has not begun"),
     ):
-        site.asked("s", link="m1->s", to={"delay_ms": 350.0})
+        site.request_change("s", link="m1->s", to={"delay_ms": 350.0})
 
 
 def test_silent_members_are_named() -> None:
@@ -104,11 +104,12 @@ def test_silent_members_are_named() -> None:
         closing(Answering(running=True, deaf=True)) as site,
         pytest.raises(SessionError, match="s did not answer"),
     ):
-        site.asked("s", link="m1->s", to={"delay_ms": 350.0})
+        site.request_change("s", link="m1->s", to={"delay_ms": 350.0})
 
 
-def find(*payloads: bytes) -> list[Info]:
-    network, clock = LocalNetwork(), ManualClock()
+def find_answering(*payloads: bytes) -> list[Info]:
+    network = LocalNetwork()
+    clock = ManualClock()
     for n, payload in enumerate(payloads):
         network.join().respond(
             topics.key(SESSION, f"m{n}", topics.INFO), lambda _, sent=payload: sent
@@ -118,17 +119,17 @@ def find(*payloads: bytes) -> list[Info]:
 
 
 def test_members_are_found_despite_unreadable_answers() -> None:
-    members = find(encode(answer_info("m0", 1)), b"garbage")
+    members = find_answering(encode(answer_info("m0", 1)), b"garbage")
     assert {info.member for info in members} == {"m0"}
     assert len(members) >= 2
-    assert find() == []
+    assert find_answering() == []
 
 
 def test_answers_of_other_versions_name_their_member() -> None:
     with pytest.raises(
         SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
     ):
-        find(encode(answer_info("m0", 1, v=VERSION + 1)))
+        find_answering(encode(answer_info("m0", 1, v=VERSION + 1)))
 
 
 def test_waiting_recorders_announce_themselves_first() -> None:

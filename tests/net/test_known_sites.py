@@ -114,8 +114,8 @@ def test_other_commands_take_the_normal_way_quietly(
 
 
 @given(st.lists(st.text()))
-def test_arbitrary_words_take_the_normal_way(words: list[str]) -> None:
-    assert stop_at_once(words) == words
+def test_arbitrary_words_take_the_normal_way(arguments: list[str]) -> None:
+    assert stop_at_once(arguments) == arguments
 
 
 def test_stops_report_their_attempt_at_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,7 +67,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return keys_folder
 
 
-def lawless(keys: MemberKeys) -> dict[str, Any]:
+def make_lawless_settings(keys: MemberKeys) -> dict[str, Any]:
     """Returns the settings of a member that enforces no rules, not even on itself."""
     return {"transport": keys.settings["transport"]}
 
@@ -76,7 +76,8 @@ class Meeting:
     """m1 and m2 with their keys, and a third member, as peers of one another or through a router."""
 
     def __init__(self, folder: Path, *, routed: bool) -> None:
-        self.folder, self.members = folder, list[Bus]()
+        self.folder = folder
+        self.members = list[Bus]()
         places = [
             free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(3)
         ]
@@ -114,32 +115,28 @@ def meeting(request: pytest.FixtureRequest, folder: Path) -> Iterator[Meeting]:
     key_meeting.close()
 
 
-def key(member: str, channel: str) -> str:
+def make_key(member: str, channel: str) -> str:
     return topics.key("x", member, channel)
 
 
 def exchange_messages(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
     messages: list[tuple[str, bytes]] = []
 
-    def there() -> bool:
+    def has_arrived() -> bool:
         say(b"true")
         messages.extend(drained(inbox))
         return any(payload == b"true" for _, payload in messages)
 
-    until(there)
+    until(has_arrived)
     return messages
 
 
 def test_members_speak_under_their_own_name_only(meeting: Meeting, folder: Path) -> None:
-    attacker = meeting.join(lawless(read_member_keys(folder / "s")))
-    inbox, alive = (
-        meeting.m1.inbox(key("*", topics.EVENT)),
-        meeting.m1.presence(topics.presence_key("x", "*")),
-    )
-    forged, true = (
-        attacker.publisher(key("m2", topics.EVENT)),
-        attacker.publisher(key("s", topics.EVENT)),
-    )
+    attacker = meeting.join(make_lawless_settings(read_member_keys(folder / "s")))
+    inbox = meeting.m1.inbox(make_key("*", topics.EVENT))
+    alive = meeting.m1.presence(topics.presence_key("x", "*"))
+    forged = attacker.publisher(make_key("m2", topics.EVENT))
+    true = attacker.publisher(make_key("s", topics.EVENT))
     attacker.announce(topics.presence_key("x", "m2").replace("*", "666"))
     attacker.announce(topics.presence_key("x", "s").replace("*", "7"))
 
@@ -147,32 +144,34 @@ def test_members_speak_under_their_own_name_only(meeting: Meeting, folder: Path)
         forged(b"forged")
         true(payload)
 
-    assert {where for where, _ in exchange_messages(say, inbox)} == {key("s", topics.EVENT)}
+    assert {where for where, _ in exchange_messages(say, inbox)} == {
+        make_key("s", topics.EVENT)
+    }
     assert until(alive.poll) == (topics.presence_key("x", "s").replace("*", "7"), True)
     assert drained(alive) == []
 
 
 def test_no_member_answers_for_another(meeting: Meeting, folder: Path) -> None:
-    attacker = meeting.join(lawless(read_member_keys(folder / "s")))
-    attacker.respond(key("m2", topics.INFO), lambda _: b"forged")
-    attacker.respond(key("s", topics.INFO), lambda _: b"true")
-    first = until(lambda: query_once(meeting.m1, key("*", topics.INFO)))
-    assert first == (key("s", topics.INFO), b"true")
-    answers = [reply[1] for reply in received(meeting.m1.query(key("*", topics.INFO)), 1)]
+    attacker = meeting.join(make_lawless_settings(read_member_keys(folder / "s")))
+    attacker.respond(make_key("m2", topics.INFO), lambda _: b"forged")
+    attacker.respond(make_key("s", topics.INFO), lambda _: b"true")
+    first = until(lambda: query_once(meeting.m1, make_key("*", topics.INFO)))
+    assert first == (make_key("s", topics.INFO), b"true")
+    answers = [reply[1] for reply in received(meeting.m1.query(make_key("*", topics.INFO)), 1)]
     assert answers == [b"true"]
 
 
 def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> None:
-    attacker = meeting.join(lawless(read_member_keys(folder / "s")))
+    attacker = meeting.join(make_lawless_settings(read_member_keys(folder / "s")))
     operator = meeting.join(read_member_keys(folder / OPERATOR).settings)
-    meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
+    meeting.m1.respond(make_key("m1", topics.SET), lambda payload: payload)
     channels = (topics.HAND, topics.ENABLE)
-    inboxes = [meeting.m1.inbox(key("m1", channel)) for channel in channels]
-    assert until(lambda: query_once(operator, key("m1", topics.SET), b"order"))
-    assert query_once(attacker, key("m1", topics.SET), b"order") is None
+    inboxes = [meeting.m1.inbox(make_key("m1", channel)) for channel in channels]
+    assert until(lambda: query_once(operator, make_key("m1", topics.SET), b"order"))
+    assert query_once(attacker, make_key("m1", topics.SET), b"order") is None
 
     for channel, inbox in zip(channels, inboxes, strict=True):
-        forged, true = (bus.publisher(key("m1", channel)) for bus in (attacker, operator))
+        forged, true = (bus.publisher(make_key("m1", channel)) for bus in (attacker, operator))
 
         def say(payload: bytes, forged: Any = forged, true: Any = true) -> None:
             forged(b"forged")
@@ -186,16 +185,18 @@ def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path)
     bridge, operator = (
         meeting.join(read_member_keys(folder / name).settings) for name in (BRIDGE, OPERATOR)
     )
-    meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
-    assert until(lambda: query_once(bridge, key("m1", topics.SET), b"reset"))
+    meeting.m1.respond(make_key("m1", topics.SET), lambda payload: payload)
+    assert until(lambda: query_once(bridge, make_key("m1", topics.SET), b"reset"))
     for channel in (topics.HAND, topics.MEASURED):
-        inbox = meeting.m1.inbox(key("m1", channel))
+        inbox = meeting.m1.inbox(make_key("m1", channel))
         assert {
             payload
-            for _, payload in exchange_messages(bridge.publisher(key("m1", channel)), inbox)
+            for _, payload in exchange_messages(
+                bridge.publisher(make_key("m1", channel)), inbox
+            )
         } == {b"true"}
-    switch = meeting.m1.inbox(key("m1", topics.ENABLE))
-    forged, true = (bus.publisher(key("m1", topics.ENABLE)) for bus in (bridge, operator))
+    switch = meeting.m1.inbox(make_key("m1", topics.ENABLE))
+    forged, true = (bus.publisher(make_key("m1", topics.ENABLE)) for bus in (bridge, operator))
 
     def say(payload: bytes) -> None:
         forged(b"forged")
@@ -203,39 +204,39 @@ def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path)
 
     assert {payload for _, payload in exchange_messages(say, switch)} == {b"true"}
     states, samples = (
-        bridge.inbox(key("*", channel)) for channel in (topics.STATE, topics.SAMPLE)
+        bridge.inbox(make_key("*", channel)) for channel in (topics.STATE, topics.SAMPLE)
     )
-    sample = meeting.m1.publisher(key("m1", topics.SAMPLE))
+    sample = meeting.m1.publisher(make_key("m1", topics.SAMPLE))
 
     def tell(payload: bytes) -> None:
         sample(payload)
         state(payload)
 
-    state = meeting.m1.publisher(key("m1", topics.STATE))
+    state = meeting.m1.publisher(make_key("m1", topics.STATE))
     assert exchange_messages(tell, states)
     assert drained(samples) == []
 
 
 def test_every_member_may_stop_but_no_more(meeting: Meeting, folder: Path) -> None:
     for channel in (topics.STOP, topics.SET):
-        meeting.m1.respond(key("m1", channel), lambda payload: payload)
+        meeting.m1.respond(make_key("m1", channel), lambda payload: payload)
     members = [
         meeting.join(read_member_keys(folder / name).settings)
         for name in ("s", RECORDER, OPERATOR)
     ]
     for member in members:
-        assert until(lambda bus=member: query_once(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
-    assert until(lambda: query_once(members[2], key("m1", topics.SET), b"reset"))
-    assert [query_once(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [
+        assert until(lambda bus=member: query_once(bus, make_key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
+    assert until(lambda: query_once(members[2], make_key("m1", topics.SET), b"reset"))
+    assert [
+        query_once(member, make_key("m1", topics.SET), b"reset") for member in members[:2]
+    ] == [
         None,
         None,
     ]
 
 
 def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> None:
-    """By the list in the folder of the member that the removed one speaks to; its certificate
-    is still valid.
-    """
+    """The list of removed members in a member's folder decides, because the certificate is still valid."""
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o600)
@@ -250,9 +251,9 @@ def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> 
         for name in ("s", "m2")
     }
     try:
-        inbox = m1.inbox(key("*", topics.EVENT))
+        inbox = m1.inbox(make_key("*", topics.EVENT))
         withdrawn, true = (
-            others[name].publisher(key(name, topics.EVENT)) for name in ("s", "m2")
+            others[name].publisher(make_key(name, topics.EVENT)) for name in ("s", "m2")
         )
 
         def say(payload: bytes) -> None:
@@ -260,7 +261,7 @@ def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> 
             true(payload)
 
         assert {where for where, _ in exchange_messages(say, inbox)} == {
-            key("m2", topics.EVENT)
+            make_key("m2", topics.EVENT)
         }
     finally:
         for bus in (*others.values(), m1):
@@ -268,12 +269,10 @@ def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> 
 
 
 def test_oversized_messages_are_dropped_alone(meeting: Meeting) -> None:
-    inbox, publish = (
-        meeting.m1.inbox(key("m2", topics.STATE)),
-        meeting.m2.publisher(key("m2", topics.STATE)),
-    )
+    inbox = meeting.m1.inbox(make_key("m2", topics.STATE))
+    publish = meeting.m2.publisher(make_key("m2", topics.STATE))
     recorder = meeting.join(read_member_keys(meeting.folder / RECORDER).settings)
-    records = recorder.inbox(key("m2", topics.STATE))
+    records = recorder.inbox(make_key("m2", topics.STATE))
 
     def say(payload: bytes) -> None:
         publish(bytes(MOST_PUT_BYTES + 1))
@@ -284,18 +283,18 @@ def test_oversized_messages_are_dropped_alone(meeting: Meeting) -> None:
 
 
 def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
-    inbox = meeting.m1.inbox(key("*", topics.EVENT))
+    inbox = meeting.m1.inbox(make_key("*", topics.EVENT))
     stranger = (
-        meeting.join(lawless(read_member_keys(foreign / "m2")))
+        meeting.join(make_lawless_settings(read_member_keys(foreign / "m2")))
         if meeting._mode == "peer"
         else None
     )
     if stranger is None:
         with pytest.raises(RouterSilent):
-            meeting.join(lawless(read_member_keys(foreign / "m2")))
+            meeting.join(make_lawless_settings(read_member_keys(foreign / "m2")))
     else:
-        stranger.publisher(key("m2", topics.EVENT))(b"forged")
-    messages = exchange_messages(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
+        stranger.publisher(make_key("m2", topics.EVENT))(b"forged")
+    messages = exchange_messages(meeting.m2.publisher(make_key("m2", topics.EVENT)), inbox)
     assert {payload for _, payload in messages} == {b"true"}
 
 
@@ -449,10 +448,8 @@ def test_open_links_outlive_certificates(
     folder = make_ending_keys(timedelta(seconds=8))
     ends = load_certificate(folder / "m1").not_valid_after_utc
     with two_members(folder, stops=True) as (site, peer):
-        inbox, say = (
-            peer.inbox(key("m1", topics.EVENT)),
-            site.publisher(key("m1", topics.EVENT)),
-        )
+        inbox = peer.inbox(make_key("m1", topics.EVENT))
+        say = site.publisher(make_key("m1", topics.EVENT))
         assert exchange_messages(say, inbox)
         until(lambda: datetime.now(UTC) > ends + timedelta(seconds=1), 30.0)
         assert exchange_messages(say, inbox)
@@ -467,10 +464,10 @@ def test_ended_keys_may_only_stop_arms(
     ):
         read_member_keys(folder / "m1")
     with two_members(folder, stops=True) as (site, peer):
-        questions = site.query_inbox(key("m1", topics.STOP))
+        questions = site.query_inbox(make_key("m1", topics.STOP))
 
         def is_asked() -> bool:
-            peer.query(key("m1", topics.STOP), b"stop")
+            peer.query(make_key("m1", topics.STOP), b"stop")
             return questions.poll() is not None
 
         until(is_asked)
@@ -490,7 +487,8 @@ def test_renewed_keys_meet_older_ones(tmp_path: Path) -> None:
     ]
     with two_members(folder) as (site, peer):
         assert exchange_messages(
-            site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
+            site.publisher(make_key("m1", topics.EVENT)),
+            peer.inbox(make_key("m1", topics.EVENT)),
         )
     assert {path.name for path in renew_keys(folder)} == set(ALL)
     assert {member: (folder / member / PRIVATE_KEY).read_bytes() for member in ALL} == before
@@ -526,10 +524,11 @@ def test_added_members_meet_the_others(tmp_path: Path) -> None:
         assert read_member_keys(folder / member).members == ("m1", "m2", "s")
     with two_members(folder) as (site, peer):  # m1, whose keys are the old ones, and s
         assert exchange_messages(
-            peer.publisher(key("s", topics.EVENT)), site.inbox(key("s", topics.EVENT))
+            peer.publisher(make_key("s", topics.EVENT)), site.inbox(make_key("s", topics.EVENT))
         )
         assert exchange_messages(
-            site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
+            site.publisher(make_key("m1", topics.EVENT)),
+            peer.inbox(make_key("m1", topics.EVENT)),
         )
     assert {path.name for path in renew_keys(folder)} == {"m1", "m2", "s"}
 
@@ -602,10 +601,12 @@ def load_certificate(folder: Path) -> x509.Certificate:
 def test_keys_ending_before_sessions_are_refused(tmp_path: Path) -> None:
     """The end is checked when a site begins, and again when the awaited session begins."""
     create_keys(tmp_path / "keys", ["m", "s"], days=1)
-    for member, words in (("m", "two_sites"), ("s", "two_sites")):
+    for member, scenario in (("m", "two_sites"), ("s", "two_sites")):
         long = ("--set", "duration_s=86400")
         keys = str(tmp_path / "keys" / member)
-        done = trilat("site", member, "--scenario", words, "--keys", keys, *long, cwd=tmp_path)
+        done = trilat(
+            "site", member, "--scenario", scenario, "--keys", keys, *long, cwd=tmp_path
+        )
         assert done.code == 2, done
         assert f"--keys: the keys of {member} expire on " in done.err
         assert "renew the keys with trilat keys renew" in done.err

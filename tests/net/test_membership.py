@@ -18,7 +18,7 @@ SITES = ("m1", "m2", "s")
 RECORDER = topics.RECORDER
 
 
-def running(*others: str) -> tuple[Party, Epoch]:
+def make_running_party(*others: str) -> tuple[Party, Epoch]:
     """Returns a running session of all sites and of others, and its epoch."""
     session = Party(SITES)
     session.start(*SITES, *others)
@@ -27,7 +27,7 @@ def running(*others: str) -> tuple[Party, Epoch]:
     return session, epoch
 
 
-def joined(session: Party, within_ns: int) -> Epoch | None:
+def wait_for_recorder(session: Party, within_ns: int) -> Epoch | None:
     for _ in range(within_ns // STEP_NS):
         if session.members[RECORDER].epoch is not None:
             break
@@ -36,9 +36,9 @@ def joined(session: Party, within_ns: int) -> Epoch | None:
 
 
 def test_recorders_learn_epoch_and_boots() -> None:
-    session, epoch = running()
+    session, epoch = make_running_party()
     session.start(RECORDER)
-    late = joined(session, LATE_GATHER_NS)
+    late = wait_for_recorder(session, LATE_GATHER_NS)
     assert late == epoch._replace(epochs={})
     assert session.kinds().count("start") == 1
 
@@ -46,20 +46,20 @@ def test_recorders_learn_epoch_and_boots() -> None:
 @given(ahead_ns=st.integers(-(10**9) + 1, 10**15), unix_ns=st.integers(0, 2**60))
 @settings(max_examples=30, deadline=None)
 def test_skewed_recorders_find_the_same_instant(ahead_ns: int, unix_ns: int) -> None:
-    session, epoch = running()
+    session, epoch = make_running_party()
     session.start(RECORDER, on_clock=session.elsewhere(ahead_ns, unix_ns))
-    late = joined(session, 4 * LATE_GATHER_NS)
+    late = wait_for_recorder(session, 4 * LATE_GATHER_NS)
     assert late is not None
     assert late.mono_ns == epoch.mono_ns + ahead_ns
     assert late.unix_ns == epoch.unix_ns
 
 
 def test_missing_sites_are_awaited_briefly() -> None:
-    session, epoch = running()
+    session, epoch = make_running_party()
     session.kill("s")
     session.start(RECORDER)
-    assert joined(session, LATE_GATHER_NS - 5 * STEP_NS) is None
-    assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})
+    assert wait_for_recorder(session, LATE_GATHER_NS - 5 * STEP_NS) is None
+    assert wait_for_recorder(session, 30 * STEP_NS) == epoch._replace(epochs={})
     assert set(session.members[RECORDER].joining.membership.others) == {"m1", "m2"}
 
 
@@ -95,7 +95,7 @@ def test_recorders_may_join_after_the_start() -> None:
     while session.clock.monotonic_ns() + STEP_NS < epoch.mono_ns:
         session.round()
         assert deaf.epoch is None
-    late = joined(session, 2 * LATE_GATHER_NS)
+    late = wait_for_recorder(session, 2 * LATE_GATHER_NS)
     assert late == epoch._replace(epochs={})
 
 
@@ -103,22 +103,22 @@ def test_recorders_may_join_after_the_start() -> None:
     "forged", [{"boots": {"m1": 5}}, {"boots": {}}, {"scenario": ""}, {"running": False}]
 )
 def test_contradicting_members_are_not_believed(forged: dict[str, object]) -> None:
-    session, _ = running()
+    session, _ = make_running_party()
     for name in SITES:
         publisher = session.members[name].publisher
         publisher.info = msgspec.structs.replace(publisher.info, **forged)
     session.start(RECORDER)
     # a session that runs and does not say since when takes nobody in
     with suppress(SessionError):
-        joined(session, 3 * LATE_GATHER_NS)
+        wait_for_recorder(session, 3 * LATE_GATHER_NS)
     assert session.members[RECORDER].epoch is None
 
 
 def test_recorders_do_not_learn_from_recorders() -> None:
-    session, epoch = running(RECORDER)
+    session, epoch = make_running_party(RECORDER)
     session.members["other"] = session.members.pop(RECORDER)
     session.start(RECORDER)
-    assert joined(session, 2 * LATE_GATHER_NS) == epoch._replace(epochs={})
+    assert wait_for_recorder(session, 2 * LATE_GATHER_NS) == epoch._replace(epochs={})
     assert RECORDER not in session.members[RECORDER].joining.membership.others
 
 
@@ -126,7 +126,7 @@ def test_restarted_sites_are_not_awaited() -> None:
     """A member met under another boot, while the old boot's token is absent, left before the
     newcomer arrived.
     """
-    session, epoch = running()
+    session, epoch = make_running_party()
     session.kill("s")
     session.start(RECORDER)
     anew = {"member": "s", "boot": 99, "running": False, "boots": {}}
@@ -134,4 +134,4 @@ def test_restarted_sites_are_not_awaited() -> None:
         msgspec.structs.replace(session.members["m1"].publisher.info, **anew),
         may_have_started=False,
     )
-    assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})
+    assert wait_for_recorder(session, 30 * STEP_NS) == epoch._replace(epochs={})

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.net.crossing import exchange_second, make_ceiling, make_floor, make_queueing_delay
 from trilat_net.net.offset import (
     SLEW_NS,
     WINDOWS_KEPT,
@@ -18,7 +19,7 @@ from trilat_net.net.offset import (
     format_offset,
 )
 
-from .crossing import Other, S, ceiling, floor, queueing, second
+from .crossing import Other, S
 
 DAY = 86_400 * S
 
@@ -41,9 +42,9 @@ def test_true_offset_and_drift_stay_inside_bounds(
     for pause_ns, there_ns, delay_ns in crossings:
         now_ns += pause_ns
         if there_ns:
-            estimator.add(ceiling(other, now_ns, delay_ns), None)
+            estimator.add(make_ceiling(other, now_ns, delay_ns), None)
         else:
-            estimator.add(None, floor(other, now_ns, delay_ns))
+            estimator.add(None, make_floor(other, now_ns, delay_ns))
         latest_ns = max(latest_ns, now_ns + delay_ns)
     estimate = estimator.estimate(latest_ns)
     assert estimator.broken == 0
@@ -66,8 +67,8 @@ def test_one_exchange_gives_the_classical_offset(
     """Four stamps of one instant: (t1 + t2 - t3 - t4)/2 within (t4 - t1 - (t3 - t2))/2, and
     drift besides.
     """
-    sent = ceiling(other, 0, there_ns)
-    bound = floor(other, there_ns, back_ns)
+    sent = make_ceiling(other, 0, there_ns)
+    bound = make_floor(other, there_ns, back_ns)
     estimator = OffsetEstimator()
     estimator.add(sent, bound)
     estimate = estimator.estimate(there_ns + back_ns)
@@ -88,9 +89,15 @@ def test_one_exchange_gives_the_classical_offset(
 )
 def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: int) -> None:
     """Within 100 us and 20 ppm after 10 s, 5 ppm after 60 s, for the ways of one busy machine."""
-    other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
+    other = Other(offset_ns, drift_ppb)
+    rnd = random.Random(seed)
+    estimator = OffsetEstimator()
     for n in range(60):
-        estimator.add(*second(other, n * S, queueing(90, 200), queueing(120, 300), rnd))
+        estimator.add(
+            *exchange_second(
+                other, n * S, make_queueing_delay(90, 200), make_queueing_delay(120, 300), rnd
+            )
+        )
         at_ns = (n + 1) * S
         estimate = estimator.estimate(at_ns)
         assert estimate is not None
@@ -103,9 +110,15 @@ def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: in
 
 
 def test_unequal_ways_bias_estimates_within_bounds() -> None:
-    other, rnd, estimator = Other(S, 20_000), random.Random(1), OffsetEstimator()
+    other = Other(S, 20_000)
+    rnd = random.Random(1)
+    estimator = OffsetEstimator()
     for n in range(20):
-        estimator.add(*second(other, n * S, queueing(500, 50), queueing(100, 50), rnd))
+        estimator.add(
+            *exchange_second(
+                other, n * S, make_queueing_delay(500, 50), make_queueing_delay(100, 50), rnd
+            )
+        )
     estimate = estimator.estimate(20 * S)
     assert estimate is not None
     error_ns = estimate.offset_ns - other.offset(20 * S)
@@ -114,20 +127,25 @@ def test_unequal_ways_bias_estimates_within_bounds() -> None:
 
 
 def test_bounds_follow_the_quickest_messages() -> None:
-    other, estimator = Other(7, 0), OffsetEstimator()
-    estimator.add(ceiling(other, 0, 10_000), floor(other, 1_000_000, 900_000))
-    estimator.add(ceiling(other, 2_000_000, 900_000), floor(other, 3_000_000, 20_000))
+    other = Other(7, 0)
+    estimator = OffsetEstimator()
+    estimator.add(make_ceiling(other, 0, 10_000), make_floor(other, 1_000_000, 900_000))
+    estimator.add(make_ceiling(other, 2_000_000, 900_000), make_floor(other, 3_000_000, 20_000))
     estimate = estimator.estimate(4_000_000)
     assert estimate is not None
     assert estimate.error_bound_ns(4_000_000, estimate.offset_ns) <= 15_000 + 3_000
 
 
 def test_bad_minutes_do_not_move_the_drift() -> None:
-    other, rnd, estimator = Other(S, 50_000), random.Random(2), OffsetEstimator()
+    other = Other(S, 50_000)
+    rnd = random.Random(2)
+    estimator = OffsetEstimator()
     for n in range(40):
         bad = 15 <= n < 25
-        way_back = queueing(5_000, 5_000) if bad else queueing(100, 50)
-        estimator.add(*second(other, n * S, way_back, queueing(100, 50), rnd))
+        way_back = make_queueing_delay(5_000, 5_000) if bad else make_queueing_delay(100, 50)
+        estimator.add(
+            *exchange_second(other, n * S, way_back, make_queueing_delay(100, 50), rnd)
+        )
     estimate = estimator.estimate(40 * S)
     assert estimate is not None
     assert estimate.drift == pytest.approx(50_000, abs=1_000)
@@ -143,9 +161,15 @@ def test_wandering_drift_stays_inside(period_s: float, phase: float, seed: int) 
     def wander(own_ns: int) -> float:
         return size * math.sin(2 * math.pi * own_ns / S / period_s + phase)
 
-    other, rnd, estimator = Other(S, 40_000, wander), random.Random(seed), OffsetEstimator()
+    other = Other(S, 40_000, wander)
+    rnd = random.Random(seed)
+    estimator = OffsetEstimator()
     for n in range(70):
-        estimator.add(*second(other, n * S, queueing(1, 1), queueing(1, 1), rnd, 10))
+        estimator.add(
+            *exchange_second(
+                other, n * S, make_queueing_delay(1, 1), make_queueing_delay(1, 1), rnd, 10
+            )
+        )
         estimate = estimator.estimate((n + 1) * S)
         assert estimate is not None
         assert estimate.low_ns - 2 <= other.offset((n + 1) * S) <= estimate.high_ns + 2
@@ -154,14 +178,24 @@ def test_wandering_drift_stays_inside(period_s: float, phase: float, seed: int) 
 
 @pytest.mark.parametrize("step_ns", [S, -S, 2_000_000, -2_000_000])
 def test_stepped_clocks_are_noticed_and_found_again(step_ns: int) -> None:
-    rnd, estimator = random.Random(3), OffsetEstimator()
-    before, after = Other(S, 30_000), Other(S + step_ns, 30_000)
+    rnd = random.Random(3)
+    estimator = OffsetEstimator()
+    before = Other(S, 30_000)
+    after = Other(S + step_ns, 30_000)
     for n in range(30):
-        estimator.add(*second(before, n * S, queueing(100, 50), queueing(100, 50), rnd))
+        estimator.add(
+            *exchange_second(
+                before, n * S, make_queueing_delay(100, 50), make_queueing_delay(100, 50), rnd
+            )
+        )
         assert estimator.estimate((n + 1) * S) is not None
     assert estimator.broken == 0
     for n in range(30, 34):
-        estimator.add(*second(after, n * S, queueing(100, 50), queueing(100, 50), rnd))
+        estimator.add(
+            *exchange_second(
+                after, n * S, make_queueing_delay(100, 50), make_queueing_delay(100, 50), rnd
+            )
+        )
         estimate = estimator.estimate((n + 1) * S)
     assert estimator.broken > 0
     assert estimate is not None
@@ -178,9 +212,10 @@ def test_only_contradicting_limits_leave_nothing() -> None:
 
 
 def test_memory_is_bounded_to_the_newest() -> None:
-    other, estimator = Other(S, 0), OffsetEstimator()
+    other = Other(S, 0)
+    estimator = OffsetEstimator()
     for n in range(3 * WINDOWS_KEPT):
-        estimator.add(ceiling(other, n * S, 1000), floor(other, n * S, 1000))
+        estimator.add(make_ceiling(other, n * S, 1000), make_floor(other, n * S, 1000))
     assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {
         WINDOWS_KEPT
     }
@@ -222,7 +257,8 @@ estimates = st.builds(
 def test_the_used_offset_is_always_continuous(
     bends: list[tuple[OffsetEstimate, int]],
 ) -> None:
-    course, now_ns = SlewedOffset(exact_offset(5)), 0
+    course = SlewedOffset(exact_offset(5))
+    now_ns = 0
     for estimate, passed_ns in bends:
         now_ns += passed_ns
         before = course.evaluate_ns(now_ns)
@@ -249,12 +285,19 @@ def test_used_offset_reaches_and_follows_its_estimate(estimate: OffsetEstimate) 
 def test_bounds_hold_the_truth_at_every_instant(
     seed: int, offset_ns: int, drift_ppb: float
 ) -> None:
-    """From the first exchange on, with late estimates, and through a silence of a minute."""
-    other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
-    estimator.add(*second(other, 0, queueing(300, 1000), queueing(50, 1000), rnd, 3))
+    """The bounds hold from the first exchange on, with late estimates, and through a silence of a minute."""
+    other = Other(offset_ns, drift_ppb)
+    rnd = random.Random(seed)
+    estimator = OffsetEstimator()
+    estimator.add(
+        *exchange_second(
+            other, 0, make_queueing_delay(300, 1000), make_queueing_delay(50, 1000), rnd, 3
+        )
+    )
     first = estimator.estimate(S)
     assert first is not None
-    course, now_ns = SlewedOffset(first), S
+    course = SlewedOffset(first)
+    now_ns = S
     for silence in (False,) * 8 + (True,):
         for _ in range(20):
             at_ns = now_ns + rnd.randrange(60 * S if silence else 3 * S)
@@ -262,7 +305,16 @@ def test_bounds_hold_the_truth_at_every_instant(
                 abs(course.evaluate_ns(at_ns) - other.offset(at_ns))
                 <= course.error_bound_ns(at_ns) + 3
             )
-        estimator.add(*second(other, now_ns, queueing(100, 300), queueing(50, 100), rnd, 10))
+        estimator.add(
+            *exchange_second(
+                other,
+                now_ns,
+                make_queueing_delay(100, 300),
+                make_queueing_delay(50, 100),
+                rnd,
+                10,
+            )
+        )
         now_ns += S + rnd.randrange(S)
         estimate = estimator.estimate(now_ns)
         assert estimate is not None

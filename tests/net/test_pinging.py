@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import SkewedClock
@@ -37,7 +38,10 @@ class Slow:
     """A bus whose questions reach the responders later, and whose answers return later still."""
 
     def __init__(self, bus: Bus, clock: ManualClock, there_ns: int, back_ns: int) -> None:
-        self._bus, self._clock, self._there_ns, self._back_ns = bus, clock, there_ns, back_ns
+        self._bus = bus
+        self._clock = clock
+        self._there_ns = there_ns
+        self._back_ns = back_ns
         self.asked = 0
 
     def query(self, key: str, payload: bytes = b"") -> "Slow.Late":
@@ -48,8 +52,12 @@ class Slow:
         """Answers on their way."""
 
         def __init__(self, slow: "Slow", key: str, payload: bytes, asked_ns: int) -> None:
-            self._slow, self._key, self._payload, self._asked_ns = slow, key, payload, asked_ns
-            self._replies, self._answered_ns = None, 0
+            self._slow = slow
+            self._key = key
+            self._payload = payload
+            self._asked_ns = asked_ns
+            self._replies = None
+            self._answered_ns = 0
 
         def poll(self) -> tuple[str, bytes] | None:
             now_ns = self._slow._clock.monotonic_ns()
@@ -82,7 +90,7 @@ class World:
     def wait(self, passed_ns: int, *wanted: int) -> None:
         for _ in range(passed_ns // STEP_NS):
             self.pinger.poll(wanted)
-            self.clock.sleep_until(self.clock.monotonic_ns() + STEP_NS)
+            sleep_for_ns(self.clock, STEP_NS)
 
 
 @given(
@@ -101,9 +109,10 @@ def test_clocks_are_known_to_half_round_trips(
     world.wait(400_000_000, 7)
     assert world.pinger.knows_clocks([7])
     estimate = world.pinger.estimate(7)
-    world.clock.sleep_until(world.clock.monotonic_ns() + later_ns)
+    sleep_for_ns(world.clock, later_ns)
     now_ns = world.clock.monotonic_ns()
-    truth, value = clock.monotonic_ns() - now_ns, estimate.extrapolate_ns(now_ns)
+    truth = clock.monotonic_ns() - now_ns
+    value = estimate.extrapolate_ns(now_ns)
     assert abs(truth - value) <= estimate.error_bound_ns(now_ns, value) + 2
     trip_ns = world.pinger.trips[7].shortest_ns
     assert trip_ns // STEP_NS in (
@@ -147,23 +156,23 @@ def test_polls_hurry_only_while_answers_travel() -> None:
     world.pinger.poll([7])
     assert world.pinger.pause_ns(5_000_000) == GLANCE_NS
     assert world.pinger.pause_ns(10) == 10
-    world.clock.sleep_until(world.clock.monotonic_ns() + S)
+    sleep_for_ns(world.clock, S)
     assert world.pinger.pause_ns(5_000_000) == 5_000_000
 
 
-def pong(**facts: object) -> Pong:
+def make_pong(**facts: object) -> Pong:
     return Pong(**{"member": "s", "boot": 7, "clock": "c", "came_ns": 0, "left_ns": 0, **facts})
 
 
 STRANGERS = {
     "garbage": b"\xc1",
-    "of another boot": encode(pong(boot=8)),
-    "of another member": encode(pong(member="m2")),
-    "of another version": encode(pong(v=VERSION + 1)),
-    "left before it came": encode(pong(came_ns=5, left_ns=4)),
-    "held longer than it was away": encode(pong(came_ns=0, left_ns=10**15)),
+    "of another boot": encode(make_pong(boot=8)),
+    "of another member": encode(make_pong(member="m2")),
+    "of another version": encode(make_pong(v=VERSION + 1)),
+    "left before it came": encode(make_pong(came_ns=5, left_ns=4)),
+    "held longer than it was away": encode(make_pong(came_ns=0, left_ns=10**15)),
     "beyond any clock": msgspec.msgpack.encode(
-        {**msgspec.structs.asdict(pong()), "came_ns": 2**62}
+        {**msgspec.structs.asdict(make_pong()), "came_ns": 2**62}
     ),
 }
 
@@ -182,7 +191,7 @@ def test_stepping_clocks_are_unknown_until_messages_agree() -> None:
     for n in range(PINGS):
         trips.receive(
             n * STEP_NS,
-            pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50),
+            make_pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50),
             n * STEP_NS + 100,
         )
     assert trips.is_known
@@ -191,20 +200,21 @@ def test_stepping_clocks_are_unknown_until_messages_agree() -> None:
     for n in range(PINGS, PINGS + PINGS_PER_WINDOW):
         at_ns = n * STEP_NS
         came_ns = at_ns + 50 + far_ns * (n % 2)
-        trips.receive(at_ns, pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
+        trips.receive(at_ns, make_pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
     assert not trips.is_known
     assert trips.latest == before
 
 
 def test_answers_count_for_their_own_question() -> None:
-    clock, network = ManualClock(S), LocalNetwork()
+    clock = ManualClock(S)
+    network = LocalNetwork()
     questions = network.join().query_inbox("t/a")
     asking = RepeatedQuery(network.join(), clock, "t/*")
     asked_ticks = []
     for _ in range(3):
         asking.repeat(0)
         asked_ticks.append(clock.monotonic_ns())
-        clock.sleep_until(clock.monotonic_ns() + S)
+        sleep_for_ns(clock, S)
     waiting = [questions.poll() for _ in asked_ticks]
     for n in (2, 0, 1):
         waiting[n].reply(bytes([n]))

@@ -36,7 +36,8 @@ from trilat_net.net.ros2_names import check_ros_name
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import ZenohMode, make_zenoh_config
 
-STRING, LOG = "std_msgs/msg/String", "rcl_interfaces/msg/Log"
+STRING = "std_msgs/msg/String"
+LOG = "rcl_interfaces/msg/Log"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
 LISTENER = Ros2Member(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
@@ -91,7 +92,9 @@ def test_qualities_of_service_omit_the_defaults(qos: QualityOfService, text: str
     assert qos.encode() == text
 
 
-TRIGGER, NAME, INFO = "std_srvs/srv/Trigger", Nodetype.NAME, "service_msgs/msg/ServiceEventInfo"
+TRIGGER = "std_srvs/srv/Trigger"
+NAME = Nodetype.NAME
+INFO = "service_msgs/msg/ServiceEventInfo"
 ASKED, TOLD, EVENT = (f"{TRIGGER}_{part}" for part in ("Request", "Response", "Event"))
 SERVICE = {
     INFO: (
@@ -217,9 +220,11 @@ class Wire:
     """A router, a graph of ours at the router, and a stranger that uses Zenoh alone."""
 
     def __init__(self, place: str) -> None:
-        self.place, self.said, self._kept = place, list[str](), list[Any]()
-        self.router = opened("router", place)
-        self.stranger = opened("client", place)
+        self.place = place
+        self.said = list[str]()
+        self._kept = list[Any]()
+        self.router = open_zenoh("router", place)
+        self.stranger = open_zenoh("client", place)
         self.graph = Ros2Graph(
             Refusals(self.said.append), [place], "play", "trilat", SystemClock()
         )
@@ -245,7 +250,7 @@ class Wire:
         self.router.close()
 
 
-def opened(mode: ZenohMode, place: str) -> Any:
+def open_zenoh(mode: ZenohMode, place: str) -> Any:
     ends = ([], [place]) if mode == "client" else ([place], [])
     return zenoh.open(zenoh.Config.from_json5(json.dumps(make_zenoh_config(*ends, mode))))
 
@@ -336,9 +341,9 @@ def test_returning_routers_carry_every_topic_again(wire: Wire) -> None:
         wire.stranger.close()
         wire.router.close()
         until(lambda: not wire.graph.connected)
-        wire.router = opened("router", wire.place)
+        wire.router = open_zenoh("router", wire.place)
         until(lambda: wire.graph.connected)
-        wire.stranger = opened("client", wire.place)
+        wire.stranger = open_zenoh("client", wire.place)
         now = wire.hears("0/a/**")
         until(lambda: plain.has_subscribers)
         plain.put(b"now")
@@ -351,7 +356,7 @@ def test_returning_routers_carry_every_topic_again(wire: Wire) -> None:
 def test_peers_forward_nothing_and_name_the_cure() -> None:
     (endpoint,) = find_free_endpoints(1)
     with (
-        closing(opened("peer", endpoint)),
+        closing(open_zenoh("peer", endpoint)),
         pytest.raises(UsageError, match=r"is not a router.*rmw_zenohd"),
     ):
         Ros2Graph(Refusals(print), [endpoint], "play", "trilat", SystemClock())

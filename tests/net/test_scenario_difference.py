@@ -1,6 +1,5 @@
 """The settings in which two scenarios differ, named in a line that any text may go into."""
 
-
 import pytest
 import tomli_w
 from hypothesis import given

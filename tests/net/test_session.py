@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
@@ -23,14 +24,14 @@ SITES = ("m1", "m2", "s")
 RECORDER = topics.RECORDER
 
 
-def party(*names: str) -> Party:
+def make_party(*names: str) -> Party:
     session_party = Party(SITES)
     session_party.start(*names)
     return session_party
 
 
 @st.composite
-def lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
+def draw_lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
     """The members of a session, and their events in any order before all are present."""
     sites = [f"site{n}" for n in range(draw(st.integers(2, 5)))]
     members = [*sites, RECORDER] if draw(st.booleans()) else sites
@@ -40,7 +41,7 @@ def lives(draw: st.DrawFn) -> tuple[list[str], list[tuple[str, str]]]:
     return members, draw(st.lists(happenings, max_size=80))
 
 
-@given(lives())
+@given(draw_lives())
 @settings(max_examples=50)
 def test_all_orders_of_starts_give_one_epoch(
     life: tuple[list[str], list[tuple[str, str]]],
@@ -72,13 +73,13 @@ def test_all_orders_of_starts_give_one_epoch(
 
 
 def test_the_epoch_lies_ahead_of_all_members() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     epoch = session.agreed()
     assert epoch.mono_ns - session.clock.monotonic_ns() >= DECIDE_NS - STEP_NS
 
 
 def test_no_member_starts_without_start() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     leader = session.members["m1"]
     for _ in range(200):  # the leader does not poll: nothing is announced
         session.round("m2", "s")
@@ -98,7 +99,7 @@ def test_no_member_starts_without_start() -> None:
 
 
 def test_slow_members_get_another_attempt() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     while "epoch" not in session.kinds():
         session.round("m1", "m2")
         session.members["s"].publisher.answer_queries()  # s is there, and then hangs
@@ -112,7 +113,7 @@ def test_slow_members_get_another_attempt() -> None:
 
 
 def test_a_leader_that_comes_last_leads() -> None:
-    session = party("s", "m2", RECORDER)
+    session = make_party("s", "m2", RECORDER)
     session.rounds(50)
     session.start("m1")
     session.agreed()
@@ -122,7 +123,7 @@ def test_a_leader_that_comes_last_leads() -> None:
 
 
 def test_members_lost_before_starts_are_awaited() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     while "epoch" not in session.kinds():
         session.round()
     session.kill("s")
@@ -134,7 +135,7 @@ def test_members_lost_before_starts_are_awaited() -> None:
 
 
 def test_leaders_lost_before_starts_are_replaced() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     while session.kinds().count("ready") < 2:
         session.round("m1")
         session.round("m2", "s")
@@ -144,7 +145,7 @@ def test_leaders_lost_before_starts_are_replaced() -> None:
 
 
 def test_announced_recorders_are_awaited() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     # there, and not joining yet
     session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")
     session.rounds(100)
@@ -166,7 +167,7 @@ def test_recorders_needed_by_any_site_are_awaited(who: str) -> None:
 
 
 def test_missing_members_are_named() -> None:
-    session = party("m2")
+    session = make_party("m2")
     assert session.members["m2"].joining.membership.list_missing() == ["m1", "s"]
     session.start("s")
     session.rounds(30)
@@ -175,7 +176,7 @@ def test_missing_members_are_named() -> None:
 
 def test_other_scenarios_are_refused_by_both_hashes() -> None:
     other = "a1" * 32
-    session = party("m1", "m2")
+    session = make_party("m1", "m2")
     session.start("s", scenario_sha256=other)
     both = re.compile(f"(?=.*{other[:16]})(?=.*{'5c' * 8})")
     with pytest.raises(SessionError, match=both):
@@ -190,7 +191,7 @@ def test_other_scenarios_are_refused_by_both_hashes() -> None:
 
 
 def test_refusals_are_reported_once_per_start() -> None:
-    session = party("m1", "m2")
+    session = make_party("m1", "m2")
     stubborn = session.member("s", scenario_sha256="a1" * 32)
     for _ in range(100):
         session.round()
@@ -208,7 +209,7 @@ def polled_until_refused(*members: Member, clock: ManualClock) -> list[str]:
                 except SessionError as error:
                     left[member.info.boot] = str(error)
                     member.bus.close()
-        clock.sleep_until(clock.monotonic_ns() + STEP_NS)
+        sleep_for_ns(clock, STEP_NS)
     return list(left.values())
 
 
@@ -248,7 +249,7 @@ def test_split_leaders_cannot_split_a_session() -> None:
 @pytest.mark.parametrize("present", [True, False])
 def test_joining_a_running_session_is_refused(name: str, present: bool) -> None:
     """Whether the member of that name is present, or has left its place."""
-    session = party(*SITES)
+    session = make_party(*SITES)
     epoch = session.agreed()
     if not present:
         session.kill(name)
@@ -290,9 +291,10 @@ def test_other_clocks_begin_at_the_same_instant(ahead_ns: dict[str, int], unix_n
 
 
 def test_readiness_needs_all_other_clocks() -> None:
-    session = party("m1", "m2")
+    session = make_party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
-    bus, deaf = session.members["m2"].bus, LocalNetwork().join().inbox("nothing")
+    bus = session.members["m2"].bus
+    deaf = LocalNetwork().join().inbox("nothing")
     ask = bus.query
     bus.query = lambda key: deaf if key.endswith(topics.PING) else ask(key)
     session.rounds(300)
@@ -306,10 +308,10 @@ def test_readiness_needs_all_other_clocks() -> None:
 
 def test_slow_networks_get_later_epochs() -> None:
     """Announcement, answer and start each need a way: the margin grows with the leader's round trips."""
-    session = party("m1", "m2")
+    session = make_party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
     trip_ns = 15 * STEP_NS
-    session.members["m1"].bus.query = later(
+    session.members["m1"].bus.query = delay_answers(
         session.members["m1"].bus.query, session.clock, trip_ns
     )
     session.rounds(200)
@@ -320,12 +322,15 @@ def test_slow_networks_get_later_epochs() -> None:
     assert all(member.epoch for member in session.members.values())
 
 
-def later(ask: Callable[..., Inbox], clock: ManualClock, after_ns: int) -> Callable[..., Inbox]:
+def delay_answers(
+    ask: Callable[..., Inbox], clock: ManualClock, after_ns: int
+) -> Callable[..., Inbox]:
     """Asks at once, and gets the answers later."""
 
     class Late:
         def __init__(self, inbox: Inbox) -> None:
-            self._inbox, self._from_ns = inbox, clock.monotonic_ns() + after_ns
+            self._inbox = inbox
+            self._from_ns = clock.monotonic_ns() + after_ns
 
         def poll(self) -> tuple[str, bytes] | None:
             return self._inbox.poll() if clock.monotonic_ns() >= self._from_ns else None
@@ -357,7 +362,7 @@ GARBAGE.append(bytes(70_000))
 
 @pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])
 def test_garbage_delays_no_session(name: str) -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     answers = session.stranger.query_inbox(topics.key(SESSION, name, topics.INFO))
     for _ in range(30):
         query = answers.poll()
@@ -370,7 +375,7 @@ def test_garbage_delays_no_session(name: str) -> None:
 
 
 def test_foreign_tokens_are_ignored() -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     for token in (f"trilat/{SESSION}/m1/alive/xyz", f"trilat/{SESSION}/stranger/alive/0x1"):
         session.stranger.announce(token)
     session.rounds(5)
@@ -405,7 +410,7 @@ FORGED = {
 
 @pytest.mark.parametrize("event", FORGED.values(), ids=FORGED.keys())
 def test_unannounced_events_change_nothing(event: Event) -> None:
-    session = party(*SITES)
+    session = make_party(*SITES)
     for _ in range(30):
         session.say(event.member, encode(event))
         session.round()
@@ -415,7 +420,7 @@ def test_unannounced_events_change_nothing(event: Event) -> None:
 
 
 def test_answers_under_foreign_keys_do_not_count() -> None:
-    session = party("m1", "m2")
+    session = make_party("m1", "m2")
     answers = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
     for _ in range(50):
         while (question := answers.poll()) is not None:
@@ -425,7 +430,7 @@ def test_answers_under_foreign_keys_do_not_count() -> None:
 
 
 def test_answers_of_other_versions_enter_the_error() -> None:
-    session = party("m1", "m2")
+    session = make_party("m1", "m2")
     answers = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
     newer: Info = answer_info("s", 1, v=VERSION + 1)
     for _ in range(50):

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.net.crossing import make_queueing_delay
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.step.ticks import tick_ns
 from trilat_net.net.clock import SkewedClock
@@ -30,13 +31,13 @@ from trilat_net.net.timing import (
     find_turn_ns,
 )
 
-from .crossing import Delay, Other, S, queueing
+from .crossing import Delay, Other, S
 
 RATE_HZ = 200
 NAMES = ("a", "b")
 
 
-def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> PeerSample:
+def make_sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> PeerSample:
     rest = {"q": [0, 0], "qd": [0, 0], "tau_x": [0, 0]}
     return PeerSample(
         v=VERSION, site="x", boot=1, tick=tick, sent_ns=sent_ns, echo=echo or [], **rest
@@ -60,21 +61,24 @@ class Session:
         self, skews: tuple[tuple[int, int], tuple[int, int]], ways: tuple[Delay, Delay]
     ) -> None:
         self.true = ManualClock(10**12)
-        self.ways, self.rnd = ways, random.Random(5)
+        self.ways = ways
+        self.rnd = random.Random(5)
         clocks = [SkewedClock(self.true, *skew) for skew in skews]
         epochs = [clock.monotonic_ns() + S for clock in clocks]
         epochs[1] += 300_000  # b converted it wrong by so much
         self.step_at: dict[int, tuple[int, int]] = {}
         self.step = {0: 0, 1: 0}
         self.sites = []
-        for own, other in ((0, 1), (1, 0)):
-            ahead = clocks[other].monotonic_ns() - clocks[own].monotonic_ns()
-            now_ns = clocks[own].monotonic_ns()
+        for side, other in ((0, 1), (1, 0)):
+            ahead = clocks[other].monotonic_ns() - clocks[side].monotonic_ns()
+            now_ns = clocks[side].monotonic_ns()
             first = OffsetEstimate(
                 now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5
             )
             peer = PeerClock(NAMES[other], epochs[other], 0, first, OffsetEstimator())
-            self.sites.append(Site(clocks[own], SiteTiming(epochs[own], RATE_HZ, [peer], "a")))
+            self.sites.append(
+                Site(clocks[side], SiteTiming(epochs[side], RATE_HZ, [peer], "a"))
+            )
             self.sites[-1].news += self.sites[-1].timing.list_initial_notices()
 
     def run(self, seconds: float, cut: range = range(0)) -> None:
@@ -107,14 +111,15 @@ class Session:
             self.step[n] = self.step_at[n][1]
         now_ns = site.clock.monotonic_ns() + self.step[n]
         echo = [list(entry) for entry in site.timing.pop_echo()]
-        sent = sample(k, site.timing.record_sent(k, now_ns), echo)
+        sent = make_sample(k, site.timing.record_sent(k, now_ns), echo)
         if k % (RATE_HZ // 10) == 0:
             site.stats.append(site.timing.pop_measurements(now_ns))
             site.news += site.timing.update_clocks(k + 1, now_ns)
         return sent
 
     def _take(self, n: int, message: PeerSample, true_ns: int) -> None:
-        site, other = self.sites[n], self.sites[1 - n]
+        site = self.sites[n]
+        other = self.sites[1 - n]
         arrived_ns = site.clock.monotonic_ns() + self.step[n]
         (meter,) = site.timing.monitors
         bound_ns = meter.offset.error_bound_ns(arrived_ns)
@@ -123,12 +128,12 @@ class Session:
         site.errors_ns.append((message.tick, delay_ns - true_delay_ns, bound_ns))
 
 
-LAN = queueing(80, 60)
+LAN = make_queueing_delay(80, 60)
 
 
 @pytest.mark.parametrize("skew", [(-2 * S, -100_000), (86_400 * S, 30_000)])
 def test_delays_stay_inside_bounds_and_grid_follows(skew: tuple[int, int]) -> None:
-    session = Session(((0, 0), skew), (LAN, queueing(140, 90)))
+    session = Session(((0, 0), skew), (LAN, make_queueing_delay(140, 90)))
     session.run(20.0)
     for site in session.sites:
         assert len(site.errors_ns) == 20 * RATE_HZ
@@ -150,7 +155,8 @@ def test_delays_stay_inside_bounds_and_grid_follows(skew: tuple[int, int]) -> No
 def test_logged_figures_are_true() -> None:
     session = Session(((0, 0), (3 * S, 100_000)), (LAN, LAN))
     session.run(12.0)
-    site, start_ns = session.sites[0], 10**12
+    site = session.sites[0]
+    start_ns = 10**12
     clock_events = [news for news in site.news if news["kind"] == "clock"]
     assert len(clock_events) >= 12
     for news in clock_events:
@@ -178,9 +184,11 @@ ways = st.tuples(st.floats(0, 5000), st.floats(1, 5000))
 @given(skews, skews, ways, ways, st.integers(0, 600), st.integers(0, 600))
 @settings(max_examples=8, deadline=None)
 def test_bounds_hold_for_any_clocks_and_ways(
-    one: Pair, two: Pair, there: Pair, back: Pair, begin: int, ticks: int
+    first_clock: Pair, two: Pair, way: Pair, back: Pair, begin: int, ticks: int
 ) -> None:
-    session = Session((one, two), (queueing(*there), queueing(*back)))
+    session = Session(
+        (first_clock, two), (make_queueing_delay(*way), make_queueing_delay(*back))
+    )
     session.run(4.0, range(begin, begin + ticks))
     for site in session.sites:
         for _, error_ns, bound_ns in site.errors_ns:
@@ -201,14 +209,16 @@ def test_stepping_clocks_are_faults_and_found_again(step_ns: int) -> None:
         assert abs(last["offset_ns"] - sign * (3 * S + step_ns)) <= last["bound_ns"]
 
 
-def meter(estimator: OffsetEstimator | None = None) -> tuple[LinkTimingMonitor, SentStamps]:
+def make_meter(
+    estimator: OffsetEstimator | None = None,
+) -> tuple[LinkTimingMonitor, SentStamps]:
     sent_stamps = SentStamps(8)
     return LinkTimingMonitor(
         PeerClock("b", 1000, 3, exact_offset(0), estimator), sent_stamps
     ), sent_stamps
 
 
-def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
+def read_figures(link: LinkTimingMonitor) -> tuple[int, ...]:
     measured = link.pop_measurements(0)
     return tuple(
         measured[name] for name in ("delay_us", "delay_max_us", "rtt_us", "clock_faults")
@@ -216,52 +226,52 @@ def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
 
 
 def test_on_one_clock_delays_are_exact() -> None:
-    link, sent = meter()
+    link, sent = make_meter()
     sent.record(7, 5_000)
-    assert link.receive(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
-    assert figures(link) == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
+    assert link.receive(make_sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
+    assert read_figures(link) == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
     assert link.close_window(10**12, 10**12) is None
     assert link.offset.bound_ns == 0
 
 
 def test_echoes_of_forgotten_stamps_are_ignored() -> None:
-    link, sent = meter()
+    link, sent = make_meter()
     for tick in range(20):
         sent.record(tick, tick)
-    link.receive(sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
+    link.receive(make_sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
     assert link.pop_measurements(0)["rtt_us"] == -1
     assert sent.find_ns(12) == 12
     assert sent.find_ns(11) is None
 
 
 def test_figures_cover_windows_and_faults_cover_everything() -> None:
-    link, _ = meter()
+    link, _ = make_meter()
     for n, delay_ns in enumerate((3_000, 1_000, 900_000, -5_000)):
-        link.receive(sample(n, 0), 1000 + delay_ns)
-    assert figures(link) == (3, 900, -1, 1)
-    assert figures(link) == (-1, -1, -1, 1)
+        link.receive(make_sample(n, 0), 1000 + delay_ns)
+    assert read_figures(link) == (3, 900, -1, 1)
+    assert read_figures(link) == (-1, -1, -1, 1)
     assert link.worst_ns == 5_000
 
 
 def test_the_newest_sample_is_echoed_once() -> None:
     peers = [PeerClock(name, 0, 0, exact_offset(0), None) for name in ("b", "c")]
     timing = SiteTiming(0, 1000, peers, "a")
-    one, two = timing.monitors
+    first, two = timing.monitors
     for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
-        one.receive(sample(tick, 0), at_ns)
-    two.receive(sample(9, 0), 80)
+        first.receive(make_sample(tick, 0), at_ns)
+    two.receive(make_sample(9, 0), 80)
     assert timing.pop_echo() == [(0, 6, 60), (1, 9, 80)]
     assert timing.pop_echo() == []
 
 
 def test_the_first_windows_are_short() -> None:
     estimator = OffsetEstimator()
-    link, sent = meter(estimator)
+    link, sent = make_meter(estimator)
     closed = []
     for n in range(400):
         now_ns = n * 10_000_000
         sent.record(n, now_ns)
-        link.receive(sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
+        link.receive(make_sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
         if link.close_window(now_ns + 600, now_ns + 600):
             closed.append(now_ns)
     assert closed[:FIRST_WINDOWS] == [FIRST_WINDOW_NS * (n + 1) for n in range(FIRST_WINDOWS)]
@@ -271,7 +281,7 @@ def test_the_first_windows_are_short() -> None:
 def test_members_on_the_leaders_clock_need_no_steering() -> None:
     timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, exact_offset(0), None)], "a")
     for k in range(0, 5000, 100):
-        timing.monitors[0].receive(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
+        timing.monitors[0].receive(make_sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
         assert timing.update_clocks(k + 1, 5 + k * 1_000_000 + 400_000) == []
     assert timing.schedule.due_ns(10_000) == 5 + 10 * S
     assert timing.schedule.slew == 0.0
@@ -304,7 +314,8 @@ def test_unsteered_grids_are_absolute_to_the_nanosecond(k: int, rate_hz: int) ->
 def test_steering_never_steps_or_exceeds_its_slew(
     steers: list[tuple[int, int, float]], rate_hz: int
 ) -> None:
-    grid, k = TickSchedule(EPOCH_NS, rate_hz), 0
+    grid = TickSchedule(EPOCH_NS, rate_hz)
+    k = 0
     for ticks, error_ns, drift in steers:
         k += ticks
         before = grid.due_ns(k)
@@ -320,7 +331,7 @@ def test_steering_never_steps_or_exceeds_its_slew(
 @pytest.mark.parametrize("drift_ppb", [-150_000, -100_000, 0, 37_000, 150_000])
 @pytest.mark.parametrize("begin_ns", [-400_000, 0, 400_000])
 def test_steered_grids_follow_the_leaders_drifting_clock(drift_ppb: int, begin_ns: int) -> None:
-    """From an epoch that was converted wrong by begin_ns, steered ten times a second by the true offset."""
+    """The epoch is wrong by begin_ns at first, and the true offset steers the grid ten times a second."""
     leader = Other(0, drift_ppb)
     grid = TickSchedule(begin_ns, 1000)
     errors = []

@@ -63,7 +63,7 @@ not_finite = st.sampled_from([math.nan, -math.nan, math.inf, -math.inf])
 ticks = st.integers(0, 2**40 - 1)
 
 
-def row(length: int) -> st.SearchStrategy[list[float]]:
+def draw_row(length: int) -> st.SearchStrategy[list[float]]:
     return st.lists(finite, min_size=length, max_size=length)
 
 
@@ -76,23 +76,30 @@ outputs = st.builds(
     rx_crc=st.integers(0, 2**32 - 1),
     cmd=st.lists(st.text(max_size=20), max_size=2),
     mem=st.lists(finite, max_size=3),
-    ch=st.one_of(st.just(()), row(3)),
-    hand=st.one_of(st.just(()), row(7)),
-    bodies=st.one_of(st.just(()), row(7)),
+    ch=st.one_of(st.just(()), draw_row(3)),
+    hand=st.one_of(st.just(()), draw_row(7)),
+    bodies=st.one_of(st.just(()), draw_row(7)),
     **dict.fromkeys(TASK_VECTORS, st.just(())),
-    **{name: row(length) for name, length in STATE_VECTORS.items()},
+    **{name: draw_row(length) for name, length in STATE_VECTORS.items()},
 )
 arrivals = st.lists(
-    st.builds(Arrival, st.integers(0, 1), ticks, row(2), row(2), st.integers(-(2**40), 2**40))
+    st.builds(
+        Arrival,
+        st.integers(0, 1),
+        ticks,
+        draw_row(2),
+        draw_row(2),
+        st.integers(-(2**40), 2**40),
+    )
 )
 boots = st.integers(0, 2**64 - 1)
 
 
-def bits(numbers: Any) -> bytes:
+def pack_numbers(numbers: Any) -> bytes:
     return struct.pack(f"<{len(numbers)}d", *numbers)
 
 
-def payload(**changes: Any) -> bytes:
+def make_state_payload(**changes: Any) -> bytes:
     vectors = {name: [0.5] * length for name, length in STATE_VECTORS.items()}
     output = TickRecord(
         tick=7, t_ns=7_000_000, mode=Mode.RUN, used=[-1, 3], rx_crc=1, cmd=[], mem=[], **vectors
@@ -103,28 +110,28 @@ def payload(**changes: Any) -> bytes:
     return msgpack.packb({**record, **changes})
 
 
-def sample(**changes: Any) -> bytes:
-    record = decode(payload(), State)
+def make_sample_payload(**changes: Any) -> bytes:
+    record = decode(make_state_payload(), State)
     fields = {name: getattr(record, name) for name in PeerSample.__struct_fields__}
     return msgpack.packb({**fields, **changes})
 
 
 @settings(max_examples=40)
-@given(output=outputs, came=arrivals, boot=boots, late_us=st.integers(0, 2**40))
+@given(output=outputs, arrivals_in=arrivals, boot=boots, late_us=st.integers(0, 2**40))
 def test_records_return_bit_for_bit(
-    output: TickRecord, came: list[Arrival], boot: int, late_us: int
+    output: TickRecord, arrivals_in: list[Arrival], boot: int, late_us: int
 ) -> None:
-    data = encode_state("m1", boot, PEERS, output, came, late_us, 12)
+    data = encode_state("m1", boot, PEERS, output, arrivals_in, late_us, 12)
     state = decode(data, State)
     plain = msgpack.unpackb(data)
     for name in STATE_VECTORS:
-        wanted = bits(getattr(output, name))
-        assert bits(getattr(state, name)) == wanted
-        assert bits(plain[name]) == wanted
+        wanted = pack_numbers(getattr(output, name))
+        assert pack_numbers(getattr(state, name)) == wanted
+        assert pack_numbers(plain[name]) == wanted
     assert (state.tick, state.t_ns, state.boot) == (output.tick, output.t_ns, boot)
     assert state.mode == output.mode.name.lower() == plain["mode"]
     assert state.used == dict(zip(PEERS, output.used, strict=True)) == plain["used"]
-    assert state.rx == [[a.peer, a.tick, a.latency_us] for a in came] == plain["rx"]
+    assert state.rx == [[a.peer, a.tick, a.latency_us] for a in arrivals_in] == plain["rx"]
     assert (state.rx_crc, state.late_us, state.busy_us) == (output.rx_crc, late_us, 12)
 
 
@@ -148,12 +155,12 @@ def test_stamps_return_and_are_nominal_in_virtual_time(
 
 
 def test_version_1_records_are_read_in_files() -> None:
-    record = msgpack.unpackb(payload(v=1))
+    record = msgpack.unpackb(make_state_payload(v=1))
     first = msgpack.packb(
         {name: record[name] for name in record if name not in ("sent_ns", "echo")}
     )
     assert decode(first, State, READABLE) == msgspec.structs.replace(
-        decode(payload(sent_ns=0), State), v=1
+        decode(make_state_payload(sent_ns=0), State), v=1
     )
     with pytest.raises(WireError) as refused:
         decode(first, State)
@@ -161,13 +168,13 @@ def test_version_1_records_are_read_in_files() -> None:
     assert VERSION in READABLE
 
 
-pose = st.one_of(st.just(()), row(3))
+pose = st.one_of(st.just(()), draw_row(3))
 
 
 @settings(max_examples=40)
 @given(
     output=outputs,
-    task=st.tuples(pose, row(3), row(3)),
+    task=st.tuples(pose, draw_row(3), draw_row(3)),
     echo=st.lists(st.tuples(ticks, ticks, instants), max_size=MOST_PEERS),
 )
 def test_sample_fields_equal_their_records(
@@ -183,16 +190,19 @@ def test_sample_fields_equal_their_records(
         of_state = (
             {"q": "x", "qd": "xd", "tau_x": "wrench"}.get(name, name) if task[0] else name
         )
-        ours, theirs = getattr(small, name), getattr(state, of_state)
+        ours = getattr(small, name)
+        theirs = getattr(state, of_state)
         assert ours == theirs
-        assert name not in ("q", "qd", "tau_x", "ch") or bits(ours) == bits(theirs)
-    assert bits(state.ch) == bits(output.ch)
+        assert name not in ("q", "qd", "tau_x", "ch") or pack_numbers(ours) == pack_numbers(
+            theirs
+        )
+    assert pack_numbers(state.ch) == pack_numbers(output.ch)
     assert b"wrench" in encode_state("m1", 3, PEERS, output, [], 0, 0) or not task[0]
 
 
 @given(st.lists(st.integers(0, 20_000), min_size=1, max_size=12))
 def test_blocks_hold_unchanged_records_in_order(sizes: list[int]) -> None:
-    records = [payload(tick=n, cmd=["x" * size]) for n, size in enumerate(sizes)]
+    records = [make_state_payload(tick=n, cmd=["x" * size]) for n, size in enumerate(sizes)]
     blocks = list(join_states(records))
     assert [state for block in blocks for state in split_states(block)] == records
     assert all(len(block) <= max(BACKFILL_BYTES, *map(len, records)) for block in blocks)
@@ -201,8 +211,8 @@ def test_blocks_hold_unchanged_records_in_order(sizes: list[int]) -> None:
 
 @given(st.integers(1, 3), st.integers(1, 200))
 def test_cut_blocks_keep_earlier_records(whole: int, cut: int) -> None:
-    records = [payload(tick=n) for n in range(whole)]
-    states = split_states(b"".join([*records, payload()[:cut]]))
+    records = [make_state_payload(tick=n) for n in range(whole)]
+    states = split_states(b"".join([*records, make_state_payload()[:cut]]))
     assert [next(states) for _ in records] == records
     with pytest.raises(WireError, match="malformed"):
         next(states)
@@ -215,13 +225,14 @@ def test_an_invalid_block_is_refused(block: bytes) -> None:
 
 
 @settings(max_examples=30)
-@given(output=outputs, came=arrivals)
-def test_msgspec_and_msgpack_agree(output: TickRecord, came: list[Arrival]) -> None:
+@given(output=outputs, arrivals_in=arrivals)
+def test_msgspec_and_msgpack_agree(output: TickRecord, arrivals_in: list[Arrival]) -> None:
     """Either library reads the other's bytes."""
-    state = decode(encode_state("m1", 1, PEERS, output, came, 0, 0), State)
+    state = decode(encode_state("m1", 1, PEERS, output, arrivals_in, 0, 0), State)
     again = decode(msgspec.msgpack.encode(state), State)
     assert all(
-        bits(getattr(again, name)) == bits(getattr(state, name)) for name in STATE_VECTORS
+        pack_numbers(getattr(again, name)) == pack_numbers(getattr(state, name))
+        for name in STATE_VECTORS
     )
     assert again.rx == state.rx
 
@@ -255,25 +266,32 @@ def test_infinite_numbers_are_refused_at_both_ends(
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_laws_send_their_declared_finite_numbers(count: int) -> None:
     numbers = [0.5] * count
-    for kind, data in {State: payload(ch=numbers), PeerSample: sample(ch=numbers)}.items():
+    for kind, data in {
+        State: make_state_payload(ch=numbers),
+        PeerSample: make_sample_payload(ch=numbers),
+    }.items():
         assert decode(data, kind, layout=Layout(sent=count)).ch == numbers
         with pytest.raises(WireError, match=rf"ch has {count} numbers?, not {count + 1}"):
             decode(data, kind, layout=Layout(sent=count + 1))
-    output = decode(payload(), State)
+    output = decode(make_state_payload(), State)
     output = TickRecord(
         7, 0, Mode.RUN, *[output.q] * 6, output.theta_hat, [], 0, [], [], ch=[math.inf]
     )
     with pytest.raises(WireError, match="not finite"):
         encode_sample("m1", 1, output, 0, [])
     with pytest.raises(WireError, match="not finite"):
-        decode(sample(ch=[math.nan]), PeerSample)
+        decode(make_sample_payload(ch=[math.nan]), PeerSample)
 
 
 @pytest.mark.parametrize("name", sorted(STATE_VECTORS))
 @pytest.mark.parametrize("off", [-1, 1])
 def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
     with pytest.raises(WireError, match=f"{name} has"):
-        decode(payload(**{name: [0.0] * (STATE_VECTORS[name] + off)}), State, layout=Layout())
+        decode(
+            make_state_payload(**{name: [0.0] * (STATE_VECTORS[name] + off)}),
+            State,
+            layout=Layout(),
+        )
 
 
 @pytest.mark.parametrize(
@@ -300,9 +318,10 @@ def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
 )
 def test_invalid_records_are_refused_by_reason(changes: dict[str, Any], reason: str) -> None:
     of_both = changes.keys() <= {*PeerSample.__struct_fields__, "stranger"}
-    for kind, data in ((State, payload(**changes)), (PeerSample, sample(**changes)))[
-        : 1 + of_both
-    ]:
+    for kind, data in (
+        (State, make_state_payload(**changes)),
+        (PeerSample, make_sample_payload(**changes)),
+    )[: 1 + of_both]:
         with pytest.raises(WireError) as refused:
             decode(data, kind)
         assert refused.value.reason == reason
@@ -332,7 +351,7 @@ def test_random_bytes_raise_wire_errors_only(data: bytes) -> None:
 
 
 def test_a_truncated_record_is_refused() -> None:
-    data = payload()
+    data = make_state_payload()
     for end in range(len(data)):
         with pytest.raises(WireError):
             decode(data[:end], State)
@@ -340,13 +359,13 @@ def test_a_truncated_record_is_refused() -> None:
 
 @given(
     st.lists(
-        st.tuples(st.integers(0, len(payload()) - 1), st.integers(0, 255)),
+        st.tuples(st.integers(0, len(make_state_payload()) - 1), st.integers(0, 255)),
         min_size=1,
         max_size=4,
     )
 )
 def test_a_mutated_record_raises_wire_errors_only(changes: list[tuple[int, int]]) -> None:
-    data = bytearray(payload())
+    data = bytearray(make_state_payload())
     for at, byte in changes:
         data[at] = byte
     only_wire_errors(bytes(data))
@@ -369,13 +388,13 @@ def test_a_mutated_record_raises_wire_errors_only(changes: list[tuple[int, int]]
 )
 def test_any_other_messagepack_raises_wire_errors_only(value: Any) -> None:
     only_wire_errors(msgpack.packb(value))
-    only_wire_errors(payload(q=value))
+    only_wire_errors(make_state_payload(q=value))
 
 
 @pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1q", b"\xdc\x00\x01"])
 def test_deep_nesting_is_refused(opening: bytes) -> None:
     only_wire_errors(opening * (MAX_BYTES // len(opening)))
-    data = sample(stranger=0)[:-1] + opening * 10_000 + b"\xc0"
+    data = make_sample_payload(stranger=0)[:-1] + opening * 10_000 + b"\xc0"
     only_wire_errors(data)
     with pytest.raises(WireError):
         decode(data, PeerSample)
@@ -384,7 +403,7 @@ def test_deep_nesting_is_refused(opening: bytes) -> None:
 def test_false_lengths_are_refused() -> None:
     for head in (kind + b"\xff" * 4 for kind in (b"\xdf", b"\xdd", b"\xdb", b"\xc6")):
         only_wire_errors(head)
-        only_wire_errors(payload(q=0)[:-1] + head)
+        only_wire_errors(make_state_payload(q=0)[:-1] + head)
 
 
 @given(
@@ -466,7 +485,9 @@ def test_schemas_are_equal_without_docstrings() -> None:
 
 def test_waiting_records_are_read_despite_strangers() -> None:
     ring: BoundedRing[tuple[str, bytes]] = BoundedRing(9)
-    one, two, bad = payload(tick=1), payload(tick=2), b"\xc1"
-    for sent in (one + two, b"no record", one + bad + two, b"", two):
+    first = make_state_payload(tick=1)
+    two = make_state_payload(tick=2)
+    bad = b"\xc1"
+    for sent in (first + two, b"no record", first + bad + two, b"", two):
         ring.put(("t/m1/state", sent))
     assert [record.tick for record in read_records(ring)] == [1, 2, 1, 2]

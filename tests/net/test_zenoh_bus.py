@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.net.networks import make_encrypted_mesh, wait_for_meeting
 from trilat_net.errors import UsageError
 from trilat_net.net.connection import find_free_endpoints, is_loopback
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
-from .networks import Routed, encrypted, meet
+from .networks import Routed
 from .waiting import query_once, received, until
 
 
@@ -30,11 +31,12 @@ def test_busy_ports_are_the_callers_named_error() -> None:
 def test_messages_without_member_are_refused() -> None:
     """Rings hold hundreds of messages, which at hundreds of megabytes each would fill the memory."""
     (endpoint,) = find_free_endpoints(1)
-    with closing(ZenohBus([endpoint])) as here, closing(ZenohBus([], [endpoint])) as there:
-        inbox, publish = (
-            here.inbox("trilat/x/m/event"),
-            there.publisher("trilat/x/m/event", patient=True),
-        )
+    with (
+        closing(ZenohBus([endpoint])) as listener,
+        closing(ZenohBus([], [endpoint])) as connecting,
+    ):
+        inbox = listener.inbox("trilat/x/m/event")
+        publish = connecting.publisher("trilat/x/m/event", patient=True)
 
         def hear() -> tuple[str, bytes] | None:
             publish(bytes(MOST_PUT_BYTES + 1))
@@ -63,16 +65,18 @@ def test_strangers_without_certificate_stay_outside(tmp_path: Path) -> None:
     """
     for folder in ("ours", "theirs"):
         (tmp_path / folder).mkdir()
-    ours, theirs = (encrypted("tls", tmp_path / folder) for folder in ("ours", "theirs"))
+    ours, theirs = (
+        make_encrypted_mesh("tls", tmp_path / folder) for folder in ("ours", "theirs")
+    )
     (endpoint,) = (
         free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(1)
     )
-    router = ZenohBus([endpoint], mode="router", settings=ours.own)
+    router = ZenohBus([endpoint], mode="router", settings=ours.settings)
     try:
-        for own_file in (theirs.own, None):
+        for own_file in (theirs.settings, None):
             with pytest.raises(RouterSilent):
                 ZenohBus([], [endpoint], "client", own_file)
-        ZenohBus([], [endpoint], "client", ours.own).close()
+        ZenohBus([], [endpoint], "client", ours.settings).close()
     finally:
         router.close()
 
@@ -97,7 +101,8 @@ ACCESS = """{
 
 
 def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
-    users, file = tmp_path / "users.txt", tmp_path / "router.json5"
+    users = tmp_path / "users.txt"
+    file = tmp_path / "router.json5"
     users.write_text("lab:secret\n")
     file.write_text(ACCESS.replace("USERS", str(users)))
     endpoints = find_free_endpoints(1)
@@ -117,9 +122,9 @@ def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
             enter("guessed")
         with pytest.raises(RouterSilent):
             ZenohBus([], endpoints, "client")
-        one, other = enter("secret"), enter("secret")
-        one.announce("trilat/lab/one/alive/1")
-        one.respond("trilat/lab/one/ping", lambda sent: sent)
+        first, other = enter("secret"), enter("secret")
+        first.announce("trilat/lab/one/alive/1")
+        first.respond("trilat/lab/one/ping", lambda sent: sent)
         assert until(other.presence("trilat/lab/*/alive/*").poll) == (
             "trilat/lab/one/alive/1",
             True,
@@ -128,14 +133,12 @@ def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
             "trilat/lab/one/ping",
             b"?",
         )
-        elsewhere, publish = (
-            other.inbox("trilat/elsewhere/state"),
-            one.publisher("trilat/elsewhere/state"),
-        )
+        elsewhere = other.inbox("trilat/elsewhere/state")
+        publish = first.publisher("trilat/elsewhere/state")
         publish(b"not allowed")
-        meet(one.publisher("trilat/lab/one/state"), other, "trilat/lab/one/state")
+        wait_for_meeting(first.publisher("trilat/lab/one/state"), other, "trilat/lab/one/state")
         publish(b"nor this")
-        meet(one.publisher("trilat/lab/one/event"), other, "trilat/lab/one/event")
+        wait_for_meeting(first.publisher("trilat/lab/one/event"), other, "trilat/lab/one/event")
         assert elsewhere.poll() is None
     finally:
         for bus in (*members, router):
@@ -144,11 +147,13 @@ def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_messages_travel_over_quic(tmp_path: Path) -> None:
-    network = encrypted("quic", tmp_path)
+    network = make_encrypted_mesh("quic", tmp_path)
     try:
-        sender, receiver = network.join(), network.join()
-        inbox, publish = receiver.inbox("t/a"), sender.publisher("t/a")
-        meet(publish, receiver, "t/a")
+        sender = network.join()
+        receiver = network.join()
+        inbox = receiver.inbox("t/a")
+        publish = sender.publisher("t/a")
+        wait_for_meeting(publish, receiver, "t/a")
         numbers = [n.to_bytes(2, "big") for n in range(500)]
         for number in numbers:
             publish(number)
@@ -167,14 +172,13 @@ def routed() -> Iterator[Routed]:
 
 @pytest.mark.long
 def test_members_meet_again_through_restarted_routers(routed: Routed) -> None:
-    one, other = routed.join(), routed.join()
-    one.announce("t/one/alive/1")
-    presence, inbox, publish = (
-        other.presence("t/*/alive/*"),
-        other.inbox("t/a"),
-        one.publisher("t/a"),
-    )
-    one.respond("t/one/ping", lambda sent: sent)
+    first = routed.join()
+    other = routed.join()
+    first.announce("t/one/alive/1")
+    presence = other.presence("t/*/alive/*")
+    inbox = other.inbox("t/a")
+    publish = first.publisher("t/a")
+    first.respond("t/one/ping", lambda sent: sent)
     assert until(presence.poll) == ("t/one/alive/1", True)
     routed.restart()
     assert until(presence.poll) == ("t/one/alive/1", False)
@@ -197,8 +201,8 @@ def test_connected_routers_are_one_network() -> None:
     ]
     members = [ZenohBus([], [endpoint], "client") for endpoint in endpoints]
     try:
-        meet(members[0].publisher("t/a"), members[1], "t/a")
-        meet(members[1].publisher("t/b"), members[0], "t/b")
+        wait_for_meeting(members[0].publisher("t/a"), members[1], "t/a")
+        wait_for_meeting(members[1].publisher("t/b"), members[0], "t/b")
     finally:
         for bus in (*members, *routers):
             bus.close()
@@ -208,7 +212,8 @@ def test_members_meet_at_a_private_socket(tmp_path: Path) -> None:
     """A Unix socket in a folder that no other user may enter, in place of a port of loopback."""
     endpoint = f"unixsock-stream/{tmp_path}/m1.sock"
     with closing(ZenohBus([endpoint])) as site, closing(ZenohBus([], [endpoint])) as peer:
-        inbox, publish = peer.inbox("trilat/x/m1/event"), site.publisher("trilat/x/m1/event")
+        inbox = peer.inbox("trilat/x/m1/event")
+        publish = site.publisher("trilat/x/m1/event")
 
         def arrived() -> bool:
             publish(b"1")

@@ -21,7 +21,7 @@ from trilat_net.net.zenoh_config import (
 SOURCE = "mine.json5"
 
 
-def nested(path: str, value: object) -> Any:
+def nest_value(path: str, value: object) -> Any:
     for key in reversed(path.split("/")):
         value = {key: value}
     return value
@@ -34,7 +34,7 @@ def look_up(settings: Mapping[str, Any], path: str) -> object:
     return value
 
 
-def checked(stated: object) -> ZenohFile:
+def check_stated(stated: object) -> ZenohFile:
     return check_zenoh_file(SOURCE, stated, lambda _: "")
 
 
@@ -66,7 +66,7 @@ WRONG = {
 @pytest.mark.parametrize("path", REQUIREMENTS)
 def test_settings_against_needs_are_refused_with_reason(path: str) -> None:
     with pytest.raises(UsageError) as refused:
-        checked(nested(path, WRONG[path]))
+        check_stated(nest_value(path, WRONG[path]))
     assert str(refused.value).startswith(f"{SOURCE}: {path}: ")
     assert f" must be {REQUIREMENTS[path][1]}" in str(refused.value)
 
@@ -81,9 +81,9 @@ def test_accepted_files_keep_the_sessions_needs(data: st.DataObject) -> None:
                 [WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"]
             )
         )
-        stated = merge_settings(stated, nested(path, value))
+        stated = merge_settings(stated, nest_value(path, value))
     try:
-        file = checked(stated)
+        file = check_stated(stated)
     except UsageError:
         return
     settings = make_zenoh_config([], [], "peer", file.settings)
@@ -97,7 +97,7 @@ def test_accepted_files_keep_the_sessions_needs(data: st.DataObject) -> None:
 
 
 def test_unneeded_settings_are_kept() -> None:
-    checked_file = checked(
+    checked_file = check_stated(
         {
             "transport": {
                 "link": {"tx": {"lease": 9_000, "keep_alive": 3}, "protocols": ["tls"]},
@@ -152,20 +152,20 @@ def test_stock_files_without_gossip_are_accepted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
 def test_values_equal_to_the_sessions_are_accepted(mode: str) -> None:
-    """Once for the mode of the file, or by mode; those of another mode are refused."""
+    """A value may stand once, or by mode; values of another mode are refused."""
     plain = make_zenoh_config([], [], mode)  # type: ignore[arg-type]
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
         used = look_up(plain, key)
         other = {-1: 0, 0: -1}[used] if key == "connect/timeout_ms" else not used
-        assert checked({"mode": mode, **nested(key, used)}).mode == mode
-        assert checked(nested(key, {mode: used})).mode == ""
-        for wrong in ({"mode": mode, **nested(key, other)}, nested(key, {mode: other})):
+        assert check_stated({"mode": mode, **nest_value(key, used)}).mode == mode
+        assert check_stated(nest_value(key, {mode: used})).mode == ""
+        for wrong in ({"mode": mode, **nest_value(key, other)}, nest_value(key, {mode: other})):
             with pytest.raises(
                 UsageError, match=f"{key}: .* must be left out, or as a session sets it"
             ):
-                checked(wrong)
+                check_stated(wrong)
     with pytest.raises(UsageError, match="listen/timeout_ms"):
-        checked(nested("listen/timeout_ms", False))
+        check_stated(nest_value("listen/timeout_ms", False))
 
 
 def test_all_contradicting_keys_are_named_at_once() -> None:
@@ -173,10 +173,10 @@ def test_all_contradicting_keys_are_named_at_once() -> None:
         "transport": {"link": {"tls": {"root_ca_certificate": "/nowhere.pem"}}}
     }
     for path, value in WRONG.items():
-        stated = merge_settings(stated, nested(path, value))
+        stated = merge_settings(stated, nest_value(path, value))
     stated["access_control"] = {"default_permission": "deny"}
     with pytest.raises(UsageError) as refused:
-        checked(stated)
+        check_stated(stated)
     message = str(refused.value)
     assert message.startswith(f"{SOURCE}: {len(WRONG) + 2} settings cannot be accepted: ")
     assert [key for key in WRONG if f"{key}: " not in message] == []
@@ -201,13 +201,13 @@ def test_all_keys_refused_by_zenoh_are_named(tmp_path: Path) -> None:
 
 
 def test_null_says_nothing() -> None:
-    assert checked({"id": None, "transport": {"link": {"tx": {"lease": None}}}}).settings == {
-        "transport": {"link": {"tx": {}}}
-    }
+    assert check_stated(
+        {"id": None, "transport": {"link": {"tx": {"lease": None}}}}
+    ).settings == {"transport": {"link": {"tx": {}}}}
 
 
 def test_endpoints_and_mode_may_depend_on_mode() -> None:
-    file = checked(
+    file = check_stated(
         {
             "mode": "client",
             "connect": {"endpoints": ["tcp/a:1"]},
@@ -228,11 +228,11 @@ def test_unreadable_certificates_are_reported_beforehand(tmp_path: Path) -> None
     with pytest.raises(
         UsageError, match=rf"{SOURCE}: {key}: {tmp_path}/none.pem cannot be read: No such"
     ):
-        checked(nested(key, f"{tmp_path}/none.pem"))
+        check_stated(nest_value(key, f"{tmp_path}/none.pem"))
     with pytest.raises(UsageError, match="dictionary_file"):
-        checked(nested("transport/auth/usrpwd/dictionary_file", str(tmp_path)))
+        check_stated(nest_value("transport/auth/usrpwd/dictionary_file", str(tmp_path)))
     (tmp_path / "ca.pem").write_text("")
-    assert checked(nested(key, f"{tmp_path}/ca.pem")).settings
+    assert check_stated(nest_value(key, f"{tmp_path}/ca.pem")).settings
 
 
 def test_json5_is_read_as_in_zenoh(tmp_path: Path) -> None:

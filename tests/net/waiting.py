@@ -11,6 +11,7 @@ STEP_NS = 2_000_000
 
 
 def until(condition: Callable[[], T], timeout_s: float = 30.0, clock: Clock | None = None) -> T:
+    """Returns the result of a condition once it is true; fails after a time limit."""
     clock = clock or SystemClock()
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
     while not (result := condition()):
@@ -21,10 +22,12 @@ def until(condition: Callable[[], T], timeout_s: float = 30.0, clock: Clock | No
 
 
 def drained(ring: PolledRing[T]) -> list[T]:
+    """Returns all messages that wait in a ring."""
     return list(iter(ring.poll, None))
 
 
 def query_once(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] | None:
+    """Returns the first reply to a question, or None without a reply within half a second."""
     replies = asker.query(key, payload)
     try:
         return until(replies.poll, timeout_s=0.5)
@@ -33,6 +36,7 @@ def query_once(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes]
 
 
 def received(inbox: Inbox, count: int) -> list[tuple[str, bytes]]:
+    """Returns messages of an inbox as soon as there are at least `count`."""
     messages: list[tuple[str, bytes]] = []
 
     def enough() -> bool:
@@ -41,3 +45,8 @@ def received(inbox: Inbox, count: int) -> list[tuple[str, bytes]]:
 
     until(enough)
     return messages
+
+
+def sleep_for_ns(clock: Clock, duration_ns: int) -> None:
+    """Sleeps on a clock for a duration."""
+    clock.sleep_until(clock.monotonic_ns() + duration_ns)

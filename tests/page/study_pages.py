@@ -21,7 +21,7 @@ COLOURED = """(image) => {
   }
   return count;
 }"""
-"""Number of the pixels of a picture that are neither white, black nor grey, as axes and letters are."""
+"""The least number of pixels of a picture that are neither white, black nor grey."""
 
 
 def open_folder(watched: WatchedPage, folder: Path, html: str) -> None:
@@ -59,6 +59,6 @@ def assert_page_of_study_is_whole(
 def assert_markdown_is_whole(
     browser: Browser, page: Path, pictures: int, tables: int = 1
 ) -> None:
-    """The same of a page in Markdown, as viewers of Markdown show it."""
+    """Asserts the same of a page in Markdown, as viewers of Markdown show the page."""
     html = MarkdownIt("commonmark").enable("table").render(page.read_text(encoding="utf-8"))
     assert_page_of_study_is_whole(browser, page.parent, html, pictures, tables)

@@ -69,9 +69,9 @@ def find_faults(browser: Browser, body: str, folder: Path) -> list[str]:
 
 
 def test_each_fault_of_a_page_is_found(browser: Browser, tmp_path: Path) -> None:
-    for body, words in FAULTS.items():
+    for body, phrase in FAULTS.items():
         faults = find_faults(browser, body, tmp_path)
-        assert any(words in fault for fault in faults), (body, faults)
+        assert any(phrase in fault for fault in faults), (body, faults)
 
 
 def test_a_page_without_fault_is_whole(browser: Browser, tmp_path: Path) -> None:

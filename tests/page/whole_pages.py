@@ -1,4 +1,4 @@
-"""Pages that a browser has opened, and what is wrong with them: errors, empty frames, charts without points.
+"""Pages that a browser has opened, and their faults: errors, empty frames, and charts without points.
 
 Invariant:
 - Only what the browser has drawn counts: pixels of canvases and pictures, boxes of shapes. The
@@ -64,19 +64,23 @@ class WatchedPage:
 
 
 def grave_findings(page: Page) -> list[str]:
-    """What axe-core calls serious or critical, each with its first place."""
+    """Returns the violations that axe-core calls serious or critical, each with its first element."""
     page.evaluate(AXE.read_text(encoding="utf-8"))
-    found: list[dict[str, Any]] = page.evaluate("axe.run().then((found) => found.violations)")
-    grave = [one for one in found if one["impact"] in ("serious", "critical")]
+    violations: list[dict[str, Any]] = page.evaluate(
+        "axe.run().then((found) => found.violations)"
+    )
+    grave = [
+        violation for violation in violations if violation["impact"] in ("serious", "critical")
+    ]
     return [
-        f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}"
-        for one in grave
+        f"{violation['id']}: {violation['nodes'][0]['html']}: {violation['nodes'][0]['failureSummary']}"
+        for violation in grave
     ]
 
 
 @contextmanager
 def watched_page(browser: Browser, **options: Any) -> Iterator[WatchedPage]:
-    """A page in a context of its own; at its end it has had no error."""
+    """Opens a page in a separate context, and asserts at the end that it had no error."""
     context = browser.new_context(**options)
     try:
         watched = WatchedPage(context)

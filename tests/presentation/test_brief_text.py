@@ -2,8 +2,7 @@
 
 from dataclasses import replace
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run, make_short_log
 from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from trilat_net.analysis.metrics.measures import Metric, quantities
 from trilat_net.presentation import brief_text
@@ -21,7 +20,7 @@ def key_rows(metrics: LogMetrics) -> dict[str, list[str]]:
 
 
 def test_key_metrics_name_the_worst_subject() -> None:
-    metrics = compute_log_metrics(logs.simulated("paper"))
+    metrics = compute_log_metrics(make_short_log("paper"))
     rows = key_rows(metrics)
     errors = {site: values["max_error_rad"].value for site, values in metrics.sites.items()}
     worst = max(errors, key=lambda site: errors[site] or 0.0)
@@ -33,7 +32,7 @@ def test_key_metrics_name_the_worst_subject() -> None:
 
 
 def test_missing_key_metric_has_its_reason() -> None:
-    metrics = compute_log_metrics(logs.simulated("paper"))
+    metrics = compute_log_metrics(make_short_log("paper"))
     assert metrics.sites["m1"]["settle_s"].value is None
     number, _, reason = key_rows(metrics)["settling time"]
     assert number == "–"
@@ -46,7 +45,7 @@ def test_every_key_metric_exists() -> None:
 
 
 def test_short_table_never_exceeds_ten_lines() -> None:
-    metrics = compute_log_metrics(logs.simulated("paper"))
+    metrics = compute_log_metrics(make_short_log("paper"))
     filled = {key: Metric(1.0) for key in metrics.sites["m1"]}
     table, _ = compose(replace(metrics, sites={"m1": filled}), brief=True)
     assert isinstance(table, TextTable)
@@ -64,7 +63,7 @@ def test_short_certificate_keeps_evidence_against_stability() -> None:
 
 
 def test_short_certificates_begin_like_long_ones() -> None:
-    certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
+    certificate = make_run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     *blocks, last = compose(certificate, brief=True)
     lines = [line.print_form.lines() for line in describe_certificate(certificate)]
     assert [block.lines() for block in blocks] == lines

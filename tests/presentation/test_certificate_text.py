@@ -7,8 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
+from tests.analysis.builders import (
+    JITTER,
+    LYAPUNOV,
+    make_busy_run,
+    make_diverged_log,
+    make_run,
+    make_short_log,
+)
+from tests.log.builders import rewrite_log
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
@@ -28,16 +35,16 @@ from trilat_net.presentation.page_summary import describe_basis
 from trilat_net.scenario import load_scenario
 
 LOGS = {
-    "free": lambda: runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log,
-    "jitter": lambda: runs.run("free", {**runs.JITTER, "rate_hz": 100}).log,
-    "rich": lambda: runs.run("rich").log,
-    "four": lambda: logs.simulated("four"),
+    "free": lambda: make_run("free", {"duration_s": 4.0, "rate_hz": 200}).log,
+    "jitter": lambda: make_run("free", {**JITTER, "rate_hz": 100}).log,
+    "rich": lambda: make_run("rich").log,
+    "four": lambda: make_short_log("four"),
     "p_d": lambda: (
-        runs.run("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}).log
+        make_run("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}).log
     ),
-    "empty": lambda: logs.rewritten(logs.simulated("paper"), lambda _: False),
-    "diverged": logs.diverged,
-    "busy": lambda: logs.busy().log,
+    "empty": lambda: rewrite_log(make_short_log("paper"), lambda _: False),
+    "diverged": make_diverged_log,
+    "busy": lambda: make_busy_run().log,
 }
 
 
@@ -191,7 +198,7 @@ def test_settled_runs_state_their_speed(behaviour: EndBehaviour) -> None:
 
 
 def test_divergence_is_stated_once_with_its_joint() -> None:
-    log = logs.diverged()
+    log = make_diverged_log()
     certificate = certify(log)
     cause = log.describe_divergence()
     assert re.fullmatch(
@@ -208,22 +215,22 @@ def test_divergence_is_stated_once_with_its_joint() -> None:
 def test_sentences_about_a_record_fit_its_length() -> None:
     """This run diverged after milliseconds, so that there is neither a last second nor a push to follow."""
     short = {"duration_s": 2.0, "rate_hz": 1000, "limits.qd_limit_rad_s": 0.02}
-    log = runs.run("free", short).log
+    log = make_run("free", short).log
     certificate = certify_run(log)
     assert certificate.twins is not None
     assert certificate.twins.text == "twins: too short a record to follow a push"
     texts = [line.text for line in describe_certificate(certificate)]
     assert not [text for text in texts if "last second" in text]
-    brief = runs.run("free", {"duration_s": 0.5, "rate_hz": 200}).certificate
+    brief = make_run("free", {"duration_s": 0.5, "rate_hz": 200}).certificate
     assert brief.end.text.endswith("in the whole record")
-    assert runs.run("free", {"duration_s": 1.5, "rate_hz": 200}).certificate.end.text.endswith(
+    assert make_run("free", {"duration_s": 1.5, "rate_hz": 200}).certificate.end.text.endswith(
         "in the last second"
     )
 
 
 def test_short_runs_state_their_length_once() -> None:
     slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
-    certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
+    certificate = make_run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
     short = replace(certificate, end=end, roots=slow)
     needed_s = 8.0 * np.log(2.0) / 0.25 + end.quiet_from_s
@@ -236,7 +243,7 @@ def test_short_runs_state_their_length_once() -> None:
 
 
 def test_pace_follows_the_slowest_root() -> None:
-    certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
+    certificate = make_run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     for rate_per_s, verb in ((-0.5, "halves"), (0.5, "doubles")):
         verdict = "stable" if rate_per_s < 0.0 else "unstable"
         roots = LoopRoots(verdict, rate_per_s, True, f"this rest: {verdict}")
@@ -254,13 +261,13 @@ def test_many_links_are_one_entry() -> None:
 
 
 def test_wrong_weights_of_the_paper_are_named() -> None:
-    last_line = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
+    last_line = describe_certificate(make_run("free", LYAPUNOV).certificate)[-1]
     assert last_line.mark == "note"
     assert last_line.text.startswith(
         "with the paper's weights, ones, V would have risen by 12.3 J of 32.8"
     )
     assert (
-        runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate.paper_balance is None
+        make_run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate.paper_balance is None
     )
 
 
@@ -276,7 +283,7 @@ def test_listed_energies_sum_to_v(name: str) -> None:
 
 def test_missing_energies_are_reported() -> None:
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 0.5, "rate_hz": 200}
-    certificate = certify(runs.run("paper", rest).log)
+    certificate = certify(make_run("paper", rest).log)
     assert "energy balance: there is no energy in this run" in [
         line.text for line in describe_certificate(certificate)
     ]

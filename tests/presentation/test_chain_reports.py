@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.chains import six_joints
 from tests.core.chain_references import chain_references
+from tests.presentation.figure_content import list_misplaced
+from tests.scenario.builders import six_joint_text
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
@@ -19,19 +20,17 @@ from trilat_net.presentation.figures import arm_poses, joint_motion
 from trilat_net.presentation.style import arrange_joints
 from trilat_net.scenario import parse_scenario
 
-from .drawn_words import misplaced
-
-SIX = six_joints(1.0, delay_ms=40.0)
+SIX = six_joint_text(1.0, delay_ms=40.0)
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
 
 
 @cache
-def six() -> Log:
+def simulate_six_joints() -> Log:
     return simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200}))
 
 
 def test_chains_end_where_pinocchio_says():
-    arm = six().scenario.arms["m1"]
+    arm = simulate_six_joints().scenario.arms["m1"]
     states = chain_references()["arm6"].states
     points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
     assert points[:, -1] == pytest.approx(
@@ -43,7 +42,7 @@ def test_chains_end_where_pinocchio_says():
 
 
 def test_pictures_of_chains_have_shadows_below():
-    arm = six().scenario.arms["m1"]
+    arm = simulate_six_joints().scenario.arms["m1"]
     origin, above, aside = arm_poses.project_arm_m(
         arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]])
     )
@@ -81,9 +80,9 @@ def test_panels_of_joints_fill_their_rows():
     ],
 )
 def test_every_joint_has_its_panel(form, draw, panels):
-    figure = draw(six(), form)
+    figure = draw(simulate_six_joints(), form)
     assert panels in (None, len(figure.axes))
-    assert misplaced(figure) == []
+    assert list_misplaced(figure) == []
     text = " ".join(
         axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes
     )
@@ -92,7 +91,7 @@ def test_every_joint_has_its_panel(form, draw, panels):
 
 
 def test_tip_paths_appear_in_three_planes():
-    log = six()
+    log = simulate_six_joints()
     panels = joint_motion.draw_end_effector_paths(log, REPORT_SIZE).axes
     names = [(axes.get_xlabel()[0], axes.get_ylabel()[0]) for axes in panels]
     assert names == [("x", "y"), ("x", "z"), ("y", "z")]
@@ -108,7 +107,7 @@ def test_wall_forces_equal_the_recorded_torques():
     """The wall's torque is the force times the end effector's motion along the normal, by
     differences of poses.
     """
-    arm = six().scenario.arms["s"]
+    arm = simulate_six_joints().scenario.arms["s"]
     start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[
         0, -1
     ]
@@ -139,13 +138,13 @@ def test_wall_forces_equal_the_recorded_torques():
 
 
 def test_columns_and_messages_name_joints_and_links():
-    table = six().table("m1")
+    table = simulate_six_joints().table("m1")
     assert table["q3_rad"].meaning.endswith("joint 3, elbow")
     inertia = table["theta_hat3_Izz_kg_m2"]
     assert (inertia.unit, inertia.source) == ("kg m^2", "theta_hat[29]")
-    assert (inertia.values == six()["m1"].theta_hat[:, 29]).all()
+    assert (inertia.values == simulate_six_joints()["m1"].theta_hat[:, 29]).all()
     assert table["theta_hat1_m_kg"].unit == "kg"
-    channels = Ros2SiteChannels(six().scenario, "m1")
+    channels = Ros2SiteChannels(simulate_six_joints().scenario, "m1")
     assert channels.joints == JOINTS
     names = channels.arrays["theta_hat"].channel.about["names"].split(" ")
     assert (len(names), names[0], names[29]) == (60, "shoulder.m", "forearm.Izz")
@@ -170,7 +169,7 @@ def test_small_planar_arms_have_lines_as_thin(scenario, side):
 
 @pytest.mark.long
 def test_the_page_draws_chains_from_their_joints():
-    log = six()
+    log = simulate_six_joints()
     builder = charts.ChartBuilder(log, None)
     data = builder.build().data.to_builtins()
     assert [arm["points"] for arm in data["arms"]] == [7, 7, 7]

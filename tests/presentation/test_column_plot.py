@@ -7,38 +7,34 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.analysis import logs
-from tests.task_arms import planar_task
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.presentation.figure_content import list_curves
+from tests.scenario.builders import planar_task_text
 from trilat_net.errors import UnknownName, UsageError
 from trilat_net.presentation import style
 from trilat_net.presentation.column_plot import DEFAULT_QUANTITIES
 
 
-def titles(figure):
+def list_titles(figure):
     return [axes.get_title() for axes in figure.axes]
 
 
-def curves(axes):
-    """Lines over time, without those that mark a change."""
-    return [line for line in axes.lines if line.get_transform() == axes.transData]
-
-
 def test_the_default_is_the_overview():
-    log = logs.simulated("four")
-    assert titles(log.plot()) == titles(tn.figure(log, "overview", width_in=7.0))
+    log = make_short_log("four")
+    assert list_titles(log.plot()) == list_titles(tn.figure(log, "overview", width_in=7.0))
 
 
 def test_a_notebook_displays_the_figure():
-    figure = logs.simulated("four").plot("mode")
+    figure = make_short_log("four").plot("mode")
     assert figure._repr_html_().startswith("<img")
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
 def test_a_quantity_has_a_panel_per_column():
-    figure = logs.simulated("paper").plot("q", "tau", "theta_hat")
-    assert titles(figure)[:2] == ["q1 (rad)", "q2 (rad)"]
-    assert titles(figure)[2:4] == ["tau1 (N m)", "tau2 (N m)"]
-    assert titles(figure)[4:] == [
+    figure = make_short_log("paper").plot("q", "tau", "theta_hat")
+    assert list_titles(figure)[:2] == ["q1 (rad)", "q2 (rad)"]
+    assert list_titles(figure)[2:4] == ["tau1 (N m)", "tau2 (N m)"]
+    assert list_titles(figure)[4:] == [
         "theta_hat1 (kg m²)",
         "theta_hat2 (kg m²)",
         "theta_hat3 (kg m²)",
@@ -49,9 +45,9 @@ def test_a_quantity_has_a_panel_per_column():
 
 @pytest.mark.parametrize("name", ["q", "qd", "q_des", "tau", "tau_x", "e"])
 def test_curves_have_the_extremes_of_the_records(name):
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     for joint, axes in enumerate(log.plot(name).axes):
-        for site, curve in zip(log.sites, curves(axes), strict=True):
+        for site, curve in zip(log.sites, list_curves(axes), strict=True):
             values = getattr(log[site], name)[:, joint]
             drawn = curve.get_ydata()
             assert (np.nanmin(drawn), np.nanmax(drawn)) == (values.min(), values.max())
@@ -60,52 +56,52 @@ def test_curves_have_the_extremes_of_the_records(name):
 
 @pytest.mark.parametrize("name", ["q2", "q2_rad"])
 def test_a_single_column_has_two_names(name):
-    assert titles(logs.simulated("four").plot(name)) == ["q2 (rad)"]
+    assert list_titles(make_short_log("four").plot(name)) == ["q2 (rad)"]
 
 
 def test_every_column_of_the_table_can_be_drawn():
-    log = logs.simulated("four")
+    log = make_short_log("four")
     for column in log.table("a").columns:
         assert len(log.plot(column.name, sites="a").axes) == 1, column.name
 
 
 def test_sites_joints_and_times_restrict_a_figure():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     figure = log.plot("q", "age", sites=["s", "m1"], joints=2, from_s=1.0, until_s=1.5)
-    assert titles(figure) == ["q2 (rad)", "age_m2 (ms)", "age_s (ms)", "age_m1 (ms)"]
+    assert list_titles(figure) == ["q2 (rad)", "age_m2 (ms)", "age_s (ms)", "age_m1 (ms)"]
     angles = figure.axes[0]
-    assert [len(curves(axes)) for axes in figure.axes] == [2, 2, 1, 1]
+    assert [len(list_curves(axes)) for axes in figure.axes] == [2, 2, 1, 1]
     assert angles.get_xlim() == (1.0, 1.5)
-    for curve in curves(angles):
+    for curve in list_curves(angles):
         assert curve.get_xdata().min() >= 1.0
         assert curve.get_xdata().max() <= 1.5
-    assert titles(log.plot(joints="q1")) == [
+    assert list_titles(log.plot(joints="q1")) == [
         f"{name}1 ({unit})"
         for name, unit in zip(DEFAULT_QUANTITIES, ("rad", "rad", "N m"), strict=True)
     ]
 
 
 def test_modes_are_steps_between_words():
-    log = logs.busy().log
+    log = make_busy_run().log
     [axes] = log.plot("mode").axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
     recorded = {mode for site in log.sites for mode in log[site].mode}
     assert set(labels) == recorded
     assert labels[0] == "run"
-    assert {line.get_drawstyle() for line in curves(axes)} == {"steps-post"}
+    assert {line.get_drawstyle() for line in list_curves(axes)} == {"steps-post"}
 
 
 def test_changes_outside_the_time_are_not_marked():
-    log = logs.busy().log
+    log = make_busy_run().log
     assert "a → c" in log.plot("q").get_supxlabel()
     assert "a → c" not in log.plot("q", until_s=0.5).get_supxlabel()
     assert not [text for axes in log.plot("q", until_s=0.5).axes for text in axes.texts]
 
 
 def test_sites_with_poses_have_errors_along_axes():
-    log = tn.simulate(planar_task(), duration_s=0.05)
-    assert titles(log.plot("e")) == ["e_x (m)", "e_y (m)", "e_z (m)"]
-    assert titles(log.plot("q_des", "q", joints=1)) == [
+    log = tn.simulate(planar_task_text(), duration_s=0.05)
+    assert list_titles(log.plot("e")) == ["e_x (m)", "e_y (m)", "e_z (m)"]
+    assert list_titles(log.plot("q_des", "q", joints=1)) == [
         "q_des_x (m)",
         "q_des_y (m)",
         "q_des_z (m)",
@@ -133,7 +129,7 @@ def test_sites_with_poses_have_errors_along_axes():
 )
 def test_wrong_names_suggest_the_right_ones(names, selection, error, hint):
     with pytest.raises(error) as refused:
-        logs.simulated("four").plot(*names, **selection)
+        make_short_log("four").plot(*names, **selection)
     assert hint in str(refused.value)
 
 

@@ -29,10 +29,10 @@ from tests.turning import (
     RECORDS,
     Motion,
     count_wraps,
-    largest_step,
-    make_log,
+    find_largest_turn,
+    make_rotation,
+    make_turning_log,
     place_links,
-    turn,
 )
 from trilat_net.analysis.body_turns import BodyTurns
 from trilat_net.core.step.vectors import Array
@@ -69,19 +69,19 @@ def assert_follows(what: str, series: Array, truth: Rotation, accuracy: float = 
     """
     assert (read_rotation(series) * truth.inv()).magnitude().max() < accuracy, what
     largest = np.linalg.norm(np.diff(series, axis=0), axis=1).max()
-    assert largest <= ALLOWED * largest_step(truth), what
+    assert largest <= ALLOWED * find_largest_turn(truth), what
 
 
 def test_motions_pass_half_a_turn() -> None:
     """Otherwise the other tests would prove nothing."""
-    wraps = [count_wraps(turn(number)) for number in MOTIONS]
+    wraps = [count_wraps(make_rotation(number)) for number in MOTIONS]
     assert sum(count > 0 for count in wraps) >= 25
     assert max(wraps) >= 3
 
 
 @pytest.mark.parametrize("number", MOTIONS)
 def test_numbers_of_a_turning_body_never_jump(number: int) -> None:
-    truth = turn(number, 1000)
+    truth = make_rotation(number, 1000)
     vectors = truth.as_rotvec()
     assert_follows("quaternions", compute_quaternions(vectors), truth, 1e-12)
     assert_follows("six numbers", compute_matrix_columns(vectors), truth, 1e-12)
@@ -202,7 +202,8 @@ def list_ros_series(
 
 def list_bag(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
     tn.export(log, "ros2", folder / "out.mcap")
-    poses, frames = defaultdict(list), []
+    poses = defaultdict(list)
+    frames = []
     with AnyReader([folder / "out.mcap"]) as bag:
         for connection, _, data in bag.messages():
             if connection.msgtype == "geometry_msgs/msg/PoseStamped":
@@ -265,7 +266,7 @@ def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Ite
 def test_exports_and_topics_turn_with_the_arm(
     tmp_path: Path, number: int, list_series: Callable[..., Iterator[Series]]
 ) -> None:
-    log, motions = make_log(number)
+    log, motions = make_turning_log(number)
     count = 0
     for what, series, truth in list_series(log, motions, tmp_path):
         assert len(series) == RECORDS, what
@@ -277,7 +278,8 @@ def test_exports_and_topics_turn_with_the_arm(
 @pytest.mark.parametrize("number", MOTIONS)
 def test_bodies_on_pages_turn_with_the_plant(number: int) -> None:
     """A plant may give its quaternions any sign."""
-    truth, bodies = turn(number), BodyTurns()
+    truth = make_rotation(number)
+    bodies = BodyTurns()
     canonical = truth.as_quat(canonical=True, scalar_first=True)
     frames = [bodies.align([1.0, 2.0, 3.0, *axis, 0.0, 0.0, 0.0, *-axis]) for axis in canonical]
     poses = np.array(frames).reshape(RECORDS, 2, 7)
@@ -316,5 +318,5 @@ def test_datasets_of_downward_tools_have_no_jump(tmp_path: Path) -> None:
     rows = (np.arange(len(frames)) * 1000) // 30
     turned = Rotation.from_rotvec(log["m"].x[rows, 3:])
     assert count_wraps(turned) > 0
-    assert largest_step(turned) < 0.2
+    assert find_largest_turn(turned) < 0.2
     assert_follows("action", frames["action"].to_numpy()[:, 3:].astype(np.float64), turned)

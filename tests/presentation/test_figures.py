@@ -11,8 +11,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import trilat_net
-from tests.analysis import logs
-from tests.task_arms import planar_task
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.log.builders import add_clock_readings
+from tests.presentation.figure_content import list_curves
+from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.link_summary import DelayDistribution
 from trilat_net.analysis.timeline import find_mode_intervals
@@ -33,7 +35,7 @@ BACKGROUND = 0.6
 """What marks are drawn at or below, so that lines cover them."""
 
 
-def marked(figure):
+def list_marks(figure):
     """Returns the marks behind the lines of all panels: shades, and lines at changes."""
     shades = [p for axes in figure.axes for p in axes.patches if p.get_zorder() < BACKGROUND]
     changes = [
@@ -42,32 +44,27 @@ def marked(figure):
     return shades, changes
 
 
-def lines(axes):
-    """Returns lines over time, without the horizontal ones that span the panel."""
-    return [line for line in axes.lines if line.get_transform() == axes.transData]
-
-
 def test_a_site_has_one_colour_in_every_figure():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     for figure in (
         joint_motion.draw_tracking_errors(log),
         joint_motion.draw_parameter_estimates(log),
         joint_motion.draw_operator_displacement(log, twin=log),
     ):
-        drawn = [to_hex(line.get_color()) for line in lines(figure.axes[0])]
+        drawn = [to_hex(line.get_color()) for line in list_curves(figure.axes[0])]
         assert drawn[: len(log.sites)] == [style.site_colour(log, site) for site in log.sites]
     for site, axes in zip(log.sites, joint_motion.draw_positions(log).axes[::2], strict=True):
-        assert to_hex(lines(axes)[0].get_color()) == style.site_colour(log, site)
+        assert to_hex(list_curves(axes)[0].get_color()) == style.site_colour(log, site)
 
 
 def test_a_single_site_has_the_widest_line():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     first = SimpleNamespace(sites=log.sites[:1], scenario=log.scenario)
     assert style.site_line(first, log.sites[0]) == style.site_line(log, log.sites[0])
 
 
 def test_histograms_count_every_tick():
-    log = logs.timed(logs.simulated("four"))
+    log = add_clock_readings(make_short_log("four"))
     edges = age_and_lateness.choose_bin_edges_us(log)
     for site in log.sites:
         assert age_and_lateness.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
@@ -79,16 +76,16 @@ def test_histograms_count_every_tick():
 
 @pytest.mark.long
 def test_a_log_without_events_has_no_markers():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     for name in registry.list_drawable_figures(log):
         drawn = registry.figure(log, name)
         if name != "certificate":  # which marks a rise of V
-            assert marked(drawn) == ([], []), name
+            assert list_marks(drawn) == ([], []), name
         assert drawn.get_supxlabel() == ""
 
 
 def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
-    log = logs.busy().log
+    log = make_busy_run().log
     figure = joint_motion.draw_positions(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
         for axes in row:
@@ -102,7 +99,7 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
             assert drawn == pytest.approx(
                 [edge for span in find_mode_intervals(log[site]) for edge in span[1:]]
             )
-    shades, changes = marked(joint_motion.draw_tracking_errors(log))
+    shades, changes = list_marks(joint_motion.draw_tracking_errors(log))
     assert len(changes) == 3 * 3
     assert len(shades) == 3 * sum(len(find_mode_intervals(log[site])) for site in log.sites)
     assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
@@ -112,26 +109,26 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
 
 
 def test_the_stated_mean_is_drawn_while_valid():
-    log = logs.busy().log
+    log = make_busy_run().log
     figure = age_and_lateness.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
-    t_s, mean_ms = lines(panel)[-1].get_data()
+    t_s, mean_ms = list_curves(panel)[-1].get_data()
     assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
     assert mean_ms == pytest.approx([50.0, 50.0, np.nan, 90.0, 90.0, np.nan], nan_ok=True)
     measured = trilat_net.simulate(
         "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
     )
     figure = age_and_lateness.draw_sample_age(measured)
-    assert all(np.isnan(lines(axes)[-1].get_ydata()).all() for axes in figure.axes)
+    assert all(np.isnan(list_curves(axes)[-1].get_ydata()).all() for axes in figure.axes)
     assert "mean delay as stated" not in [
         text.get_text() for text in figure.legends[0].get_texts()
     ]
 
 
 def test_each_site_has_estimates_beside_the_truth():
-    figure = joint_motion.draw_parameter_estimates(logs.simulated("paper"))
-    assert [len(lines(axes)) for axes in figure.axes] == [3] * 5
-    truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
+    figure = joint_motion.draw_parameter_estimates(make_short_log("paper"))
+    assert [len(list_curves(axes)) for axes in figure.axes] == [3] * 5
+    truths = [line for line in figure.axes[3].lines if line not in list_curves(figure.axes[3])]
     # m1 lc1 + m2 l1 of the paper's arm
     assert [line.get_ydata()[0] for line in truths] == [2.0]
 
@@ -147,7 +144,8 @@ def test_distributions_show_rare_long_ages():
 
 
 def test_ages_that_alternate_are_a_band():
-    seconds, swings = np.arange(4000) / 1000.0, np.arange(4000) % 5
+    seconds = np.arange(4000) / 1000.0
+    swings = np.arange(4000) % 5
     assert age_and_lateness.is_unsteady(200.0 + 10.0 * swings)
     assert not age_and_lateness.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
     axes = Figure().subplots()
@@ -180,7 +178,7 @@ def test_shares_are_fractions_of_the_total():
 
 
 def test_arms_stand_in_panels_with_equal_axes():
-    log = logs.simulated("four")
+    log = make_short_log("four")
     arm = log.scenario.arms["c"]
     base, elbow, end_effector = arm_poses.joint_positions_m(
         arm, np.array([[np.pi / 2, -np.pi / 2]])
@@ -213,7 +211,7 @@ def test_long_paths_are_thinned_between_ends():
 
 
 def test_a_triangle_stands_where_a_site_settles():
-    log = logs.simulated("two_sites")
+    log = make_short_log("two_sites")
     (axes,) = joint_motion.draw_settling(log).axes
     marks = [line.get_data() for line in axes.lines if line.get_marker() == "v"]
     settled = [site_signals.settling_time_s(log[site]) for site in log.sites]
@@ -224,7 +222,7 @@ def test_a_triangle_stands_where_a_site_settles():
 
 
 def test_phase_portraits_show_e_and_its_rate():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     line = joint_motion.draw_phase_portrait(log).axes[1].lines[0]
     part = log["m1"]
     both = np.stack([part.e[:, 1], (part.qd - part.qd_des)[:, 1]], axis=1)
@@ -234,7 +232,7 @@ def test_phase_portraits_show_e_and_its_rate():
 
 
 def test_torque_limits_are_drawn_where_reached():
-    free = joint_motion.draw_control_torques(logs.simulated("paper"))
+    free = joint_motion.draw_control_torques(make_short_log("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
     log = trilat_net.simulate(
         "paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20}
@@ -242,7 +240,7 @@ def test_torque_limits_are_drawn_where_reached():
     figure = joint_motion.draw_control_torques(log)
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
     axes = figure.axes[0]
-    assert {line.get_ydata()[0] for line in axes.lines if line not in lines(axes)} == {
+    assert {line.get_ydata()[0] for line in axes.lines if line not in list_curves(axes)} == {
         20.0,
         -20.0,
     }
@@ -260,32 +258,32 @@ def test_shares_are_drawn_as_they_change():
     assert joint_motion.list_sites_with_changing_dominance(log) == ["s"]
     figure = joint_motion.draw_authority(log)
     assert len(figure.axes) == 3
-    m1, m2 = (line.get_data() for line in lines(figure.axes[0])[:2])
+    m1, m2 = (line.get_data() for line in list_curves(figure.axes[0])[:2])
     assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx(
         [0.5, 0.625, 0.75, 0.375, 0.0]
     )
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
-    assert joint_motion.list_sites_with_changing_dominance(logs.simulated("paper")) == []
+    assert joint_motion.list_sites_with_changing_dominance(make_short_log("paper")) == []
 
 
 def test_overview_has_all_extremes_and_the_verdict():
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     overview = run_overview.draw_overview(log)
     errors, _, torques, _ = overview.axes
-    for site, error, torque in zip(log.sites, lines(errors), lines(torques), strict=False):
+    for site, error, torque in zip(
+        log.sites, list_curves(errors), list_curves(torques), strict=False
+    ):
         assert np.nanmax(error.get_ydata()) == np.abs(log[site].e).max()
         assert np.nanmax(torque.get_ydata()) == np.abs(log[site].tau).max()
     assert str(trilat_net.certify(log).stability) in overview.legends[0].get_title().get_text()
 
 
 def test_overlaid_runs_share_sites_and_kind():
-    paper, task = (
-        logs.simulated("paper"),
-        trilat_net.simulate(parse_scenario(planar_task(0.02))),
-    )
-    overlay = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
-    one, _ = lines(overlay.axes[2])
-    assert np.nanmax(one.get_ydata()) == max(
+    paper = make_short_log("paper")
+    task = trilat_net.simulate(parse_scenario(planar_task_text(0.02)))
+    overlay = run_overview.draw_overlay({"one": paper, "two": make_short_log("four")})
+    curve, _ = list_curves(overlay.axes[2])
+    assert np.nanmax(curve.get_ydata()) == max(
         np.abs(paper[site].tau).max() for site in paper.sites
     )
     texts = [text.get_text() for text in overlay.legends[0].get_texts()]
@@ -310,7 +308,8 @@ def test_compared_runs_have_a_line_per_run(name: str, field: str) -> None:
     sites = runs["soft"].sites
     assert len(figure.axes) == 2 * len(sites)
     for panel, axes in enumerate(figure.axes):
-        site, joint = sites[panel // 2], panel % 2
+        site = sites[panel // 2]
+        joint = panel % 2
         assert len({line.get_linestyle() for line in axes.lines}) == len(runs)
         assert {line.get_color() for line in axes.lines} == {
             style.site_colour(runs["soft"], site)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.analysis import logs
+from tests.analysis.builders import make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
 from trilat_net import presentation
@@ -30,7 +30,7 @@ CHECKS = [Finding("records", "all present"), Finding("executed again", "differs"
 UNFOLD = "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
 
 
-def measure(page: Page, expression: str) -> float:
+def measure_page(page: Page, expression: str) -> float:
     value: float = page.evaluate(expression)
     return value
 
@@ -53,20 +53,20 @@ def test_report_fits_screens_and_axe_finds_nothing(
             with watched_page(browser, **options) as watched:
                 page = watched.page
                 page.goto(path.as_uri())
-                whole_px = measure(page, "document.documentElement.scrollHeight")
+                whole_px = measure_page(page, "document.documentElement.scrollHeight")
                 assert screen == "phone" or whole_px <= MOST_SCREENS * height
                 if has_records:
                     picture = page.locator("#arms svg").first.bounding_box()
                     assert picture is not None
                     assert picture["y"] + picture["height"] <= FIRST_PICTURE_PX
                 page.evaluate(UNFOLD)
-                assert measure(page, "document.documentElement.scrollWidth") <= width
+                assert measure_page(page, "document.documentElement.scrollWidth") <= width
                 assert grave_findings(page) == []
 
 
 @needs_browser
 def test_arms_play_at_once_unless_motion_is_reduced(browser: Browser, tmp_path: Path) -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     path, _ = write_report(log, tmp_path, certificate=certify(log))
     for motion, label in (("no-preference", "stop"), ("reduce", "play")):
         with watched_page(browser, reduced_motion=motion) as watched:

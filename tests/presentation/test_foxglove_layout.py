@@ -11,7 +11,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 import trilat_net as tn
 from tests.cli.running import trilat
-from tests.task_arms import planar_task
+from tests.log.builders import write_log
+from tests.scenario.builders import planar_task_text
 from trilat_net.errors import UsageError
 from trilat_net.presentation.viewer_files import write_foxglove_layout
 
@@ -33,7 +34,7 @@ def first_messages(file: Path) -> dict[str, object]:
     return messages
 
 
-def resolve(path: str, messages: Mapping[str, object]) -> object:
+def resolve_path(path: str, messages: Mapping[str, object]) -> object:
     """Returns the value to which a message path leads; an error if there is none."""
     parts = PATH.fullmatch(path)
     assert parts is not None, path
@@ -43,21 +44,21 @@ def resolve(path: str, messages: Mapping[str, object]) -> object:
     return value if parts["index"] is None else value[int(parts["index"])]
 
 
-def panels(layout: Mapping, kind: str) -> list[Mapping]:
+def list_panels(layout: Mapping, kind: str) -> list[Mapping]:
     return [s for name, s in layout["configById"].items() if name.split("!")[0] == kind]
 
 
-def paths(layout: Mapping, kind: str) -> list[str]:
-    return [line["value"] for panel in panels(layout, kind) for line in panel["paths"]]
+def list_paths(layout: Mapping, kind: str) -> list[str]:
+    return [line["value"] for panel in list_panels(layout, kind) for line in panel["paths"]]
 
 
-def leaves(tree: object) -> Iterator[str]:
+def iterate_panels(tree: object) -> Iterator[str]:
     """Yields the panels in a tree and in the tabs that it contains."""
     if isinstance(tree, str):
         yield tree
     else:
-        yield from leaves(tree["first"])
-        yield from leaves(tree["second"])
+        yield from iterate_panels(tree["first"])
+        yield from iterate_panels(tree["second"])
 
 
 def read_layout(file: Path) -> dict:
@@ -76,22 +77,22 @@ def test_paths_of_the_paper_lead_to_numbers(paper: tuple[Path, Path]) -> None:
     log, bag = paper
     messages = first_messages(log) | first_messages(bag)
     layout = read_layout(log)
-    drawn = paths(layout, "Plot")
+    drawn = list_paths(layout, "Plot")
     assert len(drawn) == len(set(drawn))
     for path in drawn:
         topic = PATH.fullmatch(path)["topic"]
         if topic not in messages:
             assert topic.split("/")[-1] in LIVE_ONLY, path
         else:
-            assert isinstance(resolve(path, messages), float), path
-    modes = [resolve(path, messages) for path in paths(layout, "StateTransitions")]
+            assert isinstance(resolve_path(path, messages), float), path
+    modes = [resolve_path(path, messages) for path in list_paths(layout, "StateTransitions")]
     assert modes == [1.0, 1.0, 1.0, "run", "run", "run"]
 
 
 def test_the_paper_shows_all_kinds_of_quantities(
     paper: tuple[Path, Path],
 ) -> None:
-    drawn = set(paths(read_layout(paper[0]), "Plot"))
+    drawn = set(list_paths(read_layout(paper[0]), "Plot"))
     for site in ("m1", "m2", "s"):
         for index in range(2):
             root = f"/viz/{site}"
@@ -109,11 +110,13 @@ def test_the_paper_shows_all_kinds_of_quantities(
 def test_paths_of_recorded_sessions_lead_to_numbers(files: dict[str, Path]) -> None:
     messages = first_messages(files["live"]) | first_messages(files["bag"])
     layout = read_layout(files["live"])
-    for path in paths(layout, "Plot"):
-        assert isinstance(resolve(path, messages), float), path
-    reached = {PATH.fullmatch(path)["topic"].split("/")[-1] for path in paths(layout, "Plot")}
+    for path in list_paths(layout, "Plot"):
+        assert isinstance(resolve_path(path, messages), float), path
+    reached = {
+        PATH.fullmatch(path)["topic"].split("/")[-1] for path in list_paths(layout, "Plot")
+    }
     assert reached >= LIVE_ONLY
-    for panel in panels(layout, "RosOut"):
+    for panel in list_panels(layout, "RosOut"):
         assert hasattr(messages[panel["topicToRender"]], "msg")
 
 
@@ -130,13 +133,13 @@ def test_paths_of_recorded_sessions_lead_to_numbers(files: dict[str, Path]) -> N
 )
 def test_a_wrong_path_leads_nowhere(paper: tuple[Path, Path], path: str) -> None:
     with pytest.raises((KeyError, AttributeError, IndexError, AssertionError)):
-        resolve(path, first_messages(paper[0]))
+        resolve_path(path, first_messages(paper[0]))
 
 
 def test_arms_have_their_urdf_and_their_frames(paper: tuple[Path, Path]) -> None:
     _, bag = paper
     messages = first_messages(bag)
-    (scene,) = panels(read_layout(bag), "3D")
+    (scene,) = list_panels(read_layout(bag), "3D")
     arms = [layer for layer in scene["layers"].values() if layer["layerId"] == "foxglove.Urdf"]
     assert [arm["label"] for arm in arms] == ["m1", "m2", "s"]
     for arm in arms:
@@ -151,32 +154,32 @@ def test_a_log_of_urdf_arms_shows_them_itself(tmp_path: Path) -> None:
     log = tn.simulate("seven_joints", duration_s=0.05).save(tmp_path / "run.mcap")
     messages = first_messages(log)
     layout = read_layout(log)
-    scene = panels(layout, "3D")[0]
+    scene = list_panels(layout, "3D")[0]
     topics = [layer["topic"] for layer in scene["layers"].values() if "topic" in layer]
     assert topics
     for topic in topics:
         assert "<robot" in messages[topic].data
-    for path in paths(layout, "Plot"):
+    for path in list_paths(layout, "Plot"):
         if path.startswith("/viz/"):
-            assert isinstance(resolve(path, messages), float), path
+            assert isinstance(resolve_path(path, messages), float), path
 
 
 def test_sites_that_share_poses_have_plots_too(tmp_path: Path) -> None:
-    log = tn.simulate(planar_task(), duration_s=0.05)
+    log = tn.simulate(planar_task_text(), duration_s=0.05)
     file = log.save(tmp_path / "run.mcap")
     messages = first_messages(file) | first_messages(
         tn.export(log, "ros2", tmp_path / "b.mcap")
     )
-    for path in paths(read_layout(file), "Plot"):
+    for path in list_paths(read_layout(file), "Plot"):
         if PATH.fullmatch(path)["topic"].split("/")[-1] not in LIVE_ONLY:
-            assert isinstance(resolve(path, messages), float), path
+            assert isinstance(resolve_path(path, messages), float), path
 
 
 def test_every_panel_stands_in_the_tree_once(paper: tuple[Path, Path]) -> None:
     layout = read_layout(paper[0])
-    tabs = [tab for panel in panels(layout, "Tab") for tab in panel["tabs"]]
+    tabs = [tab for panel in list_panels(layout, "Tab") for tab in panel["tabs"]]
     trees = [layout["layout"], *(tab["layout"] for tab in tabs)]
-    placed = [panel for tree in trees for panel in leaves(tree)]
+    placed = [panel for tree in trees for panel in iterate_panels(tree)]
     assert sorted(placed) == sorted(layout["configById"])
     assert {tab["title"] for tab in tabs} >= {"Log", "ROS 2", "Motion", "Arms"}
 
@@ -197,7 +200,7 @@ def test_an_existing_layout_is_kept(tmp_path: Path) -> None:
 
 
 def test_the_command_says_how_to_use_it(paper: tuple[Path, Path], tmp_path: Path) -> None:
-    (tmp_path / "run.mcap").write_bytes(paper[0].read_bytes())
+    write_log(tmp_path, paper[0].read_bytes())
     view = ("log", "view", "run.mcap", "--foxglove")
     assert trilat(*view, cwd=tmp_path).succeeds() == (
         "run.foxglove.json: open run.mcap in Foxglove or Lichtblick, and import this file as "

@@ -15,7 +15,9 @@ from markupsafe import Markup
 from trilat_people.live_page.page_opening import BrowserOpening
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import FOUR, make_busy_run, make_short_log
+from tests.log.builders import add_clock_readings, rewrite_log
+from tests.presentation.varied_runs import make_fault_log
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
@@ -29,8 +31,6 @@ from trilat_net.presentation.page_certificate import render_certificate
 from trilat_net.presentation.page_summary import render_verdict
 from trilat_net.presentation.style import styled_figure
 from trilat_net.scenario import parse_scenario
-
-from .varied_runs import in_fault
 
 HOSTILE = "</script><img onerror=alert(1) src='x'>\"`<b>`"
 HARMLESS = "text `code`"
@@ -58,9 +58,9 @@ class Elements(HTMLParser):
         self.text += data
 
 
-def make_log(text: str) -> Log:
+def make_log_of_text(text: str) -> Log:
     """Returns a log that has a given text wherever a log has free text."""
-    source = logs.FOUR
+    source = FOUR
     for key in ("title", "about", "assumed"):
         quoted = json.dumps([text] if key == "assumed" else text)
         source, count = re.subn(rf"(?m)^{key} = .*$", lambda _: f"{key} = {quoted}", source)  # noqa: B023
@@ -69,13 +69,13 @@ def make_log(text: str) -> Log:
         Event(v=3, member="a", boot=1, kind=kind, text=text, t_ns=10**9, about="b", n=n)
         for n, kind in enumerate(("mark", "lost", "failed", "clock fault", "refused"))
     ]
-    log = logs.rewritten(trilat_net.simulate(parse_scenario(source)), others=events)
+    log = rewrite_log(trilat_net.simulate(parse_scenario(source)), others=events)
     for key in ("commit", "platform", "python", "fingerprint", "version_numba"):
         log.session[key] = text
     return log
 
 
-def render(log: Log, text: str) -> str:
+def render_everything(log: Log, text: str) -> str:
     """Returns the report of a log, and the HTML in a notebook."""
     certificate = certify(log)
     findings = [Finding(text, text, False), Finding("executed again", text, True)]
@@ -92,8 +92,8 @@ def render(log: Log, text: str) -> str:
 
 
 def test_hostile_log_adds_no_element() -> None:
-    hostile = Elements(render(make_log(HOSTILE), HOSTILE))
-    harmless = Elements(render(make_log(HARMLESS), HARMLESS))
+    hostile = Elements(render_everything(make_log_of_text(HOSTILE), HOSTILE))
+    harmless = Elements(render_everything(make_log_of_text(HARMLESS), HARMLESS))
     assert hostile.found == harmless.found
     assert hostile.text.count("<img onerror=alert(1)") >= 5
 
@@ -118,15 +118,15 @@ def record_calls() -> list[Call]:
                     patch.setattr(module, "render_macro", macro)
                 if hasattr(module, "render_template"):
                     patch.setattr(module, "render_template", whole)
-        for log in (logs.timed(logs.simulated("four")), logs.busy().log):
-            render(log, "text")
-        page_summary.render_alarms(in_fault())
+        for log in (add_clock_readings(make_short_log("four")), make_busy_run().log):
+            render_everything(log, "text")
+        page_summary.render_alarms(make_fault_log())
         with styled_figure(REPORT_SIZE, 1.0) as figure:
             figure._repr_html_()  # type: ignore[attr-defined]
     return calls
 
 
-def fill(value: Any, text: str) -> Any:
+def fill_texts(value: Any, text: str) -> Any:
     """Returns the value with a text in place of each plain string that it contains."""
     if isinstance(value, Markup) or value is None:
         return value
@@ -134,18 +134,18 @@ def fill(value: Any, text: str) -> Any:
         return text
     if isinstance(value, Mapping):
         # keys stay apart, so that a table keeps its columns
-        filled = {fill(key, text): fill(item, text) for key, item in value.items()}
+        filled = {fill_texts(key, text): fill_texts(item, text) for key, item in value.items()}
         names = all(isinstance(key, str) and key.isidentifier() for key in value)
-        return {key: fill(item, text) for key, item in value.items()} if names else filled
+        return {key: fill_texts(item, text) for key, item in value.items()} if names else filled
     if hasattr(value, "_fields"):
         return value._replace(
-            **{name: fill(getattr(value, name), text) for name in value._fields}
+            **{name: fill_texts(getattr(value, name), text) for name in value._fields}
         )
     if isinstance(value, list | tuple):
-        return type(value)(fill(item, text) for item in value)
+        return type(value)(fill_texts(item, text) for item in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
-            data_field.name: fill(getattr(value, data_field.name), text)
+            data_field.name: fill_texts(getattr(value, data_field.name), text)
             for data_field in dataclasses.fields(value)
         }
         return dataclasses.replace(value, **fields)
@@ -164,7 +164,7 @@ def test_template_escapes_every_text(template: str) -> None:
                     if macro
                     else render_template(name, **filled)
                 )
-                for filled in (fill(values, HOSTILE), fill(values, HARMLESS))
+                for filled in (fill_texts(values, HOSTILE), fill_texts(values, HARMLESS))
             )
             assert hostile.found == harmless.found, macro
     if used != {""}:  # the page itself has no macros

@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import trilat_net
-from tests.analysis import logs
-from tests.task_arms import planar_task, posed_arms
+from tests.analysis.builders import make_busy_run
+from tests.log.builders import rewrite_log
+from tests.scenario.builders import planar_task_text, posed_task_text
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event, State
@@ -38,33 +39,33 @@ AGES = ("age_s.a", "age_s.b")
 PLACES = {"frame_index", "episode_index", "index", "task_index"}
 
 
-def log() -> Log:
+def make_users_log() -> Log:
     """Returns a log of users a and b, of which b has 150 Hz, and a slave c; from 4 to 5 s its
     shares change to 0.9 and 0.1.
     """
-    return logs.busy().log
+    return make_busy_run().log
 
 
 @cache
-def without(*missing: tuple[float, float]) -> Log:
+def make_users_log_without(*missing: tuple[float, float]) -> Log:
     """Returns the log without the slave's records of some times, s."""
 
     def keep(state: State) -> bool:
         return state.site != "c" or not any(a <= state.t_ns * 1e-9 < b for a, b in missing)
 
-    return logs.rewritten(log(), keep)
+    return rewrite_log(make_users_log(), keep)
 
 
-def exported(folder: Path, *sources: Log, **settings: Any) -> Path:
+def export_logs(folder: Path, *sources: Log, **settings: Any) -> Path:
     Exporter("lerobot", folder / "set", settings=settings).export(*sources)
     return folder / "set"
 
 
-def read(folder: Path, place: str = "data") -> pl.DataFrame:
+def read_frames(folder: Path, place: str = "data") -> pl.DataFrame:
     return pl.read_parquet(folder / place / FILE)
 
 
-def info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
+def read_info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
     facts: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
     return facts
 
@@ -73,7 +74,7 @@ def make_event(text: str, at_s: float, kind: str = "mark") -> Event:
     return Event(member="a", boot=1, kind=kind, text=text, t_ns=round(at_s * 1e9))
 
 
-def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarray:
+def read_newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarray:
     """Returns a vector of the newest records at or before the times of frames, by exact fractions."""
     part = source[site]
     ticks = [int(Fraction(n, fps) * part.rate_hz) for n in range(count)]
@@ -81,8 +82,8 @@ def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarr
 
 
 def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
-    folder = exported(tmp_path, log())
-    info_text = info(folder)
+    folder = export_logs(tmp_path, make_users_log())
+    info_text = read_info(folder)
     assert {
         key: info_text[key] for key in ("codebase_version", "fps", "video_path", "splits")
     } == {
@@ -112,8 +113,8 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fps", [30, 7])
 def test_frames_have_the_newest_earlier_records(fps: int, tmp_path: Path) -> None:
-    """Of a run of 6 s, whose last ticks are at 5.995 s and, of b, at 5.9933 s."""
-    frames = read(exported(tmp_path, log(), fps=fps))
+    """The last ticks of the run of 6 s are at 5.995 s, and at 5.9933 s for b."""
+    frames = read_frames(export_logs(tmp_path, make_users_log(), fps=fps))
     assert len(frames) == 6 * fps
     for column, site, field in (
         ("action.b", "b", "q"),
@@ -121,9 +122,11 @@ def test_frames_have_the_newest_earlier_records(fps: int, tmp_path: Path) -> Non
         ("tau_x", "c", "tau_x"),
     ):
         assert np.array_equal(
-            frames[column].to_numpy(), newest(log(), site, field, 6 * fps, fps)
+            frames[column].to_numpy(), read_newest(make_users_log(), site, field, 6 * fps, fps)
         )
-    state = np.hstack([newest(log(), "c", field, 6 * fps, fps) for field in ("q", "qd")])
+    state = np.hstack(
+        [read_newest(make_users_log(), "c", field, 6 * fps, fps) for field in ("q", "qd")]
+    )
     assert np.array_equal(frames["observation.state"].to_numpy(), state)
     assert state.sum() == frames["observation.state"].to_numpy().sum() != 0.0
     assert frames["timestamp"].to_list() == pytest.approx([n / fps for n in range(6 * fps)])
@@ -137,8 +140,8 @@ def test_sample_ages_follow_the_drawn_delay(tmp_path: Path) -> None:
         trilat_net.simulate("paper", {"link.delay_ms": delay_ms}, duration_s=0.6)
         for delay_ms in delays_ms
     ]
-    folder = exported(tmp_path, *runs)
-    frames = read(folder)
+    folder = export_logs(tmp_path, *runs)
+    frames = read_frames(folder)
     tick_s = 1e-3
     for episode, delay_ms in enumerate(delays_ms):
         rows = frames.filter(pl.col("episode_index") == episode)
@@ -150,14 +153,14 @@ def test_sample_ages_follow_the_drawn_delay(tmp_path: Path) -> None:
             ), key
         both = rows["age_s"].to_numpy()
         assert np.allclose(both.T, np.minimum(times_s, delay_s), atol=1.5 * tick_s)
-    stats = info(folder, "meta/stats")
+    stats = read_info(folder, "meta/stats")
     assert stats["age_s"]["max"] == pytest.approx([0.24, 0.24], abs=tick_s)
     assert np.isfinite(stats["age_s.m2"]["mean"]).all()
 
 
 def test_users_above_the_programs_share_intervene(tmp_path: Path) -> None:
     """The program is b: a leads from 4 s on, and is at 0.7 half-way through the ramp."""
-    frames = read(exported(tmp_path, log(), program="b"))
+    frames = read_frames(export_logs(tmp_path, make_users_log(), program="b"))
     shares = frames["dominance"].to_numpy()
     assert shares[120].tolist() == [0.5, 0.5]
     assert shares[135] == pytest.approx([0.7, 0.3])
@@ -170,33 +173,35 @@ def test_users_above_the_programs_share_intervene(tmp_path: Path) -> None:
 
 
 def test_a_named_program_replaces_the_default(tmp_path: Path) -> None:
-    frames = read(exported(tmp_path, log(), program="a"))
+    frames = read_frames(export_logs(tmp_path, make_users_log(), program="a"))
     assert not frames["intervention"].any()
     assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
     with pytest.raises(UsageError, match="the program can hold the arm of a or b, not of 'c'"):
-        Exporter("lerobot", tmp_path / "other", settings={"program": "c"}).export(log())
+        Exporter("lerobot", tmp_path / "other", settings={"program": "c"}).export(
+            make_users_log()
+        )
 
 
 def test_without_a_program_nobody_intervenes(tmp_path: Path) -> None:
     """At equal shares the first user leads, and no column says that a person corrected b."""
     for name, settings in (("found", {}), ("named", {"program": "none"})):
         (tmp_path / name).mkdir()
-        folder = exported(tmp_path / name, log(), **settings)
-        frames = read(folder)
+        folder = export_logs(tmp_path / name, make_users_log(), **settings)
+        frames = read_frames(folder)
         assert "intervention" not in frames.columns
         assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
-        assert info(folder, "about")["program"] == "none"
+        assert read_info(folder, "about")["program"] == "none"
 
 
 def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
     """Among others that held arms; a log without a policy has no intervention."""
     taken = [make_event("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
     taken += [make_event("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
-    held = logs.rewritten(log(), others=taken)
-    folder = exported(tmp_path, held, log())
-    assert info(folder, "about")["program"] == "b and none"
-    assert [each["program"] for each in info(folder, "about")["sessions"]] == ["b", "none"]
-    frames = read(folder)
+    held = rewrite_log(make_users_log(), others=taken)
+    folder = export_logs(tmp_path, held, make_users_log())
+    assert read_info(folder, "about")["program"] == "b and none"
+    assert [each["program"] for each in read_info(folder, "about")["sessions"]] == ["b", "none"]
+    frames = read_frames(folder)
     assert frames["intervention"].to_list() == [n > 120 for n in range(180)] + 180 * [False]
 
 
@@ -212,18 +217,18 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
             ("three begins", 5.0),
         )
     ]
-    source = logs.rewritten(log(), others=[make_event("look", 0.5), *reversed(marks)])
-    folder = exported(tmp_path, source, episodes="marks", task="stack the cups")
-    frames = read(folder)
-    assert read(folder, "meta/episodes")["length"].to_list() == [30, 30, 30]
+    source = rewrite_log(make_users_log(), others=[make_event("look", 0.5), *reversed(marks)])
+    folder = export_logs(tmp_path, source, episodes="marks", task="stack the cups")
+    frames = read_frames(folder)
+    assert read_frames(folder, "meta/episodes")["length"].to_list() == [30, 30, 30]
     ends = frames.filter(pl.col("next.done"))
     assert ends["index"].to_list() == [29, 59, 89]
     assert ends["next.success"].to_list() == [True, False, False]
     assert frames["next.success"].sum() == 1
-    whole = newest(log(), "b", "q", 180, 30)
+    whole = read_newest(make_users_log(), "b", "q", 180, 30)
     marked = np.vstack([whole[30:60], whole[90:120], whole[150:]])
     assert np.array_equal(frames["action.b"].to_numpy(), marked)
-    (session,) = info(folder, "about")["sessions"]
+    (session,) = read_info(folder, "about")["sessions"]
     outcomes = {episode["name"]: episode["outcome"] for episode in session["episodes"]}
     assert outcomes == {"one": "succeeded", "two": "failed", "three": "not stated"}
     assert session["frames_outside_episodes"] == 90
@@ -233,64 +238,69 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
 
 def test_unmarked_logs_are_one_reported_episode(tmp_path: Path) -> None:
     settings = {"episodes": "marks"}
-    summary = Exporter("lerobot", tmp_path / "said", settings=settings).export(log())
-    assert f"no episode is marked in {log().source}" in summary
-    assert "no episode is marked" not in Exporter("lerobot", tmp_path / "log").export(log())
-    folder = exported(tmp_path, log(), episodes="marks")
-    assert read(folder)["next.done"].to_list() == 179 * [False] + [True]
-    assert "next.success" not in read(folder).columns
+    summary = Exporter("lerobot", tmp_path / "said", settings=settings).export(make_users_log())
+    assert f"no episode is marked in {make_users_log().source}" in summary
+    assert "no episode is marked" not in Exporter("lerobot", tmp_path / "log").export(
+        make_users_log()
+    )
+    folder = export_logs(tmp_path, make_users_log(), episodes="marks")
+    assert read_frames(folder)["next.done"].to_list() == 179 * [False] + [True]
+    assert "next.success" not in read_frames(folder).columns
 
 
 def test_an_episode_outside_the_records_is_refused(tmp_path: Path) -> None:
-    late = logs.rewritten(log(), others=[make_event("episode one begins", 7.0)])
+    late = rewrite_log(make_users_log(), others=[make_event("episode one begins", 7.0)])
     with pytest.raises(LogError, match="no marked episode contains a time"):
-        exported(tmp_path, late, episodes="marks")
+        export_logs(tmp_path, late, episodes="marks")
 
 
 def test_slave_references_are_optional_observations(tmp_path: Path) -> None:
-    folder = exported(tmp_path, log(), observations="reference")
-    names = info(folder)["features"]["observation.state"]["names"]
+    folder = export_logs(tmp_path, make_users_log(), observations="reference")
+    names = read_info(folder)["features"]["observation.state"]["names"]
     assert names[:2] + names[4:] == ["c.q1.pos", "c.q2.pos", "c.q1.ref", "c.q2.ref"]
-    state = read(folder)["observation.state"].to_numpy()
-    assert np.array_equal(state[:, 4:], newest(log(), "c", "q_des", 180, 30))
+    state = read_frames(folder)["observation.state"].to_numpy()
+    assert np.array_equal(state[:, 4:], read_newest(make_users_log(), "c", "q_des", 180, 30))
 
 
 def test_the_environment_state_is_the_state(tmp_path: Path) -> None:
-    folder = exported(tmp_path, log(), environment_state="yes")
-    features = info(folder)["features"]
+    folder = export_logs(tmp_path, make_users_log(), environment_state="yes")
+    features = read_info(folder)["features"]
     assert features["observation.environment_state"] == features["observation.state"]
-    state = read(folder)["observation.state"].to_numpy()
-    assert np.array_equal(read(folder)["observation.environment_state"].to_numpy(), state)
+    state = read_frames(folder)["observation.state"].to_numpy()
+    assert np.array_equal(
+        read_frames(folder)["observation.environment_state"].to_numpy(), state
+    )
 
 
 def test_the_plugin_needs_a_holdable_arm(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="needs an operator of kind 'live' or 'own' at b"):
-        exported(tmp_path, log(), observations="plugin")
+        export_logs(tmp_path, make_users_log(), observations="plugin")
     with pytest.raises(UsageError, match="the plugin can hold the arm of a or b, not of 'c'"):
-        exported(tmp_path, log(), observations="plugin", site="c")
+        export_logs(tmp_path, make_users_log(), observations="plugin", site="c")
 
 
 def test_episodes_end_before_gaps(tmp_path: Path) -> None:
-    """Without 1.0 to 1.5 s: 1.0 s still has a record of 5 ms before it; so has 3.0 s in the short gap."""
-    folder = exported(tmp_path, without((1.0, 1.5), (3.0, 3.02)))
-    lengths = read(folder, "meta/episodes")["length"].to_list()
+    """Records from 1.0 to 1.5 s are missing, but 1.0 s and 3.0 s still have a record of 5 ms before."""
+    folder = export_logs(tmp_path, make_users_log_without((1.0, 1.5), (3.0, 3.02)))
+    lengths = read_frames(folder, "meta/episodes")["length"].to_list()
     assert lengths == [31, 135]
-    assert info(folder, "about")["sessions"][0]["frames_left_out"] == 180 - 31 - 135
-    frames, own = read(folder), newest(log(), "c", "q", 180, 30)
+    assert read_info(folder, "about")["sessions"][0]["frames_left_out"] == 180 - 31 - 135
+    frames = read_frames(folder)
+    recorded = read_newest(make_users_log(), "c", "q", 180, 30)
     assert frames["timestamp"][31] == frames["frame_index"][31] == 0
     q = frames["observation.state"].to_numpy()[:, :2]
-    assert np.array_equal(q[:30], own[:30])
-    assert q[30].tolist() == np.float32(log()["c"].by_tick[199].q).tolist()
-    assert (np.flatnonzero((q[31:] != own[45:]).any(axis=1)) + 45).tolist() == [90]
-    assert q[31 + 45].tolist() == np.float32(log()["c"].by_tick[599].q).tolist()
+    assert np.array_equal(q[:30], recorded[:30])
+    assert q[30].tolist() == np.float32(make_users_log()["c"].by_tick[199].q).tolist()
+    assert (np.flatnonzero((q[31:] != recorded[45:]).any(axis=1)) + 45).tolist() == [90]
+    assert q[31 + 45].tolist() == np.float32(make_users_log()["c"].by_tick[599].q).tolist()
 
 
 def test_logs_become_episodes_of_one_set(tmp_path: Path) -> None:
     again = trilat_net.simulate(
-        log().scenario.text.replace("seed = 5", "seed = 6").replace("busy", "other")
+        make_users_log().scenario.text.replace("seed = 5", "seed = 6").replace("busy", "other")
     )
-    folder = exported(tmp_path, log(), again)
-    episodes = read(folder, "meta/episodes")
+    folder = export_logs(tmp_path, make_users_log(), again)
+    episodes = read_frames(folder, "meta/episodes")
     assert episodes["dataset_from_index"].to_list() == [0, 180]
     assert (
         episodes["dataset_to_index"].to_list()
@@ -298,7 +308,7 @@ def test_logs_become_episodes_of_one_set(tmp_path: Path) -> None:
         == np.cumsum(episodes["length"]).tolist()
     )
     assert episodes["tasks"].to_list() == [["busy"], ["other"]]
-    frames = read(folder)
+    frames = read_frames(folder)
     assert frames["index"].to_list() == list(range(360))
     assert frames["frame_index"].to_list() == 2 * list(range(180))
     assert (
@@ -309,7 +319,7 @@ def test_logs_become_episodes_of_one_set(tmp_path: Path) -> None:
     tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
     assert tasks.index.tolist() == ["busy", "other"]
     assert tasks["task_index"].tolist() == [0, 1]
-    assert info(folder)["total_frames"] == 360
+    assert read_info(folder)["total_frames"] == 360
 
 
 def test_python_takes_paths_and_logs_together(tmp_path: Path) -> None:
@@ -319,20 +329,20 @@ def test_python_takes_paths_and_logs_together(tmp_path: Path) -> None:
     folder = trilat_net.export(
         [second, path], "lerobot", tmp_path / "set", fps=30, program="m1"
     )
-    assert info(folder)["total_episodes"] == 2
-    assert info(folder)["total_tasks"] == 1
-    assert info(folder, "about")["program"] == "m1"
-    assert read(folder)["intervention"].to_list() == [False] * 12
+    assert read_info(folder)["total_episodes"] == 2
+    assert read_info(folder)["total_tasks"] == 1
+    assert read_info(folder, "about")["program"] == "m1"
+    assert read_frames(folder)["intervention"].to_list() == [False] * 12
 
 
 def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
-    folder = exported(tmp_path, without((1.0, 1.5)))
-    frames = read(folder)["action.a"].to_numpy().astype(np.float64)
-    stats = info(folder, "meta/stats")["action.a"]
+    folder = export_logs(tmp_path, make_users_log_without((1.0, 1.5)))
+    frames = read_frames(folder)["action.a"].to_numpy().astype(np.float64)
+    stats = read_info(folder, "meta/stats")["action.a"]
     assert stats["count"] == [len(frames)]
     assert stats["std"] == pytest.approx(frames.std(axis=0))
     assert stats["q90"] == pytest.approx(np.quantile(frames, 0.9, axis=0))
-    episodes = read(folder, "meta/episodes")
+    episodes = read_frames(folder, "meta/episodes")
     for n, (first, end) in enumerate(pairwise([0, *episodes["dataset_to_index"]])):
         assert episodes["stats/action.a/max"][n].to_list() == pytest.approx(
             frames[first:end].max(axis=0)
@@ -342,21 +352,23 @@ def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
 def test_other_arms_are_refused_without_files(tmp_path: Path) -> None:
     other = trilat_net.simulate("two_sites", duration_s=0.2)
     with pytest.raises(LogError, match="the users or joints are not the same as in"):
-        exported(tmp_path, log(), other)
+        export_logs(tmp_path, make_users_log(), other)
     assert not list(tmp_path.iterdir())
 
 
 def test_one_user_leads_alone_and_is_a_scalar(tmp_path: Path) -> None:
-    folder = exported(tmp_path, trilat_net.simulate("two_sites", duration_s=0.2))
-    assert read(folder)["dominance"].to_list() == [1.0] * 6
-    assert info(folder)["features"]["dominance"]["shape"] == [1]
+    folder = export_logs(tmp_path, trilat_net.simulate("two_sites", duration_s=0.2))
+    assert read_frames(folder)["dominance"].to_list() == [1.0] * 6
+    assert read_info(folder)["features"]["dominance"]["shape"] == [1]
 
 
 def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
-    source = trilat_net.simulate(parse_scenario(planar_task(0.2)))
-    folder = exported(tmp_path, source)
-    assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]
-    assert np.array_equal(read(folder)["action"].to_numpy(), newest(source, "m", "x", 6, 30))
+    source = trilat_net.simulate(parse_scenario(planar_task_text(0.2)))
+    folder = export_logs(tmp_path, source)
+    assert read_info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]
+    assert np.array_equal(
+        read_frames(folder)["action"].to_numpy(), read_newest(source, "m", "x", 6, 30)
+    )
 
 
 @pytest.mark.parametrize(
@@ -374,26 +386,26 @@ def test_invalid_settings_are_refused(
     settings: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UsageError, match=said):
-        Exporter("lerobot", tmp_path / "set", settings=settings).export(log())
+        Exporter("lerobot", tmp_path / "set", settings=settings).export(make_users_log())
 
 
 def test_forms_without_settings_are_reported(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="csv has no setting 'fps'; csv has no settings"):
         Exporter("csv", tmp_path / "set", settings={"fps": 30})
     with pytest.raises(UsageError, match="exports a single log"):
-        Exporter("csv", tmp_path / "set").export(log(), log())
+        Exporter("csv", tmp_path / "set").export(make_users_log(), make_users_log())
 
 
 def test_other_actions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="actions must be tip or joints, not 'arms'"):
-        exported(tmp_path, log(), actions="arms")
+        export_logs(tmp_path, make_users_log(), actions="arms")
     with pytest.raises(UsageError, match="csv has no setting 'actions'"):
         Exporter("csv", tmp_path / "csv", settings={"actions": "tip"})
 
 
 def test_different_joints_are_told_to_use_tips(tmp_path: Path) -> None:
-    source = trilat_net.simulate(parse_scenario(posed_arms(0.1)))
+    source = trilat_net.simulate(parse_scenario(posed_task_text(0.1)))
     with pytest.raises(LogError, match=r"m2 and m1 have different joints, .*: use actions tip"):
-        exported(tmp_path, source, actions="joints")
-    folder = exported(tmp_path, source, actions="tip")
-    assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]
+        export_logs(tmp_path, source, actions="joints")
+    folder = export_logs(tmp_path, source, actions="tip")
+    assert read_info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]

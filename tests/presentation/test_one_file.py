@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.dropped_files import look
+from tests.dropped_files import run_in_folder
 from trilat_net.presentation.figures.figure_entry import draws
 from trilat_net.presentation.figures.registry import FIGURES
 
@@ -74,7 +74,7 @@ def test_added_files_are_figures_and_formats(tmp_path: Path) -> None:
     for name, text in {"figures/haste.py": FIGURE, "exports/counts.py": FORMAT}.items():
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text(text)
-    output = look(LOOK, tmp_path)
+    output = run_in_folder(LOOK, tmp_path)
     assert output["figures"][-1] == "haste"
     assert output["completed"] == ["hands_moved", "haste"]
     assert [Path(name).name for name in output["drawn"]] == ["haste.png", "haste.svg"]

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
+from tests.analysis.builders import (
+    JITTER,
+    make_busy_run,
+    make_diverged_log,
+    make_log_without_hands,
+    make_run,
+    make_short_log,
+)
+from tests.log.builders import add_clock_readings, rewrite_log
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
@@ -45,7 +52,7 @@ class Page(HTMLParser):
         self.texts.setdefault(self.elements[-1][0] if self.elements else "", []).append(data)
 
 
-def read(html):
+def read_page(html):
     """Returns the page, and the data of its charts."""
     data = re.search(
         r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL
@@ -53,17 +60,17 @@ def read(html):
     return html, json.loads(data)
 
 
-def page(log, twin=None):
-    return read(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
+def render_page(log, twin=None):
+    return read_page(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
 
 
-def column(table, n):
+def read_column(table, n):
     return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
 
 
 def test_a_report_has_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
-    log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
+    log = make_run("free", {**JITTER, "rate_hz": 100}).log
     paths = write_report(
         log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS
     )
@@ -78,7 +85,7 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
     facts = json.loads(paths[1].read_text())
     assert facts["checks"] == [verdict.to_row() for verdict in VERDICTS]
     assert facts["certificate"]["verdict"] == "rose"
-    html, data = read(paths[0].read_text(encoding="utf-8"))
+    html, data = read_page(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000
     body = html[html.index("</h1>") :]
     assert 0 < body.index('id="verdict"') < body.index("✗ Failed: ") < body.index('id="arms"')
@@ -91,7 +98,7 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
 
 
 def test_the_page_asks_nothing_of_any_network():
-    html, _ = page(logs.timed(logs.simulated("four")))
+    html, _ = render_page(add_clock_readings(make_short_log("four")))
     seen = Page(html)
     for tag, attrs in seen.elements:
         assert tag not in ("link", "img", "iframe", "object", "base", "form")
@@ -109,7 +116,7 @@ def test_the_page_asks_nothing_of_any_network():
 
 
 def test_pages_list_checks_and_repeating_commands():
-    html, _ = page(logs.simulated("four"))
+    html, _ = render_page(make_short_log("four"))
     elements = Page(html).elements
     items = [attrs["class"] for tag, attrs in elements if tag == "li" and "class" in attrs]
     assert items[:2] == ["passed", "failed"]
@@ -125,25 +132,25 @@ def test_a_page_holds_one_tick_spikes():
             else state
         )
 
-    log = logs.rewritten(logs.simulated("paper"), change=spike)
-    _, data = page(log)
+    log = rewrite_log(make_short_log("paper"), change=spike)
+    _, data = render_page(log)
     chart = next(c for c in data["charts"] if c["title"] == "s, joint 1")
     series = chart["series"][0]
     table = data["tables"][series["table"]]
-    values = column(table, series["column"])
+    values = read_column(table, series["column"])
     ticks = np.frombuffer(base64.b64decode(table["tick"]), "<i4")
     assert values.max() == 9.5
     assert ticks[values.argmax()] == 123
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
-        values = column(data["tables"][series["table"]], series["column"])
+        values = read_column(data["tables"][series["table"]], series["column"])
         assert values == pytest.approx(
             site_signals.joint_errors(log[site])[:, 1], rel=1e-6, abs=1e-12
         )
 
 
 def test_the_page_describes_links_and_events():
-    html, data = page(logs.busy().log)
+    html, data = render_page(make_busy_run().log)
     assert (
         "uniform 20 to 100 ms, duplicates 20 %, in order<br>from 3 s: uniform 0 to 60 ms"
         in html
@@ -171,7 +178,7 @@ def test_the_page_describes_links_and_events():
 
 
 def test_pages_of_plain_logs_have_nothing_superfluous():
-    html, data = page(logs.simulated("paper"))
+    html, data = render_page(make_short_log("paper"))
     assert data["changes"] == []
     assert set(map(len, data["spans"].values())) == {0}
     assert not [c for c in data["charts"] if c["section"] == "delays"]
@@ -186,11 +193,11 @@ def test_pages_of_plain_logs_have_nothing_superfluous():
 @pytest.mark.parametrize("sites", [(), ("m2", "s")])
 def test_nearly_empty_logs_have_reports(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
-    some = logs.timed(logs.simulated("paper"))
-    log = logs.rewritten(
+    some = add_clock_readings(make_short_log("paper"))
+    log = rewrite_log(
         some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live"
     )
-    twin = logs.twin("paper")
+    twin = make_log_without_hands("paper")
     paths = write_report(log, tmp_path, certificate=certify(log), twin=twin, verdicts=VERDICTS)
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     pictures = write_report_figures(log, tmp_path, twin)
@@ -200,8 +207,8 @@ def test_nearly_empty_logs_have_reports(sites, tmp_path):
 
 @pytest.mark.parametrize("name", ["paper", "four"])
 def test_error_chart_names_its_floor(name):
-    log = logs.simulated(name)
-    _, data = page(log)
+    log = make_short_log(name)
+    _, data = render_page(log)
     errors = [site_signals.largest_magnitude(log[site].e).min() for site in log.sites]
     chart = next(c for c in data["charts"] if c["section"] == "overview")
     assert chart["title"] == "Largest error |e| by site"
@@ -211,8 +218,8 @@ def test_error_chart_names_its_floor(name):
 
 
 def test_a_diverged_run_has_a_page():
-    log = logs.diverged()
-    html, _ = page(log)
+    log = make_diverged_log()
+    html, _ = render_page(log)
     assert '<th scope="row">diverged</th><td>yes</td>' in html
     assert f"m1 diverged: {log.describe_divergence('m1')}." in html
 

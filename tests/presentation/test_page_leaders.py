@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_busy_run, make_run, make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
@@ -28,13 +27,13 @@ from trilat_net.presentation.page_leaders import (
 SHORT = {"rate_hz": 100, "duration_s": 14.0, "expect": {}}
 
 
-def training(**settings: Any) -> Log:
+def simulate_training(**settings: Any) -> Log:
     """The shipped scenario in which the lead passes from m1 to m2, from 10 to 12 s."""
-    return runs.run("training", {**SHORT, **settings}).log
+    return make_run("training", {**SHORT, **settings}).log
 
 
 def test_the_bar_is_the_dominance_at_every_tick() -> None:
-    log = training()
+    log = simulate_training()
     (lead,) = trace_leads(log)
     t_s = log["s"].t_s
     alpha = trace_dominance(log, "s", t_s).alpha
@@ -47,13 +46,13 @@ def test_the_bar_is_the_dominance_at_every_tick() -> None:
 
 def test_a_sudden_change_is_a_step() -> None:
     step = {"at_s": 5.0, "dominance": "s", "to": {"m1": 0.2, "m2": 0.8}}
-    (lead,) = trace_leads(training(timeline=[step]))
+    (lead,) = trace_leads(simulate_training(timeline=[step]))
     for at_s, share in ((4.999, 0.9), (5.0, 0.2), (9.0, 0.2)):
         assert np.interp(at_s, lead.t_s, lead.shares[:, 0]) == pytest.approx(share)
 
 
 def test_constant_dominance_is_a_sentence() -> None:
-    log = training(timeline=[])
+    log = simulate_training(timeline=[])
     leads = trace_leads(log)
     sentence = "m1 leads the slave with 90 % and m2 with 10 %, during the whole run."
     assert describe_leads(log, leads) == [sentence]
@@ -61,14 +60,14 @@ def test_constant_dominance_is_a_sentence() -> None:
 
 
 def test_one_master_leads_alone() -> None:
-    log = runs.run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
+    log = make_run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
     sentences = describe_leads(log, trace_leads(log))
     assert sentences == ["m alone leads the slave, during the whole run."]
 
 
 @pytest.mark.parametrize("name", ["four", "busy"])
 def test_every_following_slave_is_shown(name: str) -> None:
-    log = logs.busy().log if name == "busy" else logs.simulated(name)
+    log = make_busy_run().log if name == "busy" else make_short_log(name)
     followers = {
         site
         for site, spec in log.scenario.sites.items()
@@ -80,7 +79,9 @@ def test_every_following_slave_is_shown(name: str) -> None:
 
 
 def test_page_data_has_the_captions_and_the_bars() -> None:
-    data = json.loads(json.dumps(ChartBuilder(training(), None).build().data.to_builtins()))
+    data = json.loads(
+        json.dumps(ChartBuilder(simulate_training(), None).build().data.to_builtins())
+    )
     captions = [arm["caption"] for arm in data["arms"]]
     assert captions == ["m1, master 1", "m2, master 2", "s, slave"]
     (bar,) = data["leads"]
@@ -93,7 +94,7 @@ def test_page_data_has_the_captions_and_the_bars() -> None:
 def test_the_bar_stands_below_the_slider(
     size: tuple[int, int], browser: Browser, tmp_path: Path
 ) -> None:
-    log = training()
+    log = simulate_training()
     path, _ = write_report(log, tmp_path, certificate=certify(log))
     options: dict[str, Any] = {
         "viewport": {"width": size[0], "height": size[1]},

@@ -20,6 +20,6 @@ def test_commands_permit_exactly_the_laws_of_users(law: object, options: list[st
     commands = [shlex.split(line) for line in re.findall(r"trilat verify [^<\n]*", page)]
     assert [command[:2] for command in commands] == [["trilat", "verify"]] * 2
     arguments = [[word for word in command[2:] if word != "--virtual"] for command in commands]
-    assert [words[1:] for words in arguments] == [options] * 2
+    assert [command[1:] for command in arguments] == [options] * 2
     assert ("--law" in page) == bool(options)
     assert ("in the folder from which the code is imported" in page) == bool(options)

@@ -9,9 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.analysis import logs
-from tests.analysis.certificate import runs
-from tests.log_editing import edited, recorded
+from tests.analysis.builders import make_run, make_short_log
+from tests.log.builders import (
+    edit_log_bytes,
+    make_log_bytes,
+    replace_fields,
+    rewrite_log,
+    write_log,
+)
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
@@ -40,13 +45,15 @@ WRONG = Finding("executed again", "7/8 records identical; 1 differs", passed=Fal
 
 
 @cache
-def short_log() -> Log:
-    return runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).log
+def make_paper_log() -> Log:
+    return make_run("paper", {"duration_s": 2.0, "rate_hz": 100}).log
 
 
-def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certificate:
+def make_certificate(
+    behaviour: EndBehaviour, error_rad: float, **fields: object
+) -> Certificate:
     """Returns a certificate of a run with a proof, with the given behaviour and error at its end."""
-    certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
+    certificate = make_run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     end = certificate.end._replace(
         behaviour=behaviour, end_error_rad=error_rad, reasons=(), operator_acts=False
     )
@@ -54,11 +61,11 @@ def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certif
 
 
 def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> str:
-    return render_verdict(short_log(), certificate, findings)
+    return render_verdict(make_paper_log(), certificate, findings)
 
 
 def test_stable_run_names_its_proof() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 0.0012)
+    certificate = make_certificate(EndBehaviour.CONVERGED, 0.0012)
     assert certificate.stability is Stability.STABLE
     speed_rad_s = certificate.end.end_speed_rad_s
     html = verdict_text(certificate)
@@ -69,7 +76,7 @@ def test_stable_run_names_its_proof() -> None:
 
 
 def test_lasting_errors_are_explained() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
+    certificate = make_certificate(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
     assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
     html = verdict_text(certificate)
     speed_rad_s = certificate.end.end_speed_rad_s
@@ -79,27 +86,27 @@ def test_lasting_errors_are_explained() -> None:
 
 
 def test_pushing_hands_are_named() -> None:
-    log = logs.simulated("paper")
-    pushed = logs.rewritten(log, change=lambda row: logs.replaced(row, tau_x=[1.0, 0.0]))
-    html = render_verdict(pushed, judge(EndBehaviour.CONVERGED, 0.4), ())
+    log = make_short_log("paper")
+    pushed = rewrite_log(log, change=lambda row: replace_fields(row, tau_x=[1.0, 0.0]))
+    html = render_verdict(pushed, make_certificate(EndBehaviour.CONVERGED, 0.4), ())
     assert "not that errors vanish: hands or walls still push m1, m2 and s." in html
 
 
 def test_calm_end_of_unstable_loop_is_explained() -> None:
     growing = LoopRoots("unstable", 0.1, True, "this rest: unstable, +0.1 /s")
-    html = verdict_text(judge(EndBehaviour.CONVERGED, 0.0, roots=growing))
+    html = verdict_text(make_certificate(EndBehaviour.CONVERGED, 0.0, roots=growing))
     assert "Not stable" in html
     assert "This motion is small, but grows from small disturbances." in html
 
 
 def test_small_oscillation_is_not_called_settled() -> None:
-    html = verdict_text(judge(EndBehaviour.BOUNDED, 0.001, roots=None))
+    html = verdict_text(make_certificate(EndBehaviour.BOUNDED, 0.001, roots=None))
     assert "Not stable" in html
     assert "All errors were small then, but they do not die away." in html
 
 
 def test_an_open_run_names_its_first_reason() -> None:
-    certificate = judge(EndBehaviour.HARDLY, 0.2, roots=None)
+    certificate = make_certificate(EndBehaviour.HARDLY, 0.2, roots=None)
     assert certificate.stability is Stability.OPEN
     text = describe_basis(certificate)
     assert certificate.reasons[0] in text
@@ -107,7 +114,7 @@ def test_an_open_run_names_its_first_reason() -> None:
 
 
 def test_failed_check_puts_judgement_in_doubt() -> None:
-    certificate = judge(EndBehaviour.CONVERGED, 0.0)
+    certificate = make_certificate(EndBehaviour.CONVERGED, 0.0)
     assert "failed a check" not in verdict_text(certificate, [PASSED, EXACT])
     html = verdict_text(certificate, [PASSED, WRONG])
     assert "The log failed a check" in html
@@ -139,7 +146,7 @@ def test_a_failed_check_is_named(finding: Finding, phrase: str) -> None:
 
 
 def test_key_numbers_have_place_and_time() -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     facts = summarise_run(log)
     html = render_key_numbers(log, facts)
     names = {"s from its reference": ["s"], "m1 and m2 from the others": ["m1", "m2"]}
@@ -166,7 +173,7 @@ def test_key_numbers_have_place_and_time() -> None:
 @pytest.mark.parametrize("name", ["paper", "four"])
 def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
-    log = logs.simulated(name)
+    log = make_short_log(name)
     certificate = certify(log)
     error = find_last_error(log)
     assert error is not None
@@ -182,12 +189,12 @@ def test_all_texts_have_the_same_last_error(name: str) -> None:
 
 
 def test_limits_stand_under_the_judgement() -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     limit_nm = log.scenario.sites["m1"].limits.tau_limit_nm
-    at_limit = logs.rewritten(
+    at_limit = rewrite_log(
         log,
         change=lambda row: (
-            logs.replaced(row, tau=[-limit_nm, 0.0])
+            replace_fields(row, tau=[-limit_nm, 0.0])
             if row.site == "m1" and row.tick < 30
             else row
         ),
@@ -206,15 +213,16 @@ def test_limits_stand_under_the_judgement() -> None:
 
 
 def test_log_without_records_has_dashes() -> None:
-    empty = logs.rewritten(logs.simulated("paper"), lambda _: False, finished=False)
+    empty = rewrite_log(make_short_log("paper"), lambda _: False, finished=False)
     html = render_key_numbers(empty, summarise_run(empty))
     assert html.count("<dd>–</dd>") == 4
 
 
 def test_sessions_without_records_get_no_judgement(tmp_path: Path) -> None:
     """A session that ended before any site published anything is neither stable nor open."""
-    path = tmp_path / "run.mcap"
-    path.write_bytes(edited(recorded("two_sites"), record=lambda _: None))
+    path = write_log(
+        tmp_path, edit_log_bytes(make_log_bytes("two_sites"), record=lambda _: None)
+    )
     conclusion = conclude(open_log(path), tmp_path)
     assert conclusion.verdict.text == "nothing to judge: no site has a record in this log"
     assert conclusion.exit_code == 1
@@ -223,11 +231,11 @@ def test_sessions_without_records_get_no_judgement(tmp_path: Path) -> None:
 
 
 def test_end_errors_of_pushed_arms_are_marked() -> None:
-    log = logs.simulated("paper")
+    log = make_short_log("paper")
     text = "which a hand or a wall still pushes"
     for torque_nm, is_pushed in ((1.0, True), (0.0, False)):
-        run = logs.rewritten(
+        run = rewrite_log(
             log,
-            change=lambda row, t=torque_nm: logs.replaced(row, tau_x=[t, 0.0]),  # type: ignore[misc]
+            change=lambda row, t=torque_nm: replace_fields(row, tau_x=[t, 0.0]),  # type: ignore[misc]
         )
         assert (text in render_key_numbers(run, summarise_run(run))) == is_pushed

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.presentation.certificate_text import describe_certificate, describe_theorem
@@ -17,7 +17,7 @@ from trilat_net.presentation.certificate_text import describe_certificate, descr
 def test_rates_printing_differently_are_explained(
     factor: float, remarks: int, *, exact: bool
 ) -> None:
-    certificate = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
+    certificate = certify_run(make_run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
     assert certificate.twins is not None
     assert certificate.twins.worst is not None
     rate_per_s = factor * certificate.twins.worst.rate_per_s
@@ -30,7 +30,7 @@ def test_rates_printing_differently_are_explained(
 
 
 def test_inapplicable_theorems_have_not_passed() -> None:
-    certificate = runs.run("wall").certificate
+    certificate = make_run("wall").certificate
     (line,) = [
         line
         for line in describe_certificate(certificate)
@@ -47,4 +47,4 @@ def test_inapplicable_theorems_have_not_passed() -> None:
 
 def test_laws_without_v_have_no_theorem() -> None:
     settings = {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}
-    assert describe_theorem(runs.run("free", settings).certificate) == []
+    assert describe_theorem(make_run("free", settings).certificate) == []

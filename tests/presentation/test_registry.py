@@ -12,7 +12,9 @@ import pytest
 from matplotlib.text import Text
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.log.builders import add_clock_readings
+from tests.presentation.figure_content import list_misplaced
 from trilat_net.errors import UsageError
 from trilat_net.presentation.appearance import COLUMN_IN, PAGE_IN, FigureSize
 from trilat_net.presentation.figures import age_and_lateness, joint_motion
@@ -24,33 +26,31 @@ from trilat_net.presentation.figures.registry import (
 )
 from trilat_net.presentation.style import FIGURE_FORMATS, write_figure
 
-from .drawn_words import misplaced
-
 UNIT = re.compile(r"\((s|rad|rad/s|m|mm|N|N m|kg m|kg m²|J|ms|µs|count|%|1)\)$")
 WALLED = {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 20}
 """Until the tip is in the wall."""
 
 
 @cache
-def walled():
+def simulate_walled():
     return trilat_net.simulate("contact", WALLED)
 
 
 @cache
-def example(name):
+def make_example_log(name):
     """Returns a log that has data for a figure: changes and marks if possible."""
     if name in ("operation", "operator_torques", "hands_moved"):
-        return logs.simulated("paper")
+        return make_short_log("paper")
     if name == "observed_energy":
         return trilat_net.simulate(
             "two_sites", {"control.law": "tanks", "scheme": "digital", "duration_s": 0.3}
         )
-    return walled() if name == "contact" else logs.timed(logs.busy().log)
+    return simulate_walled() if name == "contact" else add_clock_readings(make_busy_run().log)
 
 
 @cache
 def draw_example(name, width_in):
-    return figure(example(name), name, width_in)
+    return figure(make_example_log(name), name, width_in)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def draw_example(name, width_in):
 def test_words_have_8_pt_without_overlap(name, width_in):
     figure_drawn = draw_example(name, width_in)
     assert figure_drawn.get_figwidth() == width_in
-    assert misplaced(figure_drawn) == []
+    assert list_misplaced(figure_drawn) == []
     assert {
         text.get_fontsize() for text in figure_drawn.findobj(Text) if text.get_text().strip()
     } == {8.0}
@@ -102,16 +102,19 @@ def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
 
 @pytest.mark.parametrize("kind", FIGURE_FORMATS)
 def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
-    first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
+    first = tmp_path / f"a.{kind}"
+    second = tmp_path / f"b.{kind}"
     for path in (first, second):
-        write_figure(figure(walled(), "contact"), path, FigureSize.for_print(COLUMN_IN).dpi)
+        write_figure(
+            figure(simulate_walled(), "contact"), path, FigureSize.for_print(COLUMN_IN).dpi
+        )
     assert first.read_bytes() == second.read_bytes()
     if kind == "png":
         assert int.from_bytes(first.read_bytes()[16:20], "big") == 2100  # 600 dots per inch
 
 
 def test_logs_have_the_figures_they_support():
-    have = set(list_drawable_figures(walled()))
+    have = set(list_drawable_figures(simulate_walled()))
     assert {"contact", "operation", "positions"} <= have
     assert (
         not {
@@ -123,20 +126,23 @@ def test_logs_have_the_figures_they_support():
         }
         & have
     )
-    assert "contact" not in list_drawable_figures(logs.busy().log)
-    reasons = {name: entry.absent(logs.simulated("free")) for name, entry in FIGURES.items()}
+    assert "contact" not in list_drawable_figures(make_busy_run().log)
+    reasons = {name: entry.absent(make_short_log("free")) for name, entry in FIGURES.items()}
     assert reasons["operator_torques"] == reasons["hands_moved"] == joint_motion.NO_OPERATOR
     assert reasons["loop_timing"] == age_and_lateness.NO_LOOP_CLOCK
     assert not reasons["positions"]
-    assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
+    assert {"authority", "delay_distributions"} <= set(
+        list_drawable_figures(make_busy_run().log)
+    )
 
 
 def test_wall_force_equals_the_recorded_torque():
     """J'F of the drawn force along the normal is the recorded torque ON the arm, because no
     other force acts.
     """
-    log = walled()
-    part, wall = log["s"], log.scenario.sites["s"].environment[0]
+    log = simulate_walled()
+    part = log["s"]
+    wall = log.scenario.sites["s"].environment[0]
     above = joint_motion.draw_contact(log).axes[0]
     t_s, force = above.lines[0].get_data()
     rows = np.rint(t_s * part.rate_hz).astype(int)
@@ -161,16 +167,16 @@ def test_wall_force_equals_the_recorded_torque():
 )
 def test_impossible_figures_are_refused_beforehand(names, options, said, tmp_path):
     with pytest.raises(UsageError, match=said):
-        write_figures(walled(), tmp_path / "new", ["positions", *names], **options)
+        write_figures(simulate_walled(), tmp_path / "new", ["positions", *names], **options)
     assert not (tmp_path / "new").exists()
 
 
 def test_files_are_replaced_only_by_force(tmp_path):
-    (path,) = write_figures(walled(), tmp_path, ["contact"], formats=["pdf"])
+    (path,) = write_figures(simulate_walled(), tmp_path, ["contact"], formats=["pdf"])
     data = path.read_bytes()
     with pytest.raises(UsageError, match="exists"):
-        write_figures(walled(), tmp_path, ["contact"], formats=["svg", "pdf"])
+        write_figures(simulate_walled(), tmp_path, ["contact"], formats=["svg", "pdf"])
     assert not path.with_suffix(".svg").exists()
     path.write_bytes(b"")
-    write_figures(walled(), tmp_path, ["contact"], formats=["pdf"], force=True)
+    write_figures(simulate_walled(), tmp_path, ["contact"], formats=["pdf"], force=True)
     assert path.read_bytes() == data

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.analysis import logs
-from tests.live.browsers import needs_browser, shows
+from tests.analysis.builders import make_log_without_hands
+from tests.live.browsers import needs_browser, wait_until_page
 from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
@@ -48,15 +48,15 @@ def open_report(watched: WatchedPage, log: Log, folder: Path) -> Page:
     return watched.page
 
 
-def unfold(page: Page) -> None:
+def open_all_parts(page: Page) -> None:
     """Opens every folded part of the page; charts are drawn once their part is open."""
     page.evaluate(
         "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
     )
-    shows(page, "observed.charts() === trilat.page.charts.length")
+    wait_until_page(page, "observed.charts() === trilat.page.charts.length")
 
 
-def count(page: Page, expression: str) -> int:
+def count_on_page(page: Page, expression: str) -> int:
     number: int = page.evaluate(expression)
     return number
 
@@ -84,13 +84,13 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
     with watched_page(browser, **SCREEN) as watched:
         page = open_report(watched, log, tmp_path)
         watched.assert_whole()
-        unfold(page)
+        open_all_parts(page)
         watched.assert_whole()
-        charts = count(page, "trilat.page.charts.length")
+        charts = count_on_page(page, "trilat.page.charts.length")
         assert (
             charts
-            == count(page, "observed.charts()")
-            == count(page, "document.querySelectorAll('figure').length")
+            == count_on_page(page, "observed.charts()")
+            == count_on_page(page, "document.querySelectorAll('figure').length")
         )
         assert charts > 0 or not any(len(log[site]) for site in log.sites)
         recorded = sum(len(log[site]) > 0 for site in log.sites)
@@ -98,7 +98,7 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
             page.locator("#arms input").fill("1000")
         assert [points != "" for points in arms_drawn(page)] == [True] * recorded
         strip = "document.querySelectorAll('.strip svg .arm').length"
-        assert count(page, strip) >= recorded
+        assert count_on_page(page, strip) >= recorded
         absent = [site for site in log.sites if not len(log[site])]
         assert not absent or f"there is no record: {', '.join(absent)}." in page.inner_text(
             "body"
@@ -106,10 +106,10 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
 
 
 def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
-    """Even if the chart has ticks of other sites within the gap of one."""
+    """No line is drawn even if the chart has ticks of other sites within the gap."""
     with watched_page(browser, **SCREEN) as watched:
         page = open_report(watched, VARIED["single records"](), tmp_path)
-        unfold(page)
+        open_all_parts(page)
         charts = "trilat.plots().filter((plot) => plot.series[1].label === 'm1' && plot.series.length > 2)"
         t_s, values = page.evaluate(
             f"(() => {{ const [{{ data }}] = {charts}; return [data[0], data[1]]; }})()"
@@ -127,7 +127,7 @@ def test_linear_axes_have_two_labelled_values(
     """The scale of a chart cannot be read from one value."""
     with watched_page(browser, **SCREEN) as watched:
         page = open_report(watched, VARIED[name](), tmp_path)
-        unfold(page)
+        open_all_parts(page)
         labels = page.evaluate(
             "trilat.plots().filter((plot) => plot.scales.y.distr === 1)"
             ".map((plot) => plot.axes[1]._values)"
@@ -164,7 +164,9 @@ def test_report_stays_whole_while_used(name: str, browser: Browser, tmp_path: Pa
         toggle_lines(page)
         watched.assert_whole()
         page.set_viewport_size({"width": 500, "height": 900})
-        shows(page, "document.querySelector('.uplot').getBoundingClientRect().width < 500")
+        wait_until_page(
+            page, "document.querySelector('.uplot').getBoundingClientRect().width < 500"
+        )
         watched.assert_whole()
         page.emulate_media(color_scheme="dark")
         watched.assert_whole()
@@ -217,15 +219,16 @@ CERTIFIED = ("live change", "diverged", "shipped paper", "shipped contact", "eve
 def test_whole_report_with_its_certificate_is_drawn(
     name: str, browser: Browser, tmp_path: Path
 ) -> None:
-    """As the command writes it: with the certificate, its pictures, and the twin without operators."""
+    """The report is that of the command, with the certificate, its pictures, and the twin without operators."""
     log = VARIED[name]()
-    twin = logs.twin("paper") if name == "shipped paper" else None
+    twin = make_log_without_hands("paper") if name == "shipped paper" else None
     certificate = certify(log)
     path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
-    observed, twins = certificate.observed, certificate.twins
+    observed = certificate.observed
+    twins = certificate.twins
     sections = [certificate.balance, observed and observed.curves, twins and twins.pushes]
     with watched_page(browser, **SCREEN) as watched:
         watched.page.goto(path.as_uri())
-        unfold(watched.page)
+        open_all_parts(watched.page)
         watched.assert_whole()
         assert watched.page.locator("img.picture").count() == sum(map(bool, sections))

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.log.programs import RERUN, printed
+from tests.log.builders import write_log
 from tests.log.standard_files import SCENARIO
+from tests.programs import RERUN, run_program
 from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.log.log_reader import Log, open_log
@@ -39,10 +40,12 @@ class Rerun:
         self.topics: set[str] = set()
 
     def __call__(self, command: list[str], environment: Mapping[str, str]) -> int:
-        self.command, self.environment = command, environment
+        self.command = command
+        self.environment = environment
         for file in map(Path, command):
             if file.suffix == ".mcap":
-                self.log, self.topics = file, set(read_ros2_channels(file))
+                self.log = file
+                self.topics = set(read_ros2_channels(file))
             if file.suffix == ".rbl":
                 self.layout = file
                 assert file.stat().st_size > 0
@@ -58,14 +61,14 @@ def run_viewer(
     return rerun, said
 
 
-def never() -> Log:
+def fail_to_read() -> Log:
     raise AssertionError("it was read")
 
 
 @pytest.mark.long
 def test_finished_logs_with_views_are_opened_directly(files: dict[str, Path]) -> None:
     rerun = Rerun()
-    open_rerun([files["live"]], never, ViewerOptions(web=True), lambda _: None, rerun)
+    open_rerun([files["live"]], fail_to_read, ViewerOptions(web=True), lambda _: None, rerun)
     assert rerun.log == files["live"]
     assert rerun.command[:3] == [sys.executable, "-m", "rerun"]
     assert rerun.command[rerun.command.index("--bind") + 1] == "127.0.0.1"
@@ -83,8 +86,7 @@ def test_temporary_files_end_with_the_viewer(files: dict[str, Path]) -> None:
 
 def test_parts_and_torn_logs_are_shown_whole(files: dict[str, Path], tmp_path: Path) -> None:
     parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
-    torn = tmp_path / "run.mcap.active"
-    torn.write_bytes(files["live"].read_bytes()[:150_000])
+    torn = write_log(tmp_path, files["live"].read_bytes()[:150_000], "run.mcap.active")
     for paths, name in ((parts, parts[0].name), ([torn], "run.mcap")):
         rerun, _ = run_viewer(paths, ViewerOptions(save=Path("x.rrd")))
         assert rerun.log.name == name
@@ -102,7 +104,7 @@ def test_names_unsuitable_for_rerun_are_replaced(
         "ü.mcap": "log",
     }
     assert {name: make_application_id(Path(name)) for name in names} == names
-    (tmp_path / "ü.mcap").write_bytes(files["live"].read_bytes())
+    write_log(tmp_path, files["live"].read_bytes(), "ü.mcap")
     rerun, _ = run_viewer([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
     assert rerun.log.stem == "log"
     assert "/viz/m/error" in rerun.topics
@@ -150,14 +152,16 @@ def test_rerun_takes_log_and_layout_into_one_recording(
 ) -> None:
     """The program itself: the layout is of the log's own application, so that Rerun applies it."""
     recording = tmp_path / "run.rrd"
-    open_rerun([files["live"]], never, ViewerOptions(save=recording), lambda _: None)
-    text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
+    open_rerun([files["live"]], fail_to_read, ViewerOptions(save=recording), lambda _: None)
+    text = run_program(*RERUN, "rrd", "print", "-vvv", str(recording))
     stores = set(re.findall(r'(Blueprint|Recording),\s*"([^"]+)"', text))
     assert stores == {("Blueprint", "live"), ("Recording", "live")}
     assert [name for name in read_ros2_channels(files["live"]) if name not in text] == []
 
 
-def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:
+def build_layouts(
+    files: dict[str, Path],
+) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:
     return {
         kind: (read_ros2_channels(path), build_plot_layout(read_ros2_channels(path)))
         for kind, path in files.items()
@@ -165,7 +169,7 @@ def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], Pl
 
 
 def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
-    for channels, panels in boards(files).values():
+    for channels, panels in build_layouts(files).values():
         for page in panels.pages.values():
             for plot in (plot for row in page for plot in row):
                 for entity, names, visible in plot.curves:
@@ -176,7 +180,7 @@ def test_every_curve_is_in_the_file(files: dict[str, Path]) -> None:
 
 
 def test_sites_are_columns_and_quantities_rows(files: dict[str, Path]) -> None:
-    channels, panels = boards(files)["live"]
+    channels, panels = build_layouts(files)["live"]
     assert list(panels.pages) == ["Motion", "Speeds, estimates", "Links, timing"]
     for page in panels.pages.values():
         for row in page:
@@ -191,8 +195,9 @@ def test_sites_are_columns_and_quantities_rows(files: dict[str, Path]) -> None:
 def test_a_bag_shows_the_reference_beside_the_joints(
     files: dict[str, Path],
 ) -> None:
-    of = boards(files)
-    bag, views = of["bag"][1].pages["Motion"], of["live"][1].pages["Motion"]
+    of = build_layouts(files)
+    bag = of["bag"][1].pages["Motion"]
+    views = of["live"][1].pages["Motion"]
     assert [c.entity for c in bag[0][0].curves] == [
         "/lab/m/joint_states/position",
         "/lab/m/reference/position",
@@ -207,7 +212,7 @@ def test_a_bag_shows_the_reference_beside_the_joints(
 
 
 def test_missing_quantities_take_no_room(files: dict[str, Path]) -> None:
-    rows = boards(files)["virtual"][1].pages["Links, timing"]
+    rows = build_layouts(files)["virtual"][1].pages["Links, timing"]
     assert [row[0].title for row in rows] == ["m: age of samples in use, by peer (ms)"]
     assert build_plot_layout({}) == PlotLayout({}, "")
     assert (
@@ -219,11 +224,11 @@ def test_missing_quantities_take_no_room(files: dict[str, Path]) -> None:
 
 
 def test_two_dimensional_numbers_are_named_by_both(files: dict[str, Path]) -> None:
-    delays = boards(files)["live"][1].pages["Links, timing"][1]
+    delays = build_layouts(files)["live"][1].pages["Links, timing"][1]
     assert delays[0].curves[0].names == ("s median", "s max")
 
 
 def test_files_without_index_have_no_channels(files: dict[str, Path], tmp_path: Path) -> None:
     for content in (b"", b"nonsense" * 100, files["live"].read_bytes()[:50_000]):
-        (tmp_path / "x.mcap").write_bytes(content)
+        write_log(tmp_path, content, "x.mcap")
         assert read_ros2_channels(tmp_path / "x.mcap") == {}

@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 
 import trilat_net
-from tests.analysis import logs
-from tests.core.guarded_runs import stopped_log
+from tests.analysis.builders import make_busy_run, make_short_log
+from tests.core.guarded_runs import make_stopped_log
+from tests.log.builders import rewrite_log
 from trilat_net.analysis.link_summary import summarise_clock
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
@@ -30,7 +31,7 @@ from trilat_net.presentation.summary_text import (
 
 def test_constant_links_without_loss_get_no_line():
     for name in ("paper", "free", "two_sites", "four"):
-        assert format_run_lines(logs.simulated(name)) == []
+        assert format_run_lines(make_short_log(name)) == []
 
 
 def test_links_give_stated_and_measured_values():
@@ -42,7 +43,7 @@ def test_links_give_stated_and_measured_values():
 
 
 def test_events_are_reported_once():
-    lines = format_run_lines(logs.busy().log)
+    lines = format_run_lines(make_busy_run().log)
     link = "the link c->a was set to uniform 0 to 60 ms, from 3 s on"
     shares = "the shares of c were set to a 0.9, b 0.1 within 1 s, from 4 s on"
     assert f"change: {link} (applied at tick 500)" in lines
@@ -54,13 +55,13 @@ def test_events_are_reported_once():
 
 
 def test_stopped_arms_are_reported_first():
-    log = stopped_log()
+    log = make_stopped_log()
     assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to stop"
     assert (
         "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to stop"
         in render_alarms(log)
     )
-    assert render_alarms(logs.simulated("two_sites")) == ""
+    assert render_alarms(make_short_log("two_sites")) == ""
 
 
 @pytest.mark.parametrize(
@@ -104,12 +105,12 @@ def test_foreign_records_raise_no_alarm(mem):
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):
     monkeypatch.setattr(summary_text, "MOST_LINES", 2)
-    lines = format_link_lines(logs.busy().log)
+    lines = format_link_lines(make_busy_run().log)
     assert len(lines) == 3
     assert lines[-1] == "and 4 more of this kind: see summary.json"
 
 
-def statistics(tick, **clock):
+def make_statistics(tick, **clock):
     none = {"m1": 0, "s": 0}
     counts = dict.fromkeys(("accepted", "late", "duplicate", "refused", "age_us"), none)
     zeros = dict.fromkeys(("late_max_us", "busy_max_us", "overruns"), 0)
@@ -124,7 +125,7 @@ def statistics(tick, **clock):
     return LinkStats(**facts, **counts, **zeros, dropped={}, **clock)
 
 
-def clocked():
+def make_clock_statistics():
     """Returns two statistics and an estimate of m2: m1 has another clock, s its own."""
     first = {
         "offset_us": {"m1": 3_000_000, "s": 0},
@@ -139,12 +140,12 @@ def clocked():
     faults = {"clock_faults": {"m1": 2}}
     drift = {"drift_ppb": 50_000, "drift_bound_ppb": 900}
     estimate = Event(member="m2", boot=1, kind="clock", text="", about="m1", ticks=20, **drift)
-    others = [statistics(20, **first), estimate, statistics(380, **last, **faults)]
-    return logs.rewritten(logs.simulated("paper"), driver="live", others=others)
+    others = [make_statistics(20, **first), estimate, make_statistics(380, **last, **faults)]
+    return rewrite_log(make_short_log("paper"), driver="live", others=others)
 
 
 def test_clocks_are_reported_as_at_the_end():
-    use = summarise_clock(clocked(), "m1", "m2")
+    use = summarise_clock(make_clock_statistics(), "m1", "m2")
     assert (use.offset_first_us, use.offset_us) == (3_000_000, 3_000_100)
     assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (
         130.0,
@@ -153,7 +154,7 @@ def test_clocks_are_reported_as_at_the_end():
         2,
     )
     assert (use.drift_ppm, use.drift_bound_ppm) == (50.0, 0.9)
-    (line,) = format_clock_lines(clocked())
+    (line,) = format_clock_lines(make_clock_statistics())
     assert line == (
         "clock of m1 seen by m2: +3000.100 ms at the end, known to 60 us (p50 130, max 200), "
         "drift +50.00 ppm, 2 samples arrived before they were sent: a clock has stepped"
@@ -161,11 +162,11 @@ def test_clocks_are_reported_as_at_the_end():
 
 
 def test_shared_clocks_get_no_line():
-    shared = summarise_clock(clocked(), "s", "m2")
+    shared = summarise_clock(make_clock_statistics(), "s", "m2")
     assert shared is not None
     assert shared.shared
-    assert summarise_clock(clocked(), "m2", "m1") is None
-    assert format_clock_lines(logs.simulated("paper")) == []
+    assert summarise_clock(make_clock_statistics(), "m2", "m1") is None
+    assert format_clock_lines(make_short_log("paper")) == []
 
 
 def test_the_cause_of_the_end_is_one_line() -> None:

@@ -17,9 +17,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 import trilat_net
-from tests.log.programs import RERUN, printed, rerun_faults
-from tests.log_editing import edited, opened, recorded
-from tests.task_arms import planar_task
+from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_bytes
+from tests.programs import RERUN, list_rerun_faults, run_program
+from tests.scenario.builders import planar_task_text
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
@@ -39,27 +39,29 @@ HEADS = {
 
 
 @cache
-def log() -> Log:
+def make_task_log() -> Log:
     hands = '[[sites.s.hands]]\nkind = "tip_spring"\nto_m = [1.0, 1.0, 0.0]\nstiffness_n_m = 50\n[dominance]'
-    return trilat_net.simulate(parse_scenario(planar_task(0.2).replace("[dominance]", hands)))
+    return trilat_net.simulate(
+        parse_scenario(planar_task_text(0.2).replace("[dominance]", hands))
+    )
 
 
-def exported(form: str, folder: Path) -> Path:
+def export_log(form: str, folder: Path) -> Path:
     path = folder / ("out.mcap" if form == "ros2" else f"out.{form}")
-    Exporter(form, path).export(log())
+    Exporter(form, path).export(make_task_log())
     return path
 
 
 def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
-    folder = exported("csv", tmp_path)
+    folder = export_log("csv", tmp_path)
     with (folder / "s_state.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     frame = pl.read_csv(folder / "s_state.csv")
     for field, heads in HEADS.items():
-        wanted = getattr(log()["s"], field)
+        wanted = getattr(make_task_log()["s"], field)
         assert np.array_equal([[float(row[head]) for head in heads] for row in rows], wanted)
         assert np.array_equal(frame.select(heads).to_numpy(), wanted)
-    assert np.abs(log()["s"].wrench).max() > 1.0
+    assert np.abs(make_task_log()["s"].wrench).max() > 1.0
     columns = json.loads((folder / "about.json").read_text())["tables"]["s_state.csv"][
         "columns"
     ]
@@ -69,13 +71,15 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
 
 
 def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
-    site = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)["m"]
+    site = scipy.io.loadmat(export_log("mat", tmp_path), simplify_cells=True)["m"]
     (table,) = (
-        table_of_site for table_of_site in log().tables() if table_of_site.label == "m_state"
+        table_of_site
+        for table_of_site in make_task_log().tables()
+        if table_of_site.label == "m_state"
     )
     frame = table.to_data_frame()
     for field, heads in HEADS.items():
-        wanted = getattr(log()["m"], field)
+        wanted = getattr(make_task_log()["m"], field)
         assert np.array_equal(np.stack([site[head] for head in heads], axis=1), wanted)
         assert np.array_equal(frame.select(heads).to_numpy(), wanted)
 
@@ -90,7 +94,7 @@ def list_numbers(message: Any) -> list[float]:
 
 
 def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
-    path = exported("ros2", tmp_path)
+    path = export_log("ros2", tmp_path)
     columns: dict[str, list[list[float]]] = {}
     with AnyReader([path]) as bag:
         for connection, _, data in bag.messages():
@@ -106,7 +110,7 @@ def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
                 message = bag.deserialize(data, connection.msgtype)
                 columns.setdefault(connection.topic, []).append(list_numbers(message))
         types = {connection.topic: connection.msgtype for connection in bag.connections}
-    part = log()["s"]
+    part = make_task_log()["s"]
     for topic, vectors in {
         "reference_pose": part.q_des,
         "reference_twist": part.qd_des,
@@ -123,21 +127,23 @@ def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
-    source, saved = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    source = tmp_path / "run.mcap"
+    saved = tmp_path / "run.rrd"
     with source.open("wb") as stream:
-        write_virtual_log(log().scenario, stream)
-    assert rerun_faults(source) == []
-    assert rerun_faults(exported("ros2", tmp_path)) == []
-    open_rerun([source], log, ViewerOptions(save=saved), lambda _: None)
-    text = printed(*RERUN, "rrd", "print", "-vvv", str(saved))
+        write_virtual_log(make_task_log().scenario, stream)
+    assert list_rerun_faults(source) == []
+    assert list_rerun_faults(export_log("ros2", tmp_path)) == []
+    open_rerun([source], make_task_log, ViewerOptions(save=saved), lambda _: None)
+    text = run_program(*RERUN, "rrd", "print", "-vvv", str(saved))
     assert [name for name in read_ros2_channels(source) if name not in text] == []
 
 
 def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
-    path, log_times = tmp_path / "bag.mcap", list[int]()
-    export_ros2(opened(recorded("paper")), path, log_times.append)
+    path = tmp_path / "bag.mcap"
+    log_times = list[int]()
+    export_ros2(make_log("paper"), path, log_times.append)
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages(log_time_order=False))
     times = [message.log_time for _, _, message in messages]
@@ -154,8 +160,10 @@ def test_messages_are_in_order_of_arrival(
 
 def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
     """A gap in the log is a gap in the bag."""
-    log = opened(
-        edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r)
+    log = open_bytes(
+        edit_log_bytes(
+            make_log_bytes("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r
+        )
     )
     path = tmp_path / "bag.mcap"
     export_ros2(log, path)
@@ -165,9 +173,10 @@ def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
 
 
 def test_unreadable_records_are_reported(tmp_path: Path) -> None:
-    log = opened(
-        edited(
-            recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r
+    log = open_bytes(
+        edit_log_bytes(
+            make_log_bytes("paper"),
+            record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r,
         )
     )
     with pytest.raises(LogError, match="a record of m1 cannot be read"):

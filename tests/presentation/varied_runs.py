@@ -2,22 +2,18 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import trilat_net
-from tests.analysis import logs
-from tests.analysis.certificate import runs
-from tests.chains import six_joints
+from tests.analysis.builders import make_busy_run, make_diverged_log, make_run, make_short_log
 from tests.control_laws.law_settings import LAWS as PLUGGED_LAWS
-from tests.core.guarded_runs import guarded, stopped_log
-from tests.sites.sessions import Session, gliding, reached
-from tests.task_arms import planar_task, posed_arms
-from trilat_net.log.log_reader import Log, open_log
-from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
+from tests.core.guarded_runs import make_guarded_scenario, make_stopped_log
+from tests.log.builders import add_clock_readings, open_bytes, rewrite_log
+from tests.scenario.builders import planar_task_text, posed_task_text, six_joint_text
+from tests.sites.sessions import make_gliding_scenario, run_session
+from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, list_shipped, load_scenario, parse_scenario
 
 MakeLog = Callable[[], Log]
@@ -54,50 +50,40 @@ LAW_SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
     "tanks": ("two_sites", {"scheme": "digital"}),
     "own": ("two_sites", {"control": {"law": "tests.laws:Adaptive"}}),
 }
-"""Per law a scenario that it runs in, and settings."""
+"""A scenario and settings for each law."""
 
 SHORT = {"duration_s": 2.0, "rate_hz": 200}
 
 
-def simulate(name: str, overrides: Mapping[str, Any] = {}) -> Log:
+def simulate_shipped(name: str, overrides: Mapping[str, Any] = {}) -> Log:
     """Returns a short run of a shipped scenario."""
     return trilat_net.simulate(load_scenario(name, {**SHORT, **overrides}))
 
 
-def run_with_law(law: str) -> Log:
+def simulate_law(law: str) -> Log:
     """Returns a short run in which every site has a law."""
     name, settings = LAW_SETTINGS[law]
     named = {} if "control" in settings else {"control.law": law}
-    return simulate(name, {**named, **settings})
+    return simulate_shipped(name, {**named, **settings})
 
 
-def run_session(scenario: Scenario, orders: tuple[tuple[float, str], ...] = ()) -> Log:
-    """Returns a session of sites and a recorder; the slave is given orders at times, s after the start."""
+def record_session(scenario: Scenario, orders: tuple[tuple[float, str], ...] = ()) -> Log:
+    """Returns the log of a session of sites and a recorder, in which the slave gets orders."""
     with TemporaryDirectory() as folder:
-        session = Session.whole(scenario, Path(folder), ends={})
-
-        def give_orders(bus: Bus, clock: Clock) -> None:
-            begun_ns = clock.monotonic_ns()
-            for at_s, order in orders:
-                clock.sleep_until(begun_ns + int(at_s * 1e9))
-                reached(bus, clock).send_order(["s"], order)
-
-        if orders:
-            session.stranger(give_orders)
-        session.run()
-        return open_log(BytesIO(session.path.read_bytes()))
+        run_session(scenario, Path(folder), orders)
+        return open_bytes(Path(folder, "run.mcap").read_bytes())
 
 
-def in_fault() -> Log:
+def make_fault_log() -> Log:
     """Returns a slave under the rule `glide` that its hand pushes beyond its limit of speed."""
     limits = {"qd_limit_rad_s": 0.2}
-    return trilat_net.simulate(guarded(limits, where="sites.s."))
+    return trilat_net.simulate(make_guarded_scenario(limits, where="sites.s."))
 
 
-def torn(ticks: int, *sites: str) -> Log:
+def make_torn_log(ticks: int, *sites: str) -> Log:
     """Returns a log that ends after few ticks, without some sites."""
-    whole = logs.timed(logs.simulated("paper"))
-    return logs.rewritten(
+    whole = add_clock_readings(make_short_log("paper"))
+    return rewrite_log(
         whole,
         lambda record: record.tick < ticks and record.site in (sites or whole.sites),
         finished=False,
@@ -105,31 +91,31 @@ def torn(ticks: int, *sites: str) -> Log:
     )
 
 
-def with_gaps() -> Log:
+def make_log_with_gaps() -> Log:
     """Returns a log in which a site has single records between gaps."""
-    return logs.rewritten(
-        logs.simulated("paper"), lambda record: record.site != "m1" or record.tick % 100 == 0
+    return rewrite_log(
+        make_short_log("paper"), lambda record: record.site != "m1" or record.tick % 100 == 0
     )
 
 
 VARIED: dict[str, MakeLog] = {
     **{f"shipped {name}": partial(trilat_net.simulate, name) for name in list_shipped()},
     **{
-        f"delay {model}": partial(simulate, "paper", {"link": {"model": model, **keys}})
+        f"delay {model}": partial(simulate_shipped, "paper", {"link": {"model": model, **keys}})
         for model, keys in LINKS.items()
     },
-    "delay measured": lambda: run_session(
+    "delay measured": lambda: record_session(
         load_scenario("two_sites", {**SHORT, "link": {"model": "measured"}})
     ),
-    **{f"law {law}": partial(run_with_law, law) for law in LAW_SETTINGS},
+    **{f"law {law}": partial(simulate_law, law) for law in LAW_SETTINGS},
     "six joints": lambda: trilat_net.simulate(
-        parse_scenario(six_joints(1.0), overrides={"rate_hz": 200})
+        parse_scenario(six_joint_text(1.0), overrides={"rate_hz": 200})
     ),
-    "planar task": lambda: trilat_net.simulate(parse_scenario(planar_task(rate_hz=200))),
+    "planar task": lambda: trilat_net.simulate(parse_scenario(planar_task_text(rate_hz=200))),
     "posed task": lambda: trilat_net.simulate(
-        parse_scenario(posed_arms(1.0), overrides={"rate_hz": 200})
+        parse_scenario(posed_task_text(1.0), overrides={"rate_hz": 200})
     ),
-    "carried bodies": lambda: simulate(
+    "carried bodies": lambda: simulate_shipped(
         "paper",
         {
             "sites.s.plant": {
@@ -138,16 +124,18 @@ VARIED: dict[str, MakeLog] = {
             }
         },
     ),
-    "four sites": lambda: logs.timed(logs.simulated("four")),
-    "live change": lambda: logs.busy().log,
-    "stop and enable": stopped_log,
-    "orders in a session": lambda: run_session(gliding(4.0), ((1.5, "stop"), (3.0, "enable"))),
-    "fault": in_fault,
-    "diverged": logs.diverged,
-    "everything": lambda: runs.run("rich").log,
-    "no record": lambda: torn(0),
-    "one record a site": lambda: torn(1),
-    "one of three sites": lambda: torn(200, "m1"),
-    "single records": with_gaps,
+    "four sites": lambda: add_clock_readings(make_short_log("four")),
+    "live change": lambda: make_busy_run().log,
+    "stop and enable": make_stopped_log,
+    "orders in a session": lambda: record_session(
+        make_gliding_scenario(4.0), ((1.5, "stop"), (3.0, "enable"))
+    ),
+    "fault": make_fault_log,
+    "diverged": make_diverged_log,
+    "everything": lambda: make_run("rich").log,
+    "no record": lambda: make_torn_log(0),
+    "one record a site": lambda: make_torn_log(1),
+    "one of three sites": lambda: make_torn_log(200, "m1"),
+    "single records": make_log_with_gaps,
 }
-"""What is varied, and a run of it."""
+"""The makers of the runs, by the property that is varied."""

@@ -14,6 +14,7 @@ from recorder.site_reception import InboundQueue
 from tests.net import parties
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.log.log_reader import Log, open_log
@@ -29,8 +30,10 @@ from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import Scenario, load_scenario
 
 SESSION = "t"
-MONO_NS, UNIX_NS = 3_000_000_000, 1_700_000_000_000_000_000
-MS, S = 1_000_000, 1_000_000_000
+MONO_NS = 3_000_000_000
+UNIX_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+S = 1_000_000_000
 BOOTS = {"m": 11, "s": 12, topics.RECORDER: 13}
 EPOCH = Epoch(MONO_NS, UNIX_NS, BOOTS)
 SCENARIO = load_scenario("two_sites", {"duration_s": 0.05})
@@ -42,7 +45,9 @@ def answer_info(name: str, **facts: object) -> Info:
     return parties.answer_info(name, BOOTS[name], **{**scenario, **facts})
 
 
-def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:
+def encode_states(
+    name: str, boot: int | None = None, scenario: Scenario = SCENARIO
+) -> list[bytes]:
     site = Site(scenario.setup(name))
     boot = BOOTS[name] if boot is None else boot
     return [
@@ -51,21 +56,21 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
     ]
 
 
-def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
+def encode_statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
     site = Site(scenario.setup(name))
     stats = LoopStats(site, BOOTS[name]).pop_stats(site.step(TickInput(0)))
     t_ns = tick * S // scenario.sites[name].rate_hz
     return encode(msgspec.structs.replace(stats, tick=tick, t_ns=t_ns))
 
 
-def happening(name: str, n: int, kind: str = "mode", **facts: object) -> bytes:
+def encode_event(name: str, n: int, kind: str = "mode", **facts: object) -> bytes:
     event = Event(member=name, boot=BOOTS[name], kind=kind, text=kind, t_ns=n * MS, n=n)
     return encode(msgspec.structs.replace(event, **facts))
 
 
-def end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> bytes:
+def encode_end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> bytes:
     boot = BOOTS[name] if boot is None else boot
-    return happening(name, n, "end", boot=boot, t_ns=50 * MS, ticks=ticks)
+    return encode_event(name, n, "end", boot=boot, t_ns=50 * MS, ticks=ticks)
 
 
 class Memory:
@@ -79,7 +84,8 @@ class Memory:
     """
 
     def __init__(self, network: LocalNetwork, name: str, chunk: int = 64) -> None:
-        self.name, self.chunk = name, chunk
+        self.name = name
+        self.chunk = chunk
         self.made: dict[str, Sequence[bytes]] = {"state": [], "link": [], "event": []}
         self.oldest = dict.fromkeys(self.made, 0)
         self.asked: list[BackfillRequest] = []
@@ -138,7 +144,7 @@ class Desk:
         )
 
     def wait(self, for_ns: int) -> None:
-        self.clock.sleep_until(self.clock.monotonic_ns() + for_ns)
+        sleep_for_ns(self.clock, for_ns)
 
     def take(self, name: str, channel: str, *payloads: bytes) -> None:
         for payload in payloads:
@@ -150,7 +156,7 @@ class Desk:
         self.recording.write(self.tap, self.clock.monotonic_ns())
 
     def rounds(self, count: int, *sites: Memory, step_ns: int = 10 * MS) -> None:
-        """Lets time pass, while the recorder works and the given sites answer."""
+        """Advances the time, while the recorder works and the given sites answer."""
         for _ in range(count):
             self.wait(step_ns)
             self.write()
@@ -159,9 +165,9 @@ class Desk:
 
     def whole(self, *names: str) -> None:
         for name in names:
-            self.take(name, topics.STATE, *states(name))
-            self.take(name, topics.LINK, statistics(name))
-            self.take(name, topics.EVENT, end(name))
+            self.take(name, topics.STATE, *encode_states(name))
+            self.take(name, topics.LINK, encode_statistics(name))
+            self.take(name, topics.EVENT, encode_end(name))
 
     def over(self) -> bool:
         return self.recording.is_over(self.clock.monotonic_ns())

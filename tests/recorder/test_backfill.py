@@ -13,35 +13,24 @@ from hypothesis import strategies as st
 
 from recorder.backfill import ANSWER_NS, GIVE_UP_NS, MAX_VAIN_REQUESTS, SILENT_NS
 from tests.net.manual_clock import ManualClock
+from tests.recorder.desk import encode_event, encode_states, encode_statistics
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, RecorderStats, State
 from trilat_net.net.requests import BACKFILL_MESSAGES, Backfill
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import load_scenario
 
-from .desk import (
-    BOOTS,
-    MONO_NS,
-    MS,
-    SESSION,
-    UNIX_NS,
-    Desk,
-    Memory,
-    S,
-    happening,
-    states,
-    statistics,
-)
+from .desk import BOOTS, MONO_NS, MS, SESSION, UNIX_NS, Desk, Memory, S
 
 SLOW = load_scenario("two_sites", {"duration_s": 2.0, "rate_hz": 100})
 TICKS = SLOW.ticks("m")
 EVERY = 10
 MADE = {
-    "state": states("m", scenario=SLOW),
-    "link": [statistics("m", k, SLOW) for k in range(0, TICKS, EVERY)],
+    "state": encode_states("m", scenario=SLOW),
+    "link": [encode_statistics("m", k, SLOW) for k in range(0, TICKS, EVERY)],
     "event": [
-        *(happening("m", n, "mode") for n in range(8)),
-        happening("m", 8, "end", ticks=TICKS, t_ns=2 * S),
+        *(encode_event("m", n, "mode") for n in range(8)),
+        encode_event("m", 8, "end", ticks=TICKS, t_ns=2 * S),
     ],
 }
 SENT = sorted(
@@ -100,7 +89,7 @@ WRONG: dict[str, Callable[[Backfill], dict[str, Any]]] = {
 }
 
 
-def lie(how: str, payload: bytes) -> Sequence[bytes]:
+def make_false_answer(how: str, payload: bytes) -> Sequence[bytes]:
     """Returns the arriving part of an answer."""
     if how in ARRIVES:
         return ARRIVES[how](payload)
@@ -109,7 +98,7 @@ def lie(how: str, payload: bytes) -> Sequence[bytes]:
 
 
 @st.composite
-def ways(draw: st.DrawFn) -> Way:
+def draw_ways(draw: st.DrawFn) -> Way:
     places = st.integers(0, len(SENT) - 1)
     runs = draw(st.lists(st.tuples(places, st.integers(1, len(SENT))), max_size=4))
     lost = draw(st.sets(places, max_size=30)) | {
@@ -142,18 +131,20 @@ class Run:
         turn = self._asked - self._asked // 4 - 1
         if self._asked % 4 == 0 or turn >= len(self.way.answers):
             return [payload]
-        return lie(self.way.answers[turn], payload)
+        return make_false_answer(self.way.answers[turn], payload)
 
     def live(self, until_ns: int) -> None:
         """Lets the site make and send until an instant; the recorder works every 10 ms."""
-        desk, came = self.desk, self.way.deliveries()
+        desk = self.desk
+        deliveries = self.way.deliveries()
         now_ns = desk.clock.monotonic_ns()
         while now_ns < until_ns + MONO_NS:
-            begun_ns, now_ns = now_ns, now_ns + 10 * MS
+            begun_ns = now_ns
+            now_ns = now_ns + 10 * MS
             for at_ns, channel, number in SENT:
                 if begun_ns <= at_ns + MONO_NS < now_ns:
                     self.site.made[channel] = MADE[channel][: number + 1]
-            for at_ns, channel, number in came:
+            for at_ns, channel, number in deliveries:
                 if begun_ns <= at_ns + MONO_NS < now_ns:
                     desk.clock.sleep_until(at_ns + MONO_NS)
                     desk.tap.receive(topics.key(SESSION, "m", channel), MADE[channel][number])
@@ -171,7 +162,7 @@ class Run:
         raise AssertionError("never stored")
 
 
-@given(ways())
+@given(draw_ways())
 @settings(max_examples=40, deadline=None)
 def test_logs_have_all_obtainable_messages(way: Way) -> None:
     run = Run(way)
@@ -183,16 +174,18 @@ def test_logs_have_all_obtainable_messages(way: Way) -> None:
         if site == "m":
             number = MADE[channel].index(message.data)
             file.setdefault(channel, []).append((number, message.log_time - UNIX_NS))
-    for channel, made in MADE.items():
+    for channel, payloads in MADE.items():
         account = run.desk.recording.accounts[topics.key(SESSION, "m", channel)]
         arrivals = [(at_ns, number) for at_ns, c, number in way.deliveries() if c == channel]
         numbers = [number for number, _ in file.get(channel, [])]
-        truth = {number for _, number in arrivals} | set(range(way.oldest[channel], len(made)))
+        truth = {number for _, number in arrivals} | set(
+            range(way.oldest[channel], len(payloads))
+        )
         assert sorted(numbers) == sorted(truth)
         live = [(at_ns, number) for number, at_ns in file.get(channel, []) if at_ns % MS]
         assert set(live) <= set(arrivals)
-        assert (account.expected, account.received) == (len(made), len(truth))
-        assert account.missing == len(made) - len(truth)
+        assert (account.expected, account.received) == (len(payloads), len(truth))
+        assert account.missing == len(payloads) - len(truth)
         assert account.refilled == len(truth) - len(live)
         assert account.duplicate == len(arrivals) - len(live)
         passed = [
@@ -201,7 +194,7 @@ def test_logs_have_all_obtainable_messages(way: Way) -> None:
         ]
         assert account.reordered == sum(passed)
         assert {n for first, last in account.gaps for n in range(first, last + 1)} == (
-            set(range(len(made))) - truth
+            set(range(len(payloads))) - truth
         )
         stamps = sorted(at_ns for at_ns, _ in arrivals)
         silence = max((b - a for a, b in pairwise(stamps)), default=0)
@@ -283,7 +276,7 @@ def test_hushed_sites_are_asked_thrice_a_second() -> None:
 @pytest.mark.parametrize("how", ["lost", "garbage", "wrong boot"])
 def test_unanswering_sites_are_asked_ever_less(how: str) -> None:
     run = Run(Way(lost=set(range(30, 60))))
-    run.site.replies = lambda payload: lie(how, payload)
+    run.site.replies = lambda payload: make_false_answer(how, payload)
     run.live(2100 * MS)
     run.desk.rounds(150, run.site, step_ns=100 * MS)
     assert len(run.site.asked) <= 5 + 15 * S // ANSWER_NS[1]
@@ -296,7 +289,7 @@ def test_unanswering_sites_are_asked_ever_less(how: str) -> None:
 
 def test_sites_answering_in_vain_are_left_alone() -> None:
     run = Run(Way(lost=set(range(30, 60))))
-    run.site.replies = lambda payload: lie("undecodable", payload)
+    run.site.replies = lambda payload: make_false_answer("undecodable", payload)
     run.live(20 * S)
     assert len(run.site.asked) <= 3 * MAX_VAIN_REQUESTS + 3
     assert "missing for good" in run.until_stored().text
@@ -321,7 +314,7 @@ def test_late_messages_are_stored_after_giving_up() -> None:
     assert "missing 0" in log.account("m")
 
 
-def vanish(run: Run) -> None:
+def remove_site(run: Run) -> None:
     for name in ("m", "s"):
         run.desk.recording.note_presence(
             topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False
@@ -331,7 +324,7 @@ def vanish(run: Run) -> None:
 def test_departed_sites_are_not_asked() -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.live(25 * MS)
-    vanish(run)
+    remove_site(run)
     assert not run.desk.over()
     run.desk.rounds(90, run.site, step_ns=100 * MS)
     assert run.site.asked == []
@@ -341,7 +334,7 @@ def test_departed_sites_are_not_asked() -> None:
 def test_tokens_do_not_end_a_sending_site() -> None:
     """A reconnection may report the departure and the return of a token in the wrong order."""
     run = Run(Way(lost=set(range(30, 60))))
-    vanish(run)
+    remove_site(run)
     run.live(2100 * MS)
     run.until_stored()
     assert run.site.asked
@@ -349,9 +342,9 @@ def test_tokens_do_not_end_a_sending_site() -> None:
 
 
 def test_sites_dying_after_a_return_end_recording() -> None:
-    """Their token had disappeared before, and will not be reported again."""
+    """The token of such a site disappeared before, and its absence is not reported again."""
     run = Run(Way(lost=set(range(30, 60))))
-    vanish(run)
+    remove_site(run)
     run.live(25 * MS)
     run.desk.rounds(5, run.site, step_ns=40 * MS)
     run.desk.take("m", "state", MADE["state"][25])

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 
 from recorder.record_process import Recorder
+from tests.recorder.desk import encode_end, encode_event, encode_states, encode_statistics
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION as REAL
-from tests.sites.sessions import Session, in_log, in_virtual_time
+from tests.sites.sessions import Session, execute_packed, pack_log
 from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
@@ -16,19 +17,27 @@ from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.scenario import load_scenario
 
-from .desk import BOOTS, SESSION, TICKS, Desk, Memory, S, end, happening, states, statistics
+from .desk import BOOTS, SESSION, TICKS, Desk, Memory, S
 
 
-def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
+def late_desk(*names: str) -> tuple[Desk, dict[str, Memory]]:
     """Returns a recorder that comes 40 s late into a session in which these sites remain."""
     desk = Desk()
-    sites = {name: Memory(desk.network, name) for name in there}
+    sites = {name: Memory(desk.network, name) for name in names}
     for name, site in sites.items():
-        events = [happening(name, 0, "ready", t_ns=-1), happening(name, 1), end(name, n=2)]
-        site.made = {"state": states(name), "link": [statistics(name)], "event": events}
+        events = [
+            encode_event(name, 0, "ready", t_ns=-1),
+            encode_event(name, 1),
+            encode_end(name, n=2),
+        ]
+        site.made = {
+            "state": encode_states(name),
+            "link": [encode_statistics(name)],
+            "event": events,
+        }
     desk.wait(40 * S)
     desk.recording.assume_gone()
-    for name in there:
+    for name in names:
         desk.recording.note_presence(
             topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True
         )
@@ -120,7 +129,7 @@ def test_recorders_take_over_from_ended_ones(tmp_path: Path, ahead_ns: int) -> N
     session.play()
     assert session.relay.results["second"] is None
     log = open_log(later)
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     assert verify(log).whole_run
     (late_event,) = [event for event in log.events if event.kind == "late"]
     assert 0 < late_event.t_ns < 3 * S

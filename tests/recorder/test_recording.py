@@ -12,6 +12,8 @@ from recorder.record_process import FLUSH_NS, POLL_NS, Recorder
 from recorder.session_recording import LAST_NS, RECONNECT_NS, SETTLE_NS
 from recorder.site_reception import AWAY_NS, EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
+from tests.net.waiting import sleep_for_ns
+from tests.recorder.desk import encode_end, encode_event, encode_states, encode_statistics
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.core.step.site_step import Site
@@ -37,10 +39,6 @@ from .desk import (
     Desk,
     Memory,
     answer_info,
-    end,
-    happening,
-    states,
-    statistics,
 )
 
 
@@ -53,13 +51,23 @@ def after_the_end() -> bytes:
 
 OTHERS_WORD = encode(Event(member=topics.RECORDER, boot=99, n=0, kind="stored", text=""))
 REFUSED = {
-    "another start of the site": ("stranger", "m", topics.STATE, states("m", boot=99)[3]),
-    "another site's record": ("stranger", "m", topics.STATE, states("s")[3]),
-    "an unknown site": ("stranger", "nobody", topics.STATE, states("m")[3]),
-    "an unknown member's event": ("stranger", "nobody", topics.EVENT, end("m")),
-    "an end of another start": ("stranger", "m", topics.EVENT, end("m", boot=99)),
-    "an end in the recorder's name": ("stranger", topics.RECORDER, topics.EVENT, end("m")),
-    "another site's statistics": ("stranger", "m", topics.LINK, statistics("s")),
+    "another start of the site": (
+        "stranger",
+        "m",
+        topics.STATE,
+        encode_states("m", boot=99)[3],
+    ),
+    "another site's record": ("stranger", "m", topics.STATE, encode_states("s")[3]),
+    "an unknown site": ("stranger", "nobody", topics.STATE, encode_states("m")[3]),
+    "an unknown member's event": ("stranger", "nobody", topics.EVENT, encode_end("m")),
+    "an end of another start": ("stranger", "m", topics.EVENT, encode_end("m", boot=99)),
+    "an end in the recorder's name": (
+        "stranger",
+        topics.RECORDER,
+        topics.EVENT,
+        encode_end("m"),
+    ),
+    "another site's statistics": ("stranger", "m", topics.LINK, encode_statistics("s")),
     "a word of another recorder": (
         "another recorder",
         topics.RECORDER,
@@ -67,9 +75,9 @@ REFUSED = {
         OTHERS_WORD,
     ),
     "a record after the end": ("out of range", "m", topics.STATE, after_the_end()),
-    "statistics after the end": ("out of range", "m", topics.LINK, statistics("m", 100)),
-    "an end after the end": ("out of range", "m", topics.EVENT, end("m", TICKS + 1)),
-    "an end before the beginning": ("out of range", "m", topics.EVENT, end("m", -1)),
+    "statistics after the end": ("out of range", "m", topics.LINK, encode_statistics("m", 100)),
+    "an end after the end": ("out of range", "m", topics.EVENT, encode_end("m", TICKS + 1)),
+    "an end before the beginning": ("out of range", "m", topics.EVENT, encode_end("m", -1)),
     "nothing": ("malformed", "m", topics.STATE, b""),
     "no message": ("malformed", "m", topics.LINK, b"\xc1"),
     "no fields": ("malformed", "m", topics.EVENT, b"\x80"),
@@ -98,7 +106,7 @@ def test_foreign_messages_are_dropped_and_others_kept(
     assert verify(log).identical == 2 * TICKS
     assert (log.complete, log.driver, log.session["session"]) == (True, "live", SESSION)
     assert log.accounts[f"dropped: {reason}"] == "1"
-    assert [message.data for message in written] == states("m")
+    assert [message.data for message in written] == encode_states("m")
     assert [message.publish_time - UNIX_NS for message in written] == [
         MS * k for k in range(TICKS)
     ]
@@ -107,7 +115,7 @@ def test_foreign_messages_are_dropped_and_others_kept(
 LONG = load_scenario("two_sites", {"duration_s": 60.0})
 
 
-def ahead(tick: int) -> bytes:
+def encode_early_state(tick: int) -> bytes:
     site = Site(LONG.setup("m"))
     return encode_state(
         "m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=tick), [], 0, 0
@@ -117,12 +125,12 @@ def ahead(tick: int) -> bytes:
 @pytest.mark.parametrize(
     ("reason", "channel", "payload"),
     [
-        ("m is ahead of the clock", topics.STATE, ahead(50_000)),
-        ("m is ahead of the clock", topics.STATE, ahead(2_100)),
-        ("m is ahead of the clock", topics.LINK, statistics("m", 50_000, LONG)),
-        ("m is ahead of the clock", topics.EVENT, end("m", 50_000)),
-        ("m is ahead of the clock", topics.EVENT, happening("m", -1, "join", ticks=50_000)),
-        ("out of range", topics.EVENT, happening("m", 100_000)),
+        ("m is ahead of the clock", topics.STATE, encode_early_state(50_000)),
+        ("m is ahead of the clock", topics.STATE, encode_early_state(2_100)),
+        ("m is ahead of the clock", topics.LINK, encode_statistics("m", 50_000, LONG)),
+        ("m is ahead of the clock", topics.EVENT, encode_end("m", 50_000)),
+        ("m is ahead of the clock", topics.EVENT, encode_event("m", -1, "join", ticks=50_000)),
+        ("out of range", topics.EVENT, encode_event("m", 100_000)),
     ],
     ids=[
         "a record",
@@ -136,13 +144,13 @@ def ahead(tick: int) -> bytes:
 def test_claims_beyond_the_clock_are_refused(reason: str, channel: str, payload: bytes) -> None:
     """The member has valid keys and claims 50 s of records after some milliseconds."""
     desk = Desk(LONG)
-    records = states("m")
+    records = encode_states("m")
     desk.take("m", topics.STATE, *records[:10])
     desk.take("m", channel, payload)
     assert desk.recording.dropped == {reason: 1}
     desk.take("m", topics.STATE, *records[10:])
-    desk.take("m", topics.LINK, statistics("m"))
-    desk.take("m", topics.EVENT, end("m", n=0))
+    desk.take("m", topics.LINK, encode_statistics("m"))
+    desk.take("m", topics.EVENT, encode_end("m", n=0))
     account = desk.recording.accounts[topics.key(SESSION, "m", topics.STATE)]
     assert (account.expected, account.received, account.missing) == (TICKS, TICKS, 0)
     desk.whole("s")
@@ -156,7 +164,7 @@ def test_answers_beyond_the_clock_are_refused() -> None:
     desk = Desk(LONG)
     memory = Memory(desk.network, "m")
     memory.made["state"] = [b""] * 50_000
-    desk.take("m", topics.STATE, states("m")[0], states("m")[2])
+    desk.take("m", topics.STATE, encode_states("m")[0], encode_states("m")[2])
     desk.rounds(60, memory)
     assert memory.asked
     account = desk.recording.accounts[topics.key(SESSION, "m", topics.STATE)]
@@ -167,7 +175,7 @@ def test_clocks_may_differ_within_tolerance() -> None:
     """Two seconds, and a thousandth of the time."""
     desk = Desk(LONG)
     desk.wait(40 * 1_000_000_000)
-    desk.take("m", topics.STATE, ahead(42_000))
+    desk.take("m", topics.STATE, encode_early_state(42_000))
     assert desk.recording.dropped == {}
 
 
@@ -175,7 +183,11 @@ def test_clocks_may_differ_within_tolerance() -> None:
 @pytest.mark.parametrize("kind", ["state", "link", "event"])
 def test_no_time_stamp_ends_the_recording(kind: str, t_ns: int) -> None:
     desk = Desk()
-    message = {"state": states("m")[0], "link": statistics("m"), "event": end("m")}[kind]
+    message = {
+        "state": encode_states("m")[0],
+        "link": encode_statistics("m"),
+        "event": encode_end("m"),
+    }[kind]
     fields = msgpack.unpackb(message)
     desk.take("m", kind, msgpack.packb({**fields, "t_ns": t_ns}))
     desk.whole("s")
@@ -184,10 +196,10 @@ def test_no_time_stamp_ends_the_recording(kind: str, t_ns: int) -> None:
 
 def test_gaps_are_counted_and_named_problems() -> None:
     desk = Desk()
-    records = states("m")
+    records = encode_states("m")
     desk.take("m", topics.STATE, *records[:10], *records[13:30], *records[31:-2])
-    desk.take("m", topics.LINK, statistics("m"))
-    desk.take("m", topics.EVENT, end("m"))
+    desk.take("m", topics.LINK, encode_statistics("m"))
+    desk.take("m", topics.EVENT, encode_end("m"))
     desk.whole("s")
     log = desk.log()
     assert (
@@ -207,7 +219,7 @@ def test_overflow_is_counted_in_file_and_summary(
 ) -> None:
     monkeypatch.setattr(tap_module, "CAPACITY", 20)
     desk = Desk()
-    for payload in states("m"):
+    for payload in encode_states("m"):
         desk.tap.receive(topics.key(SESSION, "m", topics.STATE), payload)
     log = desk.log()
     assert len(log["m"]) == 20
@@ -221,10 +233,10 @@ def test_overflow_is_counted_in_file_and_summary(
 def test_floods_of_events_leave_usable_logs() -> None:
     """Highly compressible messages must not take the reader's memory, nor the room of the end."""
     desk = Desk()
-    desk.take("m", topics.STATE, *states("m"))
-    desk.take("m", topics.LINK, statistics("m"))
-    desk.take("m", topics.EVENT, *(happening("m", n, text="x" * 60_000) for n in range(300)))
-    desk.take("m", topics.EVENT, end("m", n=300))
+    desk.take("m", topics.STATE, *encode_states("m"))
+    desk.take("m", topics.LINK, encode_statistics("m"))
+    desk.take("m", topics.EVENT, *(encode_event("m", n, text="x" * 60_000) for n in range(300)))
+    desk.take("m", topics.EVENT, encode_end("m", n=300))
     desk.whole("s")
     written = EVENT_BYTES // 60_000
     assert desk.recording.dropped["flood of events"] >= 299 - written
@@ -237,14 +249,14 @@ def test_floods_of_events_leave_usable_logs() -> None:
 
 def test_stored_means_every_record_is_stored() -> None:
     desk = Desk()
-    records = states("m")
+    records = encode_states("m")
     desk.take("m", topics.STATE, *records[:-1])
-    desk.take("m", topics.EVENT, happening("m", 0), end("m", n=2))
+    desk.take("m", topics.EVENT, encode_event("m", 0), encode_end("m", n=2))
     assert desk.stored() == []
     desk.take("m", topics.STATE, records[-1])
-    desk.take("m", topics.EVENT, happening("m", 1))
+    desk.take("m", topics.EVENT, encode_event("m", 1))
     assert desk.stored() == []
-    desk.take("m", topics.LINK, statistics("m"))
+    desk.take("m", topics.LINK, encode_statistics("m"))
     assert desk.stored() == [("m", TICKS)]
     desk.write()
     assert desk.stored() == []
@@ -253,20 +265,20 @@ def test_stored_means_every_record_is_stored() -> None:
     assert (account.expected, account.received) == (1, 1)
 
 
-def alive(name: str, boot: int | str) -> str:
+def alive_key(name: str, boot: int | str) -> str:
     return topics.key(SESSION, name, topics.ALIVE) + f"/{boot}"
 
 
 def test_dying_sites_end_recording_and_are_named() -> None:
     desk = Desk()
     desk.whole("m")
-    desk.take("s", topics.STATE, *states("s")[:20])
-    desk.recording.note_presence(alive("s", BOOTS["s"]), False)
+    desk.take("s", topics.STATE, *encode_states("s")[:20])
+    desk.recording.note_presence(alive_key("s", BOOTS["s"]), False)
     assert not desk.over()
     # a site stays no longer after its last tick
     desk.clock.sleep_until(MONO_NS + 50_000_000 + LAST_NS)
     assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
+    sleep_for_ns(desk.clock, 1)
     assert desk.over()
     assert desk.recording.describe_problem() == "s disappeared after 20 records"
     assert "s: 20 records, its end is unknown" in desk.recording.render_summary()[1]
@@ -278,41 +290,42 @@ def test_dying_sites_end_recording_and_are_named() -> None:
     ("said_its_end", "patience_ns"), [(True, RECONNECT_NS), (False, AWAY_NS)]
 )
 def test_long_cut_off_sites_are_awaited(said_its_end: bool, patience_ns: int) -> None:
-    """Even if the recorder itself is cut off: then all sites disappear at once."""
+    """Sites are awaited even if the recorder itself is cut off, so that all sites disappear at once."""
     desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))
     if said_its_end:
         for name in ("m", "s"):
-            desk.take(name, topics.EVENT, end(name, 1))
+            desk.take(name, topics.EVENT, encode_end(name, 1))
     for name in ("m", "s", "m"):
-        desk.recording.note_presence(alive(name, BOOTS[name]), False)
+        desk.recording.note_presence(alive_key(name, BOOTS[name]), False)
         assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns)
+    sleep_for_ns(desk.clock, patience_ns)
     assert not desk.over()
-    desk.recording.note_presence(alive("m", BOOTS["m"]), True)
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
+    desk.recording.note_presence(alive_key("m", BOOTS["m"]), True)
+    sleep_for_ns(desk.clock, 1)
     assert not desk.over()
-    desk.recording.note_presence(alive("m", BOOTS["m"]), False)
+    desk.recording.note_presence(alive_key("m", BOOTS["m"]), False)
     assert not desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns + 1)
+    sleep_for_ns(desk.clock, patience_ns + 1)
     assert desk.over()
 
 
 @pytest.mark.parametrize(
-    "key", [alive("s", 99), alive("s", "x"), alive("nobody", 1), "trilat", "", "a/b"]
+    "key",
+    [alive_key("s", 99), alive_key("s", "x"), alive_key("nobody", 1), "trilat", "", "a/b"],
 )
 def test_foreign_tokens_end_nothing(key: str) -> None:
     desk = Desk()
     desk.whole("m")
     desk.recording.note_presence(key, False)
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    sleep_for_ns(desk.clock, 2 * SETTLE_NS)
     desk.over()
-    desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
+    sleep_for_ns(desk.clock, 2 * SETTLE_NS)
     assert not desk.over()
 
 
 def test_a_crash_keeps_flushed_data() -> None:
     desk = Desk()
-    records = states("m")
+    records = encode_states("m")
     desk.take("m", topics.STATE, *records[:30])
     desk.recording.flush()
     desk.take("m", topics.STATE, *records[30:])
@@ -325,7 +338,7 @@ def test_a_crash_keeps_flushed_data() -> None:
 
 def test_waiting_messages_are_written_at_the_end() -> None:
     desk = Desk()
-    for payload in states("m"):
+    for payload in encode_states("m"):
         desk.tap.receive(topics.key(SESSION, "m", topics.STATE), payload)
     desk.tap.receive("nonsense", b"")
     log = desk.log()
@@ -369,7 +382,7 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
 
     def publish(clock: RelayClock) -> None:
         send = network.join().publisher(topics.key(SESSION, "m", topics.STATE))
-        for k, payload in enumerate(states("m")):
+        for k, payload in enumerate(encode_states("m")):
             clock.sleep_until(MONO_NS + k * 5_000_000)
             send(payload)
 
@@ -388,20 +401,22 @@ def test_stopped_recorders_finish_their_file(tmp_path: Path) -> None:
 
 def test_lagging_recorders_catch_up(tmp_path: Path) -> None:
     """The next request follows an answer at once, before the next write to the file."""
-    network, relay = LocalNetwork(), Relay()
+    network = LocalNetwork()
+    relay = Relay()
     ended_ns = MONO_NS + 50 * MS
-    grace_ns, answer_ns = 50 * MS, 2 * POLL_NS
+    grace_ns = 50 * MS
+    answer_ns = 2 * POLL_NS
     stop_ns = ended_ns + grace_ns + TICKS * answer_ns + 2 * FLUSH_NS
     memory = Memory(network, "m", chunk=1)
-    memory.made["state"] = states("m")
-    memory.made["link"] = [statistics("m")]
+    memory.made["state"] = encode_states("m")
+    memory.made["link"] = [encode_statistics("m")]
 
     def publish(clock: RelayClock) -> None:
         send = network.join().publisher(topics.key(SESSION, "m", topics.EVENT))
         clock.sleep_until(ended_ns)
-        send(end("m"))
+        send(encode_end("m"))
         while clock.monotonic_ns() < stop_ns:
-            clock.sleep_until(clock.monotonic_ns() + MS)
+            sleep_for_ns(clock, MS)
             memory.answer()
 
     relay.add(
@@ -419,22 +434,22 @@ def test_scenarios_come_from_members_only(tmp_path: Path) -> None:
 
 
 def test_ending_recorders_wait_for_held_records() -> None:
-    """For a running site only until no record is missing."""
+    """The recorder waits for a running site only until no record is missing."""
     desk = Desk()
     ending_ns = desk.clock.monotonic_ns()
     desk.whole("m")
-    desk.take("s", topics.STATE, *states("s")[:20], *states("s")[25:])
+    desk.take("s", topics.STATE, *encode_states("s")[:20], *encode_states("s")[25:])
     assert not desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
     desk.clock.sleep_until(ending_ns + 2 * SETTLE_NS)
     assert not desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
-    desk.take("s", topics.STATE, *states("s")[20:25])
+    desk.take("s", topics.STATE, *encode_states("s")[20:25])
     assert desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
 
 
 def test_silent_sites_may_still_hold_records() -> None:
     desk = Desk()
     desk.whole("m")
-    desk.take("s", topics.STATE, *states("s")[:20])
+    desk.take("s", topics.STATE, *encode_states("s")[:20])
     ending_ns = desk.clock.monotonic_ns()
     desk.clock.sleep_until(ending_ns + 3 * SETTLE_NS)
     assert not desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())

@@ -1,12 +1,13 @@
 """A recorder's report on its own work: true, once a second, bounded, and in its log."""
 
 from recorder.session_recording import REPORT_EVERY_NS
+from tests.recorder.desk import encode_states
 from trilat_net.net import topics
 from trilat_net.net.messages import RecorderStats
 from trilat_net.net.wire import MAX_BYTES, decode, encode
 from trilat_net.scenario import load_scenario
 
-from .desk import MS, SESSION, Desk, S, states
+from .desk import MS, SESSION, Desk, S
 
 
 def read_reports(desk: Desk) -> list[RecorderStats]:
@@ -15,7 +16,7 @@ def read_reports(desk: Desk) -> list[RecorderStats]:
 
 def test_reports_give_stored_and_missing_records() -> None:
     desk = Desk()
-    records = states("m")
+    records = encode_states("m")
     desk.take("m", topics.STATE, *records[:10], *records[13:30], records[29], records[12])
     desk.take("nobody", topics.STATE, records[0])
     desk.report.note_flush(3 * MS)
@@ -34,7 +35,8 @@ def test_reports_give_stored_and_missing_records() -> None:
     assert (stats.mono_ns, stats.unix_ns) == (desk.clock.monotonic_ns(), desk.clock.unix_ns())
     assert set(stats.expected) == {
         *(f"{site}/{channel}" for site in ("m", "s") for channel in ("state", "link", "event")),
-        *("recorder/event", "recorder/stats"),
+        "recorder/event",
+        "recorder/stats",
     }
     desk.report.publish()
     assert read_reports(desk)[0].flush_max_us == 0

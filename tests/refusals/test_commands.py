@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.log_editing import edited, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes
 from tests.refusals.command_cases import CommandCase
 from tests.refusals.corpus import INPUTS, parametrize_cases
 
@@ -13,12 +13,12 @@ from tests.refusals.corpus import INPUTS, parametrize_cases
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Files that cases copy, by the names that the corpus gives them."""
     folder = tmp_path_factory.mktemp("inputs")
-    log = recorded("paper", {"duration_s": 0.5})
+    log = make_log_bytes("paper", {"duration_s": 0.5})
     contents = {
         "log": log,
-        "log of 4 s": recorded("two_sites", {"duration_s": 4.0, "rate_hz": 100}),
-        "log without records": edited(log, record=lambda _: None),
-        "log of version 99": edited(log, record=lambda record: {**record, "v": 99}),
+        "log of 4 s": make_log_bytes("two_sites", {"duration_s": 4.0, "rate_hz": 100}),
+        "log without records": edit_log_bytes(log, record=lambda _: None),
+        "log of version 99": edit_log_bytes(log, record=lambda record: {**record, "v": 99}),
         "garbage": b"garbage" * 100,
         "zeros": bytes(10_000),
     }

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from tests.log_editing import edited, recorded
+from tests.log.builders import edit_log_bytes, make_log_bytes
 from tests.refusals.corpus import Case, parametrize_cases
 from trilat_net.errors import LogError
 from trilat_net.log.log_reader import Log, open_log
@@ -27,8 +27,8 @@ class LogCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Returns the content of the file."""
         if self.hex is not None:
             return bytes.fromhex(self.hex)
-        return edited(
-            recorded("paper"),
+        return edit_log_bytes(
+            make_log_bytes("paper"),
             record=lambda record: {**record, **self.record} if record["tick"] == 5 else record,
             scenario=lambda text: self.scenario or text,
         )

@@ -1,4 +1,4 @@
-"""Links as an author may write them: every model, with every optional key."""
+"""Strategies for links: every delay model, with every optional key."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ share = st.floats(0.0, 1.0)
 
 
 @st.composite
-def _losses(draw: st.DrawFn) -> dict[str, Any]:
+def _draw_losses(draw: st.DrawFn) -> dict[str, Any]:
     """Draws losses that a chain of two states can have."""
     if draw(st.booleans()):
         return draw(st.fixed_dictionaries({}, optional={"loss": share}))
@@ -24,7 +24,7 @@ def _losses(draw: st.DrawFn) -> dict[str, Any]:
 
 
 @st.composite
-def _besides(draw: st.DrawFn) -> dict[str, Any]:
+def _draw_other_keys(draw: st.DrawFn) -> dict[str, Any]:
     others = st.fixed_dictionaries(
         {},
         optional={
@@ -36,22 +36,22 @@ def _besides(draw: st.DrawFn) -> dict[str, Any]:
             ),
         },
     )
-    return {**draw(_losses()), **draw(others)}
+    return {**draw(_draw_losses()), **draw(others)}
 
 
 @st.composite
-def _spread(draw: st.DrawFn) -> dict[str, Any]:
+def _draw_spread(draw: st.DrawFn) -> dict[str, Any]:
     mean = draw(st.floats(0.5, 900.0))
     return {"delay_ms": mean, "deviation_ms": mean * draw(st.floats(0.01, 2.0))}
 
 
 @st.composite
-def _bounded(draw: st.DrawFn, key: str) -> dict[str, Any]:
+def _draw_bounded(draw: st.DrawFn, key: str) -> dict[str, Any]:
     mean = draw(ms)
     return {"delay_ms": mean, key: mean * draw(share)}
 
 
-def _traces() -> st.SearchStrategy[str]:
+def _draw_traces() -> st.SearchStrategy[str]:
     gaps = st.lists(st.integers(1, 10**6), max_size=5)
     delays = st.integers(0, 10**7).map(str) | st.just("lost")
     return gaps.flatmap(
@@ -65,29 +65,29 @@ _correlation = st.floats(0, 0.99)
 _models: dict[str, st.SearchStrategy[dict[str, Any]]] = {
     "none": st.just({}),
     "constant": st.fixed_dictionaries({"delay_ms": ms | st.integers(0, 900)}),
-    "uniform": _bounded("half_width_ms"),
-    "normal": _spread(),
-    "gamma": _spread(),
-    "lognormal": _spread(),
+    "uniform": _draw_bounded("half_width_ms"),
+    "normal": _draw_spread(),
+    "gamma": _draw_spread(),
+    "lognormal": _draw_spread(),
     "hyperexponential": st.fixed_dictionaries(
         {"floor_ms": ms, "fast_ms": ms, "slow_ms": ms, "slow_share": share}
     ),
-    "ar1": st.tuples(_spread(), _correlation).map(
+    "ar1": st.tuples(_draw_spread(), _correlation).map(
         lambda pair: {**pair[0], "correlation": pair[1]}
     ),
-    "sine": st.tuples(_bounded("amplitude_ms"), st.floats(0.01, 100), st.floats(-7, 7)).map(
-        lambda parts: {**parts[0], "period_s": parts[1], "phase_rad": parts[2]}
-    ),
+    "sine": st.tuples(
+        _draw_bounded("amplitude_ms"), st.floats(0.01, 100), st.floats(-7, 7)
+    ).map(lambda parts: {**parts[0], "period_s": parts[1], "phase_rad": parts[2]}),
     "trace": st.fixed_dictionaries(
-        {"trace": _traces()}, optional={"at_end": st.sampled_from(["hold", "loop"])}
+        {"trace": _draw_traces()}, optional={"at_end": st.sampled_from(["hold", "loop"])}
     ),
     "measured": st.just({}),
 }
 
 
 @st.composite
-def links(draw: st.DrawFn, without: tuple[str, ...] = ()) -> dict[str, Any]:
-    besides = draw(_besides())
+def draw_link(draw: st.DrawFn, without: tuple[str, ...] = ()) -> dict[str, Any]:
+    besides = draw(_draw_other_keys())
     if draw(st.integers(0, 5)) == 0:
         preset = draw(st.sampled_from(sorted(PRESETS)))
         if "loss" not in PRESETS[preset]:

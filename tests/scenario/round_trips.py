@@ -1,4 +1,4 @@
-"""Five round trips that irtt measured, and its file of them (README of clarkzjw/LENS)."""
+"""Five round trips that irtt measured, and the file that irtt wrote (README of clarkzjw/LENS)."""
 
 import gzip
 import json
@@ -20,7 +20,7 @@ def make_round_trip(number: int, lost: str = "false") -> dict[str, Any]:
     return {"seqno": number, "lost": lost, "timestamps": times, "delay": delay}
 
 
-def irtt(folder: Path, *lost: int, zipped: bool = False) -> Path:
+def write_irtt_file(folder: Path, *lost: int, zipped: bool = False) -> Path:
     trips = [make_round_trip(n, "true_up" if n in lost else "false") for n in range(5)]
     text = json.dumps({"stats": {}, "round_trips": trips}).encode()
     path = folder / ("run.json.gz" if zipped else "run.json")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import trilat_net
 from tests.core.chain_references import chain_references
-from tests.scenario.chains import SIX, six
+from tests.scenario.builders import SIX_JOINTS, make_six_joint_scenario
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
@@ -54,7 +54,7 @@ def two_joints(**master: Any) -> dict[str, Any]:
 
 def refusal(changes: Overrides) -> ScenarioError:
     with pytest.raises(ScenarioError) as caught:
-        six(**changes)
+        make_six_joint_scenario(**changes)
     return caught.value
 
 
@@ -82,26 +82,32 @@ def test_shipped_arms_have_their_makers_data() -> None:
 
 
 def test_links_of_meshes_alone_are_refused() -> None:
-    start, end = ARM6.index("<inertial>"), ARM6.index("</inertial>") + len("</inertial>")
+    start = ARM6.index("<inertial>")
+    end = ARM6.index("</inertial>") + len("</inertial>")
     mesh = '<visual><geometry><mesh filename="shoulder.dae"/></geometry></visual>'
     error = refusal({"urdf": {"arm6.urdf": ARM6[:start] + mesh + ARM6[end:]}})
     assert "link 'shoulder'" in error.problem
     assert "has no <inertial>" in error.problem
-    whole = six(urdf={"arm6.urdf": ARM6.replace("<inertial>", f"{mesh}<inertial>", 1)})
+    whole = make_six_joint_scenario(
+        urdf={"arm6.urdf": ARM6.replace("<inertial>", f"{mesh}<inertial>", 1)}
+    )
     # and no file is opened
-    assert whole.arms["m1"].theta.tolist() == six().arms["m1"].theta.tolist()
+    assert (
+        whole.arms["m1"].theta.tolist() == make_six_joint_scenario().arms["m1"].theta.tolist()
+    )
 
 
 @pytest.mark.parametrize(("scheme", "most"), [("second_order", 1.0), ("digital", 2.0)])
 def test_excessive_damping_of_a_joint_is_named(scheme: str, most: float) -> None:
     """The largest eigenvalue of h D M^-1 by NumPy, from Pinocchio's M of a stored pose."""
     chain, states = chain_references()["arm6"]
-    pose, armature = states[0].q, np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+    pose = states[0].q
+    armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     least = np.linalg.eigvalsh(states[0].inertia + np.diag(armature))[0]
     critical = float(most * 1000.0 * least)
     poses = {f"sites.{name}.q0_rad": pose.tolist() for name in ("m1", "m2", "s")}
     base = {**poses, "arm.stops": False, "scheme": scheme, "control.Kd": 0.0}
-    six(**base, **{"control.Kp": 0.999 * critical})
+    make_six_joint_scenario(**base, **{"control.Kp": 0.999 * critical})
     error = refusal({**base, "control.Kp": 1.001 * critical})
     assert error.path == "sites.m1.control"
     assert "damps joint wrist_3" in error.problem
@@ -112,9 +118,11 @@ def test_excessive_damping_of_a_joint_is_named(scheme: str, most: float) -> None
 
 
 def test_one_number_applies_to_every_joint() -> None:
-    same = six(**{"arm.armature_kg_m2": 0.1, "limits.tau_limit_nm": 50.0})
+    same = make_six_joint_scenario(**{"arm.armature_kg_m2": 0.1, "limits.tau_limit_nm": 50.0})
     assert same.sites["s"].arm.armature_kg_m2 == (0.1,) * 6
-    drawn = six(**{"arm.armature_kg_m2": UNIFORM, "arm.payload_kg": UNIFORM})
+    drawn = make_six_joint_scenario(
+        **{"arm.armature_kg_m2": UNIFORM, "arm.payload_kg": UNIFORM}
+    )
     inertias = {*drawn.sites["m1"].arm.armature_kg_m2, *drawn.sites["s"].arm.armature_kg_m2}
     assert len(inertias) == 12
     assert all(0.1 <= inertia <= 0.2 for inertia in inertias)
@@ -127,7 +135,9 @@ def test_one_number_applies_to_every_joint() -> None:
 
 def test_drawn_start_poses_move_tip_operators() -> None:
     start = [0.3, {"uniform": [-1.2, -0.8]}, 1.2, -0.6, 0.5, 0.2]
-    drawn = six(**{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]})
+    drawn = make_six_joint_scenario(
+        **{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]}
+    )
     again = reseed_scenario(drawn, 2)
     for scenario_drawn in (drawn, again):
         spec = scenario_drawn.sites["m1"]
@@ -136,21 +146,23 @@ def test_drawn_start_poses_move_tip_operators() -> None:
 
 
 def test_limits_come_from_file_or_author() -> None:
-    limits = six().sites["s"].limits
+    limits = make_six_joint_scenario().sites["s"].limits
     assert limits.tau_limit_nm == (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
     assert limits.qd_limit_rad_s == (math.pi,) * 6
-    changed = six(**{"limits.qd_limit_rad_s": 5.0}).sites["s"].limits
+    changed = make_six_joint_scenario(**{"limits.qd_limit_rad_s": 5.0}).sites["s"].limits
     assert (changed.tau_limit_nm, changed.qd_limit_rad_s) == (limits.tau_limit_nm, 5.0)
 
 
 def test_start_beyond_limits_needs_no_stops() -> None:
-    six(**{"sites.s.arm.stops": False, "sites.s.q0_rad": [7.0, 0, 0, 0, 0, 0]})
+    make_six_joint_scenario(
+        **{"sites.s.arm.stops": False, "sites.s.q0_rad": [7.0, 0, 0, 0, 0, 0]}
+    )
 
 
 def test_arms_may_start_slightly_beyond_stops() -> None:
     """No spring pushes at the start pose, the stop of other sites stays, and larger excess is refused."""
     start = [6.34, -0.3, 0.5, 0.0, 0.0, 0.0]
-    scenario = six(**{"sites.s.q0_rad": start})
+    scenario = make_six_joint_scenario(**{"sites.s.q0_rad": start})
     m1, s = (scenario.arms[name].chain.joints[0] for name in ("m1", "s"))
     assert (m1.upper, s.upper) == (2.0 * math.pi, 6.34)
     assert m1.lower == s.lower == -2.0 * math.pi
@@ -193,8 +205,12 @@ def test_position_limits_yield_to_nearby_starts() -> None:
 
 def test_gravity_along_an_axis_is_a_direction() -> None:
     """down = -z at 9.81 is the default; its length does not matter, its bits do not depend on a library."""
-    assert six(**{"arm.down": [0, 0, -3.0]}).arms["s"].chain.gravity_m_s2 == (0.0, 0.0, -9.81)
-    x, y, z = six(**{"arm.down": [1.0, 2.0, -2.0]}).arms["s"].chain.gravity_m_s2
+    assert make_six_joint_scenario(**{"arm.down": [0, 0, -3.0]}).arms[
+        "s"
+    ].chain.gravity_m_s2 == (0.0, 0.0, -9.81)
+    x, y, z = (
+        make_six_joint_scenario(**{"arm.down": [1.0, 2.0, -2.0]}).arms["s"].chain.gravity_m_s2
+    )
     assert (x, y, z) == pytest.approx((3.27, 6.54, -6.54), rel=1e-15)
 
 
@@ -205,7 +221,7 @@ def test_a_sites_own_file_replaces_groups() -> None:
         "control": {"Kp": 0.01, "Kd": 0.0},
     }
     start = [0, 0, 0, -1.5, 0, 1.5]
-    tables = six(
+    tables = make_six_joint_scenario(
         **{f"sites.s.{key}": value for key, value in own_keys.items()},
         **{"sites.s.q0_rad": start},
     )
@@ -220,37 +236,42 @@ def test_a_sites_own_file_replaces_groups() -> None:
 
 def test_overrides_reach_every_arm_or_one() -> None:
     heavy = load_scenario(
-        six(), ["arm.payload_kg=1", "sites.s.arm.payload_kg=2", "control.Kp=[9,9,9,1,1,1]"]
+        make_six_joint_scenario(),
+        ["arm.payload_kg=1", "sites.s.arm.payload_kg=2", "control.Kp=[9,9,9,1,1,1]"],
     )
     assert [spec.arm.payload_kg for spec in heavy.sites.values()] == [1.0, 1.0, 2.0]
     assert heavy.sites["s"].control.Kp == (9.0, 9.0, 9.0, 1.0, 1.0, 1.0)
     wrist = load_scenario(
-        six(), {"sites.s.arm.tip": "wrist_3_link", "sites.s.arm.payload_kg": 0.5}
+        make_six_joint_scenario(),
+        {"sites.s.arm.tip": "wrist_3_link", "sites.s.arm.payload_kg": 0.5},
     )
-    assert wrist.arms["s"].theta[50] == six().arms["s"].theta[50] + 0.5
+    assert wrist.arms["s"].theta[50] == make_six_joint_scenario().arms["s"].theta[50] + 0.5
 
 
 # Texts
 
 
 def test_embedded_texts_are_whole_without_files() -> None:
-    scenario = six()
+    scenario = make_six_joint_scenario()
     assert parse_embedded(scenario.text) == scenario
     with pytest.raises(ScenarioError, match=r"arm.urdf: no file may be named here"):
-        parse_embedded(SIX)
+        parse_embedded(SIX_JOINTS)
     long = {"urdf": {"arm6.urdf": ARM6 + " " * MAX_CHARACTERS}}
     with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} can be read"):
-        six(**long)
+        make_six_joint_scenario(**long)
 
 
 def test_unnamed_texts_are_left_out() -> None:
-    assert six(urdf={"arm6.urdf": ARM6, "other.urdf": "x"}) == six()
+    assert (
+        make_six_joint_scenario(urdf={"arm6.urdf": ARM6, "other.urdf": "x"})
+        == make_six_joint_scenario()
+    )
 
 
 def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
     (tmp_path / "mine.urdf").write_text(ARM6.replace("\n", "\r\n"), newline="")
     file = tmp_path / "six.toml"
-    file.write_text(SIX.replace("arm6.urdf", "mine.urdf"))
+    file.write_text(SIX_JOINTS.replace("arm6.urdf", "mine.urdf"))
     assert load_scenario(file).urdf == {"mine.urdf": ARM6}
     (tmp_path / "mine.urdf").write_bytes(b"\xff")
     with pytest.raises(ScenarioError, match=r"mine.urdf cannot be read: not UTF-8"):
@@ -298,19 +319,20 @@ def test_the_canonical_text_loads_to_the_same_scenario(
     if not changed.get("arm.payload_kg"):
         changed.pop("arm.payload_com_m", None)  # what has no mass has no centre
     urdf = {"arm6.urdf": ARM6.replace("</robot>", f"<!--{comment}--></robot>")}
-    scenario = six(urdf=urdf, **changed)
+    scenario = make_six_joint_scenario(urdf=urdf, **changed)
     again = parse_embedded(scenario.text)
     assert again == scenario
     assert (again.text, again.sha256) == (scenario.text, scenario.sha256)
     for name in scenario.names:
-        one, other = scenario.setup(name), again.setup(name)
-        assert one.theta.tolist() == other.theta.tolist()
-        assert (one.chain, one.gains, one.q0) == (other.chain, other.gains, other.q0)
+        setup = scenario.setup(name)
+        other = again.setup(name)
+        assert setup.theta.tolist() == other.theta.tolist()
+        assert (setup.chain, setup.gains, setup.q0) == (other.chain, other.gains, other.q0)
 
 
 def test_tip_and_inertia_equal_the_references() -> None:
     """Pinocchio's, stored; the drives' inertia is added."""
-    model = six().arms["m1"]
+    model = make_six_joint_scenario().arms["m1"]
     _, states = chain_references()["arm6"]
     for state in states:
         assert model.end_effector(state.q) == pytest.approx(state.tip_position, abs=1e-13)
@@ -322,7 +344,7 @@ def test_planar_arms_equal_their_chain() -> None:
     """End effector of the chain of two joints against the cosines of the planar one."""
     two = read_urdf(ARM7, base="link2", tip="link4")
     assert len(two.joints) == 2
-    mixed = six(
+    mixed = make_six_joint_scenario(
         control={},
         **{f"sites.{name}.arm": {"urdf": ""} for name in ("m1", "m2")},
         **{
@@ -346,7 +368,7 @@ def test_planar_arms_equal_their_chain() -> None:
 
 REACHES = {
     "planar": load_scenario("play", {"arm.l2_m": 0.6}).arms["m1"],
-    "six joints": six(**{"arm.base_xyz_m": [0.3, -0.2, 0.1]}).arms["s"],
+    "six joints": make_six_joint_scenario(**{"arm.base_xyz_m": [0.3, -0.2, 0.1]}).arms["s"],
     "seven joints": load_scenario("seven_joints").arms["s"],
     "sliding": load_scenario(
         "six_joints",
@@ -382,7 +404,7 @@ def test_the_reach_of_two_links_is_exact() -> None:
 
 
 def test_joint_hands_stay_between_stops_and_limits() -> None:
-    arm = six().arms["s"]
+    arm = make_six_joint_scenario().arms["s"]
     reach = arm.find_joint_reach(MotionLimits(q_min=(-1.0,), q_max=(7.0,)))
     assert reach.find_nearest([9.0] * 6) == (2.0 * math.pi,) * 6
     assert reach.find_nearest([-9.0] * 6) == (-1.0,) * 6

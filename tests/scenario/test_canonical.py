@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.scenario.links import links
+from tests.scenario.links import draw_link
 from trilat_net.scenario import list_shipped, load_scenario, parse_scenario
 from trilat_net.scenario.scenario_reader import read_shipped
 
@@ -34,24 +34,24 @@ stale = st.fixed_dictionaries(
 
 
 @st.composite
-def rows(draw: st.DrawFn, site: str) -> dict[str, float]:
+def draw_row(draw: st.DrawFn, site: str) -> dict[str, float]:
     share = draw(st.floats(0, 1))
-    one, other = (name for name in NAMES if name != site)
-    return {one: share, other: 1 - share}
+    first, other = (name for name in NAMES if name != site)
+    return {first: share, other: 1 - share}
 
 
 @st.composite
-def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
+def draw_changes(draw: st.DrawFn) -> list[dict[str, Any]]:
     times = sorted(draw(st.lists(st.floats(0, 100) | st.integers(0, 100), max_size=4)))
     changes_made = []
     for at_s in times:
         if draw(st.booleans()):
-            to = draw(links(without=("trace",)))
+            to = draw(draw_link(without=("trace",)))
             to.pop("outages_s", None)
             changes_made.append({"at_s": at_s, "link": draw(st.sampled_from(EVERY)), "to": to})
         else:
             site = draw(st.sampled_from(NAMES))
-            changes_made.append({"at_s": at_s, "dominance": site, "to": draw(rows(site))})
+            changes_made.append({"at_s": at_s, "dominance": site, "to": draw(draw_row(site))})
             changes_made[-1] |= draw(
                 st.fixed_dictionaries({}, optional={"ramp_s": st.floats(0, 10)})
             )
@@ -61,15 +61,15 @@ def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
 overrides = st.fixed_dictionaries(
     {},
     optional={
-        "link": links(),
-        "sites.m1.view": links(without=("measured",)),
-        "links": st.dictionaries(st.sampled_from(EVERY), links(), max_size=3),
+        "link": draw_link(),
+        "sites.m1.view": draw_link(without=("measured",)),
+        "links": st.dictionaries(st.sampled_from(EVERY), draw_link(), max_size=3),
         "control": laws,
         "sites.s.control": laws,
         "on_stale": stale,
         "sites.m2.on_stale": stale,
-        "dominance.m1": rows("m1"),
-        "timeline": changes(),
+        "dominance.m1": draw_row("m1"),
+        "timeline": draw_changes(),
         "seed": st.integers(0, 2**63 - 1),
         "expect": st.fixed_dictionaries({}, optional={"stable": st.booleans()}),
         "title": texts,
@@ -94,10 +94,11 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
     assert (again.sha256, list(again.sites)) == (scenario.sha256, list(scenario.sites))
     assert msgspec.to_builtins(again.timeline) == msgspec.to_builtins(scenario.timeline)
     for name in scenario.names:
-        one, other = scenario.setup(name), again.setup(name)
-        assert [link.models for link in one.links] == [link.models for link in other.links]
-        assert [link.key for link in one.links] == [link.key for link in other.links]
-        assert (one.ramps, one.on_stale, one.gains) == (
+        setup = scenario.setup(name)
+        other = again.setup(name)
+        assert [link.models for link in setup.links] == [link.models for link in other.links]
+        assert [link.key for link in setup.links] == [link.key for link in other.links]
+        assert (setup.ramps, setup.on_stale, setup.gains) == (
             other.ramps,
             other.on_stale,
             other.gains,
@@ -106,7 +107,7 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
 
 @pytest.mark.parametrize("name", list_shipped())
 def test_unrequested_features_are_not_in_the_text(name: str) -> None:
-    """So the hash of an experiment does not change when another feature comes."""
+    """The hash of an experiment does not change when the program gains a feature."""
     text = load_scenario("paper", {"expect": {}}).text
     assert not any(
         word in text for word in ("on_stale", "timeline", "expect", "loss", "playout")

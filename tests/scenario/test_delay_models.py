@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.core.channels import Ints, channel, due
-from tests.scenario.links import links
+from tests.core.builders import Ints, compute_due_ns, make_channel
+from tests.scenario.links import draw_link
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import MAX_DELAY_US, DelayKind
 from trilat_net.errors import ScenarioError
@@ -17,14 +17,14 @@ from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase
 
 
-def link(keys: dict[str, Any]) -> LinkBase:
+def load_link(keys: dict[str, Any]) -> LinkBase:
     loaded: LinkBase = load_scenario("paper", {"link": keys}).links["m1->s"]
     return loaded
 
 
-@given(keys=links())
+@given(keys=draw_link())
 def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
-    loaded = link(keys)
+    loaded = load_link(keys)
     mean_ms, deviation_ms = loaded.moments()
     if not loaded.measured and not math.isnan(mean_ms):
         assert 0.0 <= mean_ms <= MAX_DELAY_US / 1000
@@ -32,15 +32,15 @@ def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
     assert loaded.describe()
     points = loaded.points
     model = loaded.to_core_model()._replace(trace_count=0 if points is None else len(points))
-    fates: Ints = due(channel([model], points=points), 50)
+    fates: Ints = compute_due_ns(make_channel([model], points=points), 50)
     kept = fates[fates != LOST]
     assert (kept >= 0).all()
 
 
-@given(keys=links())
+@given(keys=draw_link())
 def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
-    loaded = link(keys)
+    loaded = load_link(keys)
     model = loaded.to_core_model()
     assert all(
         0.0 <= p <= 1.0 + 1e-12
@@ -64,15 +64,15 @@ def test_links_are_described_in_few_words() -> None:
         "outages_s": [[1, 2.5]],
         "order": "in_order",
     }
-    description = link(
+    description = load_link(
         {"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}
     ).describe()
     assert description == (
         "gamma 40 +- 10 ms, loss 5 % in bursts of 8, duplicates 1 %, cut 1-2.5 s, in order, play-out 80 ms"
     )
-    assert link({"model": "none"}).describe() == "no delay"
-    assert link({"delay_ms": 200}).describe() == "200 ms"
-    assert link({"model": "measured", "loss": 1}).describe() == "measured, loss 100 %"
+    assert load_link({"model": "none"}).describe() == "no delay"
+    assert load_link({"delay_ms": 200}).describe() == "200 ms"
+    assert load_link({"model": "measured", "loss": 1}).describe() == "measured, loss 100 %"
 
 
 def test_a_table_with_a_model_begins_anew() -> None:
@@ -141,8 +141,8 @@ def test_extreme_numbers_are_refused_or_have_moments(
     if model_of_link.find_problem() is None:
         assert all(math.isfinite(number) and number >= 0 for number in model_of_link.moments())
         assert model_of_link.to_core_model().kind in set(DelayKind)
-        assert due(channel([model_of_link.to_core_model()]), 3).min() >= 0
+        assert compute_due_ns(make_channel([model_of_link.to_core_model()]), 3).min() >= 0
 
 
 def test_traces_may_reach_the_limit() -> None:
-    assert link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None
+    assert load_link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None

@@ -87,14 +87,16 @@ def test_overlong_traces_are_refused() -> None:
 # In a scenario.
 
 
-def scenario(folder: Path, link: str) -> Any:
+def make_trace_scenario(folder: Path, link: str) -> Any:
     text = read_shipped("paper").replace("[link]\ndelay_ms = 200.0", link)
     return parse_scenario(text, "mine", folder=folder)
 
 
 def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n0.001,lost\n0.0025,0\n", encoding="utf-8")
-    loaded = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
+    loaded = make_trace_scenario(
+        tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"'
+    )
     assert {link.trace for link in loaded.links.values()} == {TEXT}
     assert "delays.csv" not in loaded.text
     assert parse_scenario(loaded.text) == loaded
@@ -114,15 +116,15 @@ def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
 def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
     file = 'file = "delays.csv"'
-    loaded = scenario(
+    loaded = make_trace_scenario(
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"'
     )
     assert (loaded.links["m1->s"].trace, loaded.links["m2->s"].trace) == ("0 7", "0 41200")
-    loaded = scenario(
+    loaded = make_trace_scenario(
         tmp_path, f'[link]\nmodel = "trace"\ntrace = "0 7"\n[links."m1->s"]\n{file}'
     )
     assert (loaded.links["m1->s"].trace, loaded.links["m2->s"].trace) == ("0 41200", "0 7")
-    loaded = scenario(
+    loaded = make_trace_scenario(
         tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"'
     )
     assert (loaded.links["m1->s"].at_end, loaded.links["m2->s"].at_end) == ("loop", "hold")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.scenario.chains import six
-from tests.unit_arm import unit_scenario
+from tests.scenario.builders import make_six_joint_scenario
+from tests.unit_arm import make_unit_scenario
 from trilat_net.app.cli.options import list_laws
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
@@ -76,7 +76,7 @@ def test_chains_are_described_by_joint() -> None:
         .read_text()
         .replace('effort="28" velocity', "velocity", 1)
     )
-    text = "\n".join(describe_scenario(six(urdf={"arm6.urdf": unlimited})))
+    text = "\n".join(describe_scenario(make_six_joint_scenario(urdf={"arm6.urdf": unlimited})))
     first = "  shoulder_pan moves shoulder, 3.7 kg; -6.283 to 6.283 rad; 150 N m; 3.142 rad/s; drive 0.2 kg m^2"
     assert (
         f"arm of m1, m2, s: arm6.urdf, 6 joints from base to flange, 17.05 kg move\n{first}\n"
@@ -126,9 +126,7 @@ def test_sites_that_never_hold_get_no_remark() -> None:
 
 
 def test_check_states_the_time_to_rest() -> None:
-    """For every site under `glide`; and for an arm too fast for its motors, the speed that its
-    joints reach.
-    """
+    """The time stands for every site under `glide`, and the reached speed for an arm too fast for its motors."""
     scenario = load_scenario("free", {"on_stale.action": "glide"})
     bounds = find_rest_bounds(scenario, "s")
     lines = [line for line in describe_scenario(scenario) if line.startswith("arms of")]
@@ -193,7 +191,7 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
 def test_a_check_names_shares_without_effect(
     law: dict[str, object], more: dict[str, object], expected: list[str]
 ) -> None:
-    scenario = unit_scenario(
+    scenario = make_unit_scenario(
         {"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more}
     )
     lines = [
@@ -206,10 +204,10 @@ def test_a_check_names_shares_without_effect(
 
 def test_lines_share_by_site_and_average_b() -> None:
     law = {"law": "wave", "b": [6.0, 3.0]}
-    scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
+    scenario = make_unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
     total = np.zeros(2)
-    for name, one in zip(scenario.names, scenario.controls, strict=True):
-        lines = np.array([one.find_impedances(name, peer) for peer in scenario.peers(name)])
+    for name, control in zip(scenario.names, scenario.controls, strict=True):
+        lines = np.array([control.find_impedances(name, peer) for peer in scenario.peers(name)])
         shares = [scenario.dominance[name][peer] for peer in scenario.peers(name)]
         assert lines / lines.sum(axis=0) == pytest.approx(
             np.array([shares, shares]).T, rel=1e-9
@@ -254,14 +252,14 @@ def test_conditions_need_exact_gravity(law: str, gravity: float) -> None:
 
 
 def test_long_values_end_with_whole_entries() -> None:
-    """Of a hand with many settings the leading ones are shown, and eight digits of a hash."""
+    """A hand with many settings shows the first ones, and eight digits of a hash."""
     hand = {"kind": "own", "class": "my_policy:Reach", "source_sha256": "0123456789abcdef" * 4}
     assert describe_value([hand]) == "[own class my_policy:Reach source_sha256 01234567]"
     settings = {f"setting_{n}": 1.5 for n in range(9)}
-    words = describe_value([{**hand, **settings}]).strip("[]").split()
-    assert words[-1] == "..."
-    assert words[-2] == "1.5"
-    assert len(words) < 12
+    entries = describe_value([{**hand, **settings}]).strip("[]").split()
+    assert entries[-1] == "..."
+    assert entries[-2] == "1.5"
+    assert len(entries) < 12
     numbers = describe_value([n + 0.125 for n in range(40)]).strip("[]").split(", ")
     assert numbers[:-1] == [f"{n + 0.125:g}" for n in range(len(numbers) - 1)]
     assert numbers[-1] == "..."

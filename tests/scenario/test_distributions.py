@@ -34,7 +34,8 @@ def draw_scenario(seed: int) -> Scenario:
 
 def test_each_number_is_drawn_separately() -> None:
     """Joints, sites and seeds differ; the same seed gives the same."""
-    first, other = draw_scenario(1), draw_scenario(2)
+    first = draw_scenario(1)
+    other = draw_scenario(2)
     assert first == draw_scenario(1)
     assert len(set(first.sites["m1"].q0_rad + other.sites["m1"].q0_rad)) == 4
     assert len({spec.arm.m1_kg for spec in (*first.sites.values(), *other.sites.values())}) == 6
@@ -50,7 +51,7 @@ def test_further_drawn_numbers_change_none() -> None:
 
 
 def test_numbers_follow_their_distribution() -> None:
-    """By the statistic of Kolmogorov and Smirnov, at 1e-4: a wrong mean or width of 10 % fails."""
+    """The statistic of Kolmogorov and Smirnov at 1e-4 detects a wrong mean or width of 10 %."""
     from scipy import stats
 
     keys = [f"sites.m1.q0_rad.{n}" for n in range(2000)]
@@ -70,16 +71,16 @@ def test_canonical_text_holds_the_drawn_numbers() -> None:
 
 
 def test_another_seed_draws_again_from_any_source() -> None:
-    """From a scenario, and from the text of a log: hands that hold the start pose too."""
-    for found in (
+    """The source is a scenario or the text of a log, and hands that hold the start pose are drawn too."""
+    for scenario in (
         reseed_scenario(draw_scenario(1), 5),
         reseed_scenario(parse_scenario(draw_scenario(2).text), 5),
     ):
-        assert found == draw_scenario(5)
-        assert found.sha256 == draw_scenario(5).sha256
-    spring, tip, _ = found.sites["m1"].hands
-    assert spring.from_rad == spring.to_rad == found.sites["m1"].q0_rad
-    a, b = found.sites["m1"].q0_rad
+        assert scenario == draw_scenario(5)
+        assert scenario.sha256 == draw_scenario(5).sha256
+    spring, tip, _ = scenario.sites["m1"].hands
+    assert spring.from_rad == spring.to_rad == scenario.sites["m1"].q0_rad
+    a, b = scenario.sites["m1"].q0_rad
     assert tip.from_m == pytest.approx((np.cos(a) + np.cos(a + b), np.sin(a) + np.sin(a + b)))
 
 
@@ -104,7 +105,7 @@ ends = st.tuples(st.floats(0.5, 2.0), st.floats(2.0, 9.0)).map(list)
 def test_changing_seeds_back_restores_the_experiment(
     drawn_there: dict[str, list[float]], seeds: tuple[int, int]
 ) -> None:
-    """For any draw: the text loads to itself, and the first seed again gives the first experiment."""
+    """For any draw the text loads to itself, and the first seed gives the first experiment again."""
     ranges = {
         key: {"uniform": two}
         for key, two in drawn_there.items()

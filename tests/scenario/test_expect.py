@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 
-from tests.scenario.chains import six
+from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Expect, load_scenario, parse_scenario, read_template
 from trilat_net.scenario.expect import ExpectWindow, find_expect_problem, window_quantities
 
 
-def with_expect(**keys: Any) -> Expect:
+def load_expect(**keys: Any) -> Expect:
     return load_scenario("free", {f"expect.{key}": value for key, value in keys.items()}).expect
 
 
@@ -86,23 +86,23 @@ def test_windows_have_quantities_of_all_joints() -> None:
         "q6_rad": [0.0, 1.0],
         "push5_mean_nm": [0.0, 1.0],
     }
-    limits = six(**{"expect.windows": [window]}).expect.windows[0].limits
+    limits = make_six_joint_scenario(**{"expect.windows": [window]}).expect.windows[0].limits
     assert dict(limits) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
     with pytest.raises(
         ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"
     ):
-        six(**{"expect.windows": [window | {"q7_rad": [0.0, 1.0]}]})
+        make_six_joint_scenario(**{"expect.windows": [window | {"q7_rad": [0.0, 1.0]}]})
     with pytest.raises(
         ScenarioError, match=r"windows\[0\].q6_rad: there is no such joint: .* has 2"
     ):
-        with_expect(windows=[window])
+        load_expect(windows=[window])
 
 
 def test_windows_may_name_joints() -> None:
     """A window with names equals one with numbers, so that no other code has to distinguish them."""
 
     def windows(**keys: Any) -> tuple[ExpectWindow, ...]:
-        return six(
+        return make_six_joint_scenario(
             **{"expect.windows": [{"from_s": 0.0, "to_s": 1.0, "site": "m1", **keys}]}
         ).expect.windows
 

@@ -243,7 +243,8 @@ def test_sites_get_their_named_law_and_scheme(
 ) -> None:
     scenario = load_sending(folder, "{'u': {}}")
     method = "def __init__(self, *_): raise OSError"
-    file, before = folder / "sending.py", scenario.sites["s"].control.source_sha256
+    file = folder / "sending.py"
+    before = scenario.sites["s"].control.source_sha256
     file.write_text(SENDING.replace("{SENDS}", f"{sends}\n    {method}"))
     named = scenario.text.replace(before, hashlib.sha256(file.read_bytes()).hexdigest())
     scenario = load_scenario(load_scenario(named), overrides)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.scenario.chains import six
+from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.core.arms.chain import Matrix
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_embedded
@@ -35,7 +35,7 @@ TWO_SITES = {
 YAW = {"mass_kg": 0.5, "inertia_kg_m2": [1e-2, 0.0, 1e-2, 0.0, 0.0, 1e-2]}
 
 
-def of_arm(text: str, arm: dict[str, Any], **sites: Any) -> Scenario:
+def make_arm_scenario(text: str, arm: dict[str, Any], **sites: Any) -> Scenario:
     """Returns a scenario of two arms of the given kind."""
     tables = {
         **TWO_SITES,
@@ -46,7 +46,7 @@ def of_arm(text: str, arm: dict[str, Any], **sites: Any) -> Scenario:
     return load_scenario(tables)
 
 
-def finger(**inertial: Any) -> str:
+def finger_text(**inertial: Any) -> str:
     """Returns the arm whose finger has another <inertial>."""
     body = '<mass value="0.02"/>' + IMPOSSIBLE
     assert body in FINGER
@@ -56,7 +56,7 @@ def finger(**inertial: Any) -> str:
     )
 
 
-def moments(tensor: Matrix) -> list[float]:
+def compute_moments(tensor: Matrix) -> list[float]:
     return [float(x) for x in np.linalg.eigvalsh(np.array(tensor))]
 
 
@@ -136,7 +136,7 @@ def test_impossible_finger_inertia_is_lumped_with_note() -> None:
 def test_side_links_never_make_arms_unusable(
     body: str, kind: str, mass_kg: float, note: str
 ) -> None:
-    chain = read_urdf(finger(body=body, kind=kind), tip="lower")
+    chain = read_urdf(finger_text(body=body, kind=kind), tip="lower")
     assert chain.joints[1].inertia[0] == mass_kg
     assert any(note in text for text in chain.notes)
     least, middle, most = body_moments(chain, 1)
@@ -146,7 +146,7 @@ def test_side_links_never_make_arms_unusable(
 
 def test_a_finger_as_end_link_is_refused() -> None:
     with pytest.raises(ScenarioError) as refused:
-        of_arm(FINGER, {})
+        make_arm_scenario(FINGER, {})
     assert refused.value.path == "arm.urdf"
     for word in (
         "'finger'",
@@ -155,10 +155,10 @@ def test_a_finger_as_end_link_is_refused() -> None:
         "arm.tip = 'lower'",
     ):
         assert word in str(refused.value)
-    assert len(of_arm(FINGER, {"balance_inertia": True}).arms["m"].joint_names) == 3
+    assert len(make_arm_scenario(FINGER, {"balance_inertia": True}).arms["m"].joint_names) == 3
     given = {"links": {"finger": {"inertia_kg_m2": [1e-6, 0, 1e-6, 0, 0, 1e-6]}}}
-    assert len(of_arm(FINGER, given).arms["m"].joint_names) == 3
-    assert len(of_arm(FINGER, {"tip": "lower"}).arms["m"].joint_names) == 2
+    assert len(make_arm_scenario(FINGER, given).arms["m"].joint_names) == 3
+    assert len(make_arm_scenario(FINGER, {"tip": "lower"}).arms["m"].joint_names) == 2
 
 
 # Balancing
@@ -177,7 +177,7 @@ def test_balanced_inertia_is_the_nearest_body(entries: tuple[float, ...]) -> Non
     nearest = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
     expected = np.trace(nearest) * np.eye(3) - nearest
     assert np.abs(np.array(balanced) - expected).max() < 1e-12
-    least, middle, most = moments(balanced)
+    least, middle, most = compute_moments(balanced)
     assert least >= -1e-12
     assert most <= least + middle + 1e-12
     assert np.abs(np.array(balance_tensor(balanced)) - balanced).max() < 1e-12
@@ -198,10 +198,10 @@ def test_shapes_without_masses_become_arms() -> None:
     with pytest.raises(
         ScenarioError, match=r"'yaw'.*give mass_kg and inertia_kg_m2 in \[arm.links.yaw\]"
     ):
-        of_arm(SHAPES, {})
+        make_arm_scenario(SHAPES, {})
     with pytest.raises(ScenarioError, match=r"'yaw'.*give inertia_kg_m2 in \[arm.links.yaw\]"):
-        of_arm(SHAPES, {"links": {"yaw": {"mass_kg": 0.5}}})
-    scenario = of_arm(SHAPES, {"links": {"yaw": YAW}})
+        make_arm_scenario(SHAPES, {"links": {"yaw": {"mass_kg": 0.5}}})
+    scenario = make_arm_scenario(SHAPES, {"links": {"yaw": YAW}})
     assert scenario.arms["m"].joint_names == ("outer_yaw", "insertion")
     assert scenario.arms["m"].theta[:10].tolist() == [0.5, 0, 0, 0, 1e-2, 0, 1e-2, 0, 0, 1e-2]
     assert scenario.arms["m"].theta[10] == 0.3
@@ -223,7 +223,8 @@ def test_omitted_keys_keep_the_files_value() -> None:
             .inertia
         )
 
-    m, c = 2.0, (0.1, 0.0, 0.2)
+    m = 2.0
+    c = (0.1, 0.0, 0.2)
     about = [0.01, 0, 0.005, 0, 0, 0.01]  # turned by a right angle about z
 
     def shifted(mass: float, com: tuple[float, ...], own: list[float]) -> list[float]:
@@ -251,7 +252,7 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
 
 def test_links_without_mass_in_files_need_one() -> None:
     with pytest.raises(ScenarioError) as refused:
-        of_arm(SHAPES, {"links": {"yaw": {"com_m": [0.0, 0.0, 0.1]}}})
+        make_arm_scenario(SHAPES, {"links": {"yaw": {"com_m": [0.0, 0.0, 0.1]}}})
     assert refused.value.path == "sites.m.arm.links.yaw.mass_kg"
 
 
@@ -259,19 +260,19 @@ def test_links_without_mass_in_files_need_one() -> None:
 
 
 def test_link_keys_enter_text_and_hash() -> None:
-    scenario = of_arm(SHAPES, {"links": {"yaw": YAW}})
+    scenario = make_arm_scenario(SHAPES, {"links": {"yaw": YAW}})
     assert parse_embedded(scenario.text) == scenario
     assert "[sites.m.arm.links.yaw]\nmass_kg = 0.5\n" in scenario.text
     heavier = load_scenario(scenario, {"arm.links.yaw.mass_kg": 0.6})
     assert heavier.arms["s"].theta[0] == 0.6
     assert heavier.sha256 != scenario.sha256
     assert load_scenario(heavier, {"arm.links.yaw.mass_kg": 0.5}).sha256 == scenario.sha256
-    assert "arm.links" not in six().text
-    assert "balance" not in six().text
+    assert "arm.links" not in make_six_joint_scenario().text
+    assert "balance" not in make_six_joint_scenario().text
 
 
 def test_overrides_reach_links_of_arms() -> None:
-    scenario = of_arm(FINGER, {"tip": "lower"})
+    scenario = make_arm_scenario(FINGER, {"tip": "lower"})
     changed = load_scenario(
         scenario,
         [
@@ -300,7 +301,7 @@ def test_sites_mend_links_beyond_their_group() -> None:
             }
         }
     }
-    scenario = of_arm(text, {"links": shared}, s=tables)
+    scenario = make_arm_scenario(text, {"links": shared}, s=tables)
     m, s = (scenario.sites[name].arm.links for name in "ms")
     assert m["tool.1"] == LinkInertia(mass_kg=0.4)
     assert s["tool.1"] == LinkInertia(mass_kg=0.4, com_m=(0.0, 0.0, 0.1))
@@ -311,7 +312,7 @@ def test_sites_mend_links_beyond_their_group() -> None:
 
 
 def test_differences_from_the_file_are_listed() -> None:
-    scenario = of_arm(
+    scenario = make_arm_scenario(
         FINGER, {"tip": "lower", "links": {"upper": {"mass_kg": 2.0}}}, m={"q0_rad": [2.1, 0]}
     )
     notes = list_arm_notes(scenario)

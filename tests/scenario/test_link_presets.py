@@ -55,7 +55,8 @@ def test_wifi_has_half_the_measured_percentiles() -> None:
 
 
 def test_lan_has_half_the_measured_quartiles() -> None:
-    mean, deviation = PRESETS["lan"]["delay_ms"], PRESETS["lan"]["deviation_ms"]
+    mean = PRESETS["lan"]["delay_ms"]
+    deviation = PRESETS["lan"]["deviation_ms"]
     law = stats.gamma((mean / deviation) ** 2, scale=deviation**2 / mean)
     assert 2 * law.median() == pytest.approx(0.542, rel=0.01)
     quartiles = law.ppf(0.75) - law.ppf(0.25)

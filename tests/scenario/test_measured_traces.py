@@ -6,14 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.scenario.round_trips import RTT_NS, SENT_NS, irtt
+from tests.scenario.round_trips import RTT_NS, SENT_NS, write_irtt_file
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import TraceDelay
 from trilat_net.scenario.delay_traces import import_trace
 
-IRTT_MEAN_NS, IRTT_DEVIATION_NS = 16616803, 488290
-"""Of five round trips that irtt measured, and its own statistics of them (README of clarkzjw/LENS)."""
+IRTT_MEAN_NS = 16616803
+"""The mean that irtt states for its five round trips (README of clarkzjw/LENS)."""
+IRTT_DEVIATION_NS = 488290
+"""The standard deviation that irtt states for the same round trips."""
 PING = """PING sat (2605:59c8:1000:962f::1) 56 data bytes
 [1700182800.410606] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=1 ttl=63 time=60.6 ms
 [1700182800.421290] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=2 ttl=63 time=56.9 ms
@@ -30,7 +32,7 @@ CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
 
 @pytest.mark.parametrize("zipped", [False, True])
 def test_irtt_round_trips_give_halves(tmp_path: Path, zipped: bool) -> None:
-    trace = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
+    trace = import_trace(write_irtt_file(tmp_path, zipped=zipped), "irtt")
     facts = trace.to_dict()
     assert facts["mean_ms"] == pytest.approx(0.5e-6 * IRTT_MEAN_NS, rel=1e-7)
     sample = facts["deviation_ms"] * math.sqrt(5 / 4)
@@ -38,18 +40,18 @@ def test_irtt_round_trips_give_halves(tmp_path: Path, zipped: bool) -> None:
     assert [t_s for t_s, _ in trace.points] == pytest.approx(
         [(t - SENT_NS[0]) * 1e-9 for t in SENT_NS], abs=1e-6
     )
-    assert import_trace(irtt(tmp_path), "irtt", way="whole").delay_ms == pytest.approx(
-        np.array(RTT_NS) * 1e-6
-    )
+    assert import_trace(
+        write_irtt_file(tmp_path), "irtt", way="whole"
+    ).delay_ms == pytest.approx(np.array(RTT_NS) * 1e-6)
 
 
 def test_irtt_losses_and_clock_differences_are_kept(tmp_path: Path) -> None:
-    trace = import_trace(irtt(tmp_path, 1, 2), "irtt")
+    trace = import_trace(write_irtt_file(tmp_path, 1, 2), "irtt")
     assert [math.isinf(ms) for _, ms in trace.points] == [False, True, True, False, False]
     assert (trace.to_dict()["lost_percent"], trace.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
     with pytest.raises(ScenarioError, match="clocks do not agree"):
-        import_trace(irtt(tmp_path), "irtt", way="receive")
-    assert import_trace(irtt(tmp_path), "irtt", way="send").too_long == 5
+        import_trace(write_irtt_file(tmp_path), "irtt", way="receive")
+    assert import_trace(write_irtt_file(tmp_path), "irtt", way="send").too_long == 5
 
 
 def test_pings_keep_gaps_and_times(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.core.channels import channel, due
-from tests.dropped_files import look, put_beside
+from tests.core.builders import compute_due_ns, make_channel
+from tests.dropped_files import put_beside, run_in_folder
 from trilat_net.core.arms.exogenous import torque_on_arm, torque_source_rows
 from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.scenario.delay_models.low_orbit import LowOrbit
@@ -98,7 +98,7 @@ print(json.dumps({
 def test_an_added_file_acts_in_every_driver(tmp_path: Path, scenario: str) -> None:
     put_beside(tmp_path, "scenario/operators", "tremor.py", OPERATOR)
     put_beside(tmp_path, "scenario/delay_models", "two_paths.py", DELAY)
-    output = look(LOOK.replace("SCENARIO", json.dumps(scenario)), tmp_path)
+    output = run_in_folder(LOOK.replace("SCENARIO", json.dumps(scenario)), tmp_path)
     assert output["identical"] == [True, True]
     assert any("two_paths 8.5 +- 3.5 ms" in line for line in output["check"])
     assert output["moved"] > 0.0
@@ -122,8 +122,9 @@ def force_of_kernel(body: HuntCrossley, q: tuple, qd: tuple) -> np.ndarray:
     return np.array(torque_on_arm(1.0, q, qd, (1.0, 1.0), rows, table, 0)[:2])
 
 
-def tip(q: tuple, qd: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    a, b = q[0], q[0] + q[1]
+def compute_tip(q: tuple, qd: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    a = q[0]
+    b = q[0] + q[1]
     J = np.array(
         [[-math.sin(a) - math.sin(b), -math.sin(b)], [math.cos(a) + math.cos(b), math.cos(b)]]
     )
@@ -135,7 +136,7 @@ def test_compiled_and_row_functions_of_a_body_agree(
     body: HuntCrossley, q: tuple, qd: tuple
 ) -> None:
     """F = K d^(3/2) (1 + lambda d'), Hunt and Crossley (1975)."""
-    at, speed, J = tip(q, qd)
+    at, speed, J = compute_tip(q, qd)
     effort = body.effort(np.array([1.0]), at[None], speed[None])[0]
     size = body.stiffness_n_m15 * (1.0 + body.damping_s_m)
     assert force_of_kernel(body, q, qd) == pytest.approx(
@@ -147,7 +148,7 @@ def test_compiled_and_row_functions_of_a_body_agree(
 def test_a_compliant_body_always_dissipates(
     body: HuntCrossley, depth_mm: float, speed_m_s: float
 ) -> None:
-    """In and out at one depth and speed: the force on the way out is never the larger."""
+    """At equal depth and speed, the force on the way out is never larger than that on the way in."""
     normal = np.array(body.normal) / np.hypot(*body.normal)
     at = np.array(body.point_m) - 1e-3 * depth_mm * normal
     still = body.effort(np.array([0.0]), at[None], np.zeros((1, 2)))[0] @ normal
@@ -161,8 +162,8 @@ def test_a_compliant_body_always_dissipates(
 
 def test_low_orbit_paths_last_their_slot() -> None:
     model = LowOrbit(floor_ms=20.0, path_ms=50.0, jitter_ms=0.0, slot_s=0.1)
-    fates = due(
-        channel(
+    fates = compute_due_ns(
+        make_channel(
             [model.to_core_model()._replace(trace_count=len(model.points))], points=model.points
         ),
         1000,

@@ -23,7 +23,7 @@ PAPER = load_scenario("paper")
     ids=str,
 )
 def test_overrides_equal_those_at_loading(name: str, overrides: dict[str, object]) -> None:
-    """For scenarios whose sites and links have no keys of their own."""
+    """The sites and links of the scenarios have no keys of their own."""
     assert load_scenario(load_scenario(name), overrides) == load_scenario(name, overrides)
 
 
@@ -40,7 +40,7 @@ def test_single_keys_override_their_groups(order: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "whole"),
+    ("entry", "whole"),
     [
         ("control.Kp.3=7", "control.Kp=[10, 10, 10, 7, 2, 2]"),
         ("sites.s.control.Kp.0=7", "sites.s.control.Kp=[7, 10, 10, 2, 2, 2]"),
@@ -49,13 +49,13 @@ def test_single_keys_override_their_groups(order: int) -> None:
         ("sites.m1.q0_rad.2=1", "sites.m1.q0_rad=[0.3, -1.0, 1.0, -0.6, 0.5, 0.2]"),
     ],
 )
-def test_joint_keys_are_entries_of_vectors(one: str, whole: str) -> None:
-    """Even if the author wrote one number for all joints, or the vector of a group."""
+def test_joint_keys_are_entries_of_vectors(entry: str, whole: str) -> None:
+    """A key of a joint works even if the author wrote one number for all joints, or the vector of a group."""
     scenario = load_scenario("six_joints", [whole])
     assert (
-        load_scenario("six_joints", [one])
+        load_scenario("six_joints", [entry])
         == scenario
-        == load_scenario(load_scenario("six_joints"), [one])
+        == load_scenario(load_scenario("six_joints"), [entry])
     )
 
 

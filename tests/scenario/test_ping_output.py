@@ -17,7 +17,7 @@ BSD = "PING host (192.0.2.5): 56 data bytes\n"
 LOST = math.inf
 
 
-def read(
+def import_text(
     tmp_path: Path, text: str, encoding: str = "utf-8", every_s: float = 1.0
 ) -> MeasuredTrace:
     path = tmp_path / "ping.txt"
@@ -25,17 +25,17 @@ def read(
     return import_trace(path, "ping", way="whole", every_s=every_s)
 
 
-def delays(trace: MeasuredTrace) -> list[float]:
+def list_delays(trace: MeasuredTrace) -> list[float]:
     return [ms for _, ms in trace.points]
 
 
-def answers(*numbers: int, key: str = "icmp_seq") -> str:
+def answer_lines(*numbers: int, key: str = "icmp_seq") -> str:
     return "".join(
         f"64 bytes from 192.0.2.5: {key}={n} ttl=64 time={n + 1}.0 ms\n" for n in numbers
     )
 
 
-def summary(sent: int, received: int) -> str:
+def summary_lines(sent: int, received: int) -> str:
     lost = 100.0 * (sent - received) / sent
     counts = f"{sent} packets transmitted, {received} received, {lost:g}% packet loss, time 9ms"
     return f"\n--- host ping statistics ---\n{counts}\n"
@@ -62,7 +62,7 @@ def test_every_probe_of_a_ping_counts(
     facts = trace.to_dict()
     assert facts["samples"] == samples
     assert facts["lost_percent"] == pytest.approx(lost_percent)
-    assert (delays(trace)[0], delays(trace)[-1]) == (first_ms, last_ms)
+    assert (list_delays(trace)[0], list_delays(trace)[-1]) == (first_ms, last_ms)
     assert facts["end_known"] == end_known
     assert ("does not tell how the measurement ended" in trace.summary()) != end_known
 
@@ -71,10 +71,11 @@ def test_every_probe_of_a_ping_counts(
 def test_losses_without_lines_count_at_both_ends(tmp_path: Path, head: str) -> None:
     """iputils counts from 1, BSD and busybox from 0; the summary tells the end."""
     first = 1 if head == IPUTILS else 0
-    probes = read(tmp_path, head + answers(3, 4) + summary(8, 2))
+    probes = import_text(tmp_path, head + answer_lines(3, 4) + summary_lines(8, 2))
     expected = [LOST] * 8
-    expected[3 - first], expected[4 - first] = 4.0, 5.0
-    assert delays(probes) == expected
+    expected[3 - first] = 4.0
+    expected[4 - first] = 5.0
+    assert list_delays(probes) == expected
     assert probes.begin_known
     assert probes.end_known
 
@@ -84,7 +85,7 @@ def test_times_continue_beyond_the_answered_probes(tmp_path: Path) -> None:
         f"[{100.005 + 0.2 * n:.6f}] 64 bytes: icmp_seq={n} ttl=64 time=5.0 ms"
         for n in (4, 5, 7)
     ]
-    probes = read(tmp_path, IPUTILS + "\n".join(lines) + "\n" + summary(9, 3))
+    probes = import_text(tmp_path, IPUTILS + "\n".join(lines) + "\n" + summary_lines(9, 3))
     assert [t_s for t_s, _ in probes.points] == pytest.approx(0.2 * np.arange(9), abs=1e-6)
 
 
@@ -95,12 +96,17 @@ def test_seeded_losses_are_counted_as_ping_counts_them(tmp_path: Path) -> None:
         answered = [n for n in range(1, sent + 1) if random.uniform() > loss]
         # some overtake others
         order = sorted(answered, key=lambda n: n + 3.0 * random.uniform())
-        text = IPUTILS + answers(*order) + answers(*order[:2]) + summary(sent, len(answered))
-        probes = read(tmp_path, text)
+        text = (
+            IPUTILS
+            + answer_lines(*order)
+            + answer_lines(*order[:2])
+            + summary_lines(sent, len(answered))
+        )
+        probes = import_text(tmp_path, text)
         assert probes.to_dict()["lost_percent"] == pytest.approx(
             100.0 * (sent - len(answered)) / sent
         )
-        assert delays(probes) == [
+        assert list_delays(probes) == [
             n + 1.0 if n in answered else LOST for n in range(1, sent + 1)
         ]
 
@@ -153,7 +159,7 @@ def test_windows_speaks_any_language_and_encoding(
         "    Minimum = 7ms, Maximum = 9ms, Average = 8ms",
         "^C",
     ]
-    probes = read(tmp_path, "\r\n".join(lines), encoding, every_s=2.0)
+    probes = import_text(tmp_path, "\r\n".join(lines), encoding, every_s=2.0)
     assert probes.points == ((0.0, LOST), (2.0, 7.0), (4.0, 8.0), (6.0, 9.0))
     assert probes.begin_known
     assert probes.end_known
@@ -171,30 +177,30 @@ def test_windows_speaks_any_language_and_encoding(
         (BSD + "Request timeout for icmp_seq 0\n64 bytes from h: icmp_seq=1 ttl=57 time=9.125 ms\n"
          "Request timeout for icmp_seq 2\n\n3 packets transmitted, 1 packets received, 66.7% packet loss",
          [LOST, 9.125, LOST]),
-        (IPUTILS + "From 192.0.2.1 icmp_seq=1 Destination Host Unreachable\n" + answers(2)
+        (IPUTILS + "From 192.0.2.1 icmp_seq=1 Destination Host Unreachable\n" + answer_lines(2)
          + "2 packets transmitted, 1 received, +1 errors, 50% packet loss, time 1ms", [LOST, 3.0]),
         ("PING6(56=40+8+8 bytes) ::1 --> ::1\n16 bytes from ::1, icmp_seq=1 hlim=64 time=0.5 ms\n"
          "2 packets transmitted, 1 packets received, 50.0% packet loss", [LOST, 0.5]),
-        (BSD + answers(0, 2, key="seq") + "4 packets transmitted, 2 packets received, 50% packet loss",
+        (BSD + answer_lines(0, 2, key="seq") + "4 packets transmitted, 2 packets received, 50% packet loss",
          [1.0, LOST, 3.0, LOST]),
         ("[1.5] h : [0], timed out (NaN avg, 100% loss)\n"
          "[2.51] h : [1], 64 bytes, 10.0 ms (10 avg, 50% loss)\n"
          "h : xmt/rcv/%loss = 3/1/66%, min/avg/max = 10/10/10", [LOST, 10.0, LOST]),
-        (IPUTILS + summary(3, 0), [LOST, LOST, LOST]),
+        (IPUTILS + summary_lines(3, 0), [LOST, LOST, LOST]),
     ],
 )  # fmt: skip
 def test_other_forms_of_ping_are_read(tmp_path: Path, text: str, expected: list[float]) -> None:
-    probes = read(tmp_path, text)
-    assert delays(probes) == expected
+    probes = import_text(tmp_path, text)
+    assert list_delays(probes) == expected
     assert probes.end_known
 
 
 @pytest.mark.parametrize(
     ("text", "begin_known", "expected"),
     [
-        (answers(4, 6), False, [5.0, LOST, 7.0]),
-        (answers(1, 2), True, [2.0, 3.0]),
-        (IPUTILS + "no answer yet for icmp_seq=1\n" + answers(2) + "no answer yet for icmp_seq=3\n", True,
+        (answer_lines(4, 6), False, [5.0, LOST, 7.0]),
+        (answer_lines(1, 2), True, [2.0, 3.0]),
+        (IPUTILS + "no answer yet for icmp_seq=1\n" + answer_lines(2) + "no answer yet for icmp_seq=3\n", True,
          [LOST, 3.0, LOST]),
         ("Reply from 192.0.2.7: bytes=32 time<1ms TTL=53\n", False, [1.0]),
     ],
@@ -202,8 +208,8 @@ def test_other_forms_of_ping_are_read(tmp_path: Path, text: str, expected: list[
 def test_unfinished_output_has_an_unknown_end(
     tmp_path: Path, text: str, begin_known: bool, expected: list[float]
 ) -> None:
-    probes = read(tmp_path, text)
-    assert delays(probes) == expected
+    probes = import_text(tmp_path, text)
+    assert list_delays(probes) == expected
     assert (probes.begin_known, probes.end_known) == (begin_known, False)
     assert ("before its first sample" in probes.summary()) != begin_known
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.scenario.links import links
+from tests.scenario.links import draw_link
 from trilat_net.core.links.delay import DelayKind, LinkModel
 from trilat_net.core.step.ticks import DominanceRamp, first_tick_at
 from trilat_net.errors import ScenarioError
@@ -26,12 +26,14 @@ LINK = {"at_s": 8.0, "link": "m1->s", "to": {"delay_ms": 350.0}}
 ROW = {"at_s": 10.0, "dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 2.0}
 
 
-def scripted(*changes: Any, **overrides: Any) -> Scenario:
+def make_scripted_scenario(*changes: Any, **overrides: Any) -> Scenario:
     return load_scenario("paper", {"timeline": list(changes), **overrides})
 
 
 def test_link_changes_hold_from_then_on() -> None:
-    setup = scripted(LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}).setup("s")
+    setup = make_scripted_scenario(
+        LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}
+    ).setup("s")
     assert setup.links[0].models == (
         LinkModel(location=200_000.0),
         LinkModel(from_ns=8 * S, location=350_000.0),
@@ -41,7 +43,9 @@ def test_link_changes_hold_from_then_on() -> None:
 
 
 def test_a_change_of_shares_is_a_ramp() -> None:
-    scenario = scripted(LINK, ROW, {"at_s": 11, "dominance": "s", "to": {"m2": 1}})
+    scenario = make_scripted_scenario(
+        LINK, ROW, {"at_s": 11, "dominance": "s", "to": {"m2": 1}}
+    )
     assert scenario.setup("s").ramps == (
         DominanceRamp(10 * S, 12 * S, (0.9, 0.1)),
         DominanceRamp(11 * S, 11 * S, (0.0, 1.0)),
@@ -60,7 +64,7 @@ def test_changes_keep_unnamed_keys() -> None:
     first = {"at_s": 1, "link": "m1->s", "to": {"deviation_ms": 5}}
     then = {"at_s": 2, "link": "m1->s", "to": {"preset": "4g"}}
     last = {"at_s": 3, "link": "m1->s", "to": {"model": "measured", "loss": 0.2}}
-    scenario = scripted(first, then, last, link=base)
+    scenario = make_scripted_scenario(first, then, last, link=base)
     assert [change.after.describe() for change in scenario.timeline] == [
         "gamma 50 +- 5 ms, loss 10 %, cut 1-2 s",
         "hyperexponential 53 +- 87.8 ms, cut 1-2 s",
@@ -75,7 +79,7 @@ def test_a_change_may_end_a_trace() -> None:
         {"at_s": 1, "link": "m1->s", "to": {"loss": 0.5}},
         {"at_s": 2, "link": "m1->s", "to": {"preset": "lan"}},
     ]
-    links_of_s = scripted(*left, link=base).setup("s").links
+    links_of_s = make_scripted_scenario(*left, link=base).setup("s").links
     assert [model.kind for model in links_of_s[0].models] == [
         DelayKind.TRACE,
         DelayKind.TRACE,
@@ -85,19 +89,19 @@ def test_a_change_may_end_a_trace() -> None:
 
 
 def test_two_changes_may_share_a_time() -> None:
-    assert scripted(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
+    assert make_scripted_scenario(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
 
 
 # By command.
 
 
-def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
+def resolve_order(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
     return resolve_change(scenario, LinkTables(scenario.links, ()), written, from_ns)
 
 
 def test_commands_hold_from_their_tick_at_receivers() -> None:
     scenario = load_scenario("paper")
-    change = ordered(
+    change = resolve_order(
         scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
     )
     assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
@@ -106,7 +110,7 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
         0,
         LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
     )
-    change = ordered(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
+    change = resolve_order(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
     assert find_owner(change) == "m2"
     assert to_core_change(scenario, change).ramp == DominanceRamp(
         2 * S, 2_500_000_000, (0.0, 1.0)
@@ -114,11 +118,13 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
 
 
 @settings(max_examples=60)
-@given(to=links(without=("trace",)), from_ns=st.integers(0, 10**14))
+@given(to=draw_link(without=("trace",)), from_ns=st.integers(0, 10**14))
 def test_recorded_commands_are_restored(to: dict[str, Any], from_ns: int) -> None:
     scenario = load_scenario("paper")
     to.pop("outages_s", None)
-    change = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
+    change = to_core_change(
+        scenario, resolve_order(scenario, {"link": "s->m1", "to": to}, from_ns)
+    )
     assert parse_core_change(scenario, "m1", change.text) == change
     assert change.model is not None
     assert change.model.from_ns == from_ns
@@ -135,12 +141,10 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
     script = {**change, "at_s": at_ns / S, **({"ramp_s": 0.2} if "dominance" in change else {})}
     if "link" in change:
         script["to"] = {"model": "constant", "delay_ms": 60.0}
-    plain, planned = (
-        load_scenario("free", short),
-        load_scenario("free", {**short, "timeline": [script]}),
-    )
+    plain = load_scenario("free", short)
+    planned = load_scenario("free", {**short, "timeline": [script]})
     written = {key: value for key, value in script.items() if key != "at_s"}
-    change_made = to_core_change(plain, ordered(plain, written, at_ns))
+    change_made = to_core_change(plain, resolve_order(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
     commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [change_made]}}))
     scripted_run = list(virtual.execute_virtual(planned))
@@ -164,16 +168,16 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
 )
 def test_impossible_orders_are_refused(written: dict[str, Any], phrase: str) -> None:
     with pytest.raises(ScenarioError, match=phrase):
-        ordered(load_scenario("paper"), written)
+        resolve_order(load_scenario("paper"), written)
 
 
 def test_links_with_traces_refuse_unrecordable_orders() -> None:
     scenario = load_scenario("paper", {"link": {"model": "trace", "trace": "0 7000"}})
     with pytest.raises(ScenarioError, match="can be changed only by setting another model"):
-        ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
+        resolve_order(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
     assert (
         to_core_change(
-            scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
+            scenario, resolve_order(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
         ).model
         is not None
     )

@@ -39,7 +39,8 @@ MODELS = {
 @pytest.mark.parametrize("peer_hz", [1000, 400])
 def test_pictures_are_delayed_like_links(view: dict[str, Any], peer_hz: int) -> None:
     scenario = load_scenario("paper", {"sites.m1.view": view, "sites.s.rate_hz": peer_hz})
-    picture, model = PictureDelay(scenario, "m1"), scenario.sites["m1"].view
+    picture = PictureDelay(scenario, "m1")
+    model = scenario.sites["m1"].view
     assert model is not None
     used = draw_used_samples(model, link_key(scenario.seed, "view s->m1"), 1000, peer_hz, 2.0)
     assert [picture.advance_to(tick, {})["s"] for tick in range(2000)] == used.tolist()

@@ -5,7 +5,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from tests.task_arms import planar_task
+from tests.scenario.builders import planar_task_text
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import simulate_scenario
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -24,9 +24,10 @@ def test_arms_unturned_by_gravity_are_accepted() -> None:
 @pytest.mark.parametrize(("elbow_rad", "damped"), [(0.01, True), (1.7, False)])
 def test_start_near_a_singular_pose_is_reported(elbow_rad: float, damped: bool) -> None:
     """The least singular value of a two-link arm of equal lengths, from its determinant sin q2."""
-    lines = describe_scenario(parse_scenario(planar_task(elbow_rad=elbow_rad)))
+    lines = describe_scenario(parse_scenario(planar_task_text(elbow_rad=elbow_rad)))
     (line,) = [line for line in lines if line.startswith("s follows along x, y")]
-    c, s = np.cos(elbow_rad), np.sin(elbow_rad)
+    c = np.cos(elbow_rad)
+    s = np.sin(elbow_rad)
     squares = 3.0 + 2.0 * c  # of all entries of J
     least = np.sqrt(0.5 * (squares - np.sqrt(squares**2 - 4.0 * s * s)))
     assert f"start pose {least:.3g}," in line

@@ -23,11 +23,11 @@ BODY = (
 LIMIT = '<limit lower="-1" upper="2" effort="30" velocity="4"/>'
 
 
-def link(name: str, body: str = BODY) -> str:
+def link_text(name: str, body: str = BODY) -> str:
     return f'<link name="{name}">{body}</link>'
 
 
-def joint(
+def joint_text(
     name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT
 ) -> str:
     return (
@@ -36,31 +36,31 @@ def joint(
     )
 
 
-def robot(*elements: str) -> str:
+def robot_text(*elements: str) -> str:
     return f'<robot name="r">{"".join(elements)}</robot>'
 
 
-TWO = robot(
-    link("base", ""),
-    joint("one", "base", "upper"),
-    link("upper"),
-    joint("two", "upper", "lower"),
-    link("lower"),
+TWO = robot_text(
+    link_text("base", ""),
+    joint_text("one", "base", "upper"),
+    link_text("upper"),
+    joint_text("two", "upper", "lower"),
+    link_text("lower"),
 )
-GRIPPER = robot(
-    link("base", ""),
-    joint("one", "base", "upper"),
-    link("upper"),
-    joint("mount", "upper", "camera", "fixed"),
-    link("camera"),
-    joint("two", "upper", "palm"),
-    link("palm"),
-    joint("left", "palm", "finger", "prismatic"),
-    link("finger"),
-    joint("right", "palm", "thumb", "prismatic", f'{LIMIT}<mimic joint="left"/>'),
-    link("thumb"),
-    joint("hand", "palm", "tcp", "fixed"),
-    link("tcp", ""),
+GRIPPER = robot_text(
+    link_text("base", ""),
+    joint_text("one", "base", "upper"),
+    link_text("upper"),
+    joint_text("mount", "upper", "camera", "fixed"),
+    link_text("camera"),
+    joint_text("two", "upper", "palm"),
+    link_text("palm"),
+    joint_text("left", "palm", "finger", "prismatic"),
+    link_text("finger"),
+    joint_text("right", "palm", "thumb", "prismatic", f'{LIMIT}<mimic joint="left"/>'),
+    link_text("thumb"),
+    joint_text("hand", "palm", "tcp", "fixed"),
+    link_text("tcp", ""),
 )
 
 
@@ -104,7 +104,7 @@ def test_references_balance_power_and_position() -> None:
             assert s.r @ s.inverse_dynamics == pytest.approx(
                 s.regressor_transpose_r @ pi, rel=1e-12, abs=1e-12
             )
-            x, R, axes = walk(chain, s.q)
+            x, R, axes = compute_pose(chain, s.q)
             assert np.abs(x - s.tip_position).max() < 1e-13
             assert np.abs(R - s.tip_rotation).max() < 1e-13
             for (kind, z, p), column in zip(axes, s.jacobian.T, strict=True):
@@ -112,57 +112,59 @@ def test_references_balance_power_and_position() -> None:
                 assert np.abs(column - expected).max() < 1e-13
 
 
-def walk(chain: UrdfChain, q: Array) -> tuple[Array, Array, list]:
-    R, x, axes = np.eye(3), np.zeros(3), []
+def compute_pose(chain: UrdfChain, q: Array) -> tuple[Array, Array, list]:
+    R = np.eye(3)
+    x = np.zeros(3)
+    axes = []
     for j, qi in zip(chain.joints, q, strict=True):
-        x, R = x + R @ j.origin_m, R @ np.array(j.rotation)
+        x = x + R @ j.origin_m
+        R = R @ np.array(j.rotation)
         axes.append((j.kind, R @ j.axis, x))
         if j.kind == "revolute":
-            R = R @ turn(np.array(j.axis), qi)
+            R = R @ rotate_about(np.array(j.axis), qi)
         else:
             x = x + R @ j.axis * qi
             axes[-1] = (j.kind, R @ j.axis, x)
     return x + R @ chain.tip_origin_m, R @ np.array(chain.tip_rotation), axes
 
 
-def turn(axis: Array, angle: float) -> Array:
+def rotate_about(axis: Array, angle: float) -> Array:
     """Returns the rotation matrix by Rodrigues' formula."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
 
 
-def rpy(angles: Array) -> Array:
+def rotate_by_angles(angles: Array) -> Array:
     roll, pitch, yaw = angles
     x, y, z = np.eye(3)
-    return turn(z, yaw) @ turn(y, pitch) @ turn(x, roll)
+    return rotate_about(z, yaw) @ rotate_about(y, pitch) @ rotate_about(x, roll)
 
 
-def points(random: np.random.Generator) -> tuple[Array, Array]:
+def draw_points(random: np.random.Generator) -> tuple[Array, Array]:
     return random.uniform(0.1, 1.0, 6), random.normal(0.0, 0.2, (6, 3))
 
 
-def tensor(masses: Array, places: Array) -> Array:
+def compute_tensor(masses: Array, places: Array) -> Array:
     return sum(
         m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
     )
 
 
-def six(I: Array) -> list[float]:  # noqa: E741 - the symbol of an inertia
+def list_moments(I: Array) -> list[float]:  # noqa: E741 - the symbol of an inertia
     return [I[0, 0], I[0, 1], I[1, 1], I[0, 2], I[1, 2], I[2, 2]]
 
 
-def stated(masses: Array, places: Array, angles: Array) -> str:
-    c, R = masses @ places / masses.sum(), rpy(angles)
-    moments = six(R.T @ tensor(masses, places - c) @ R)
+def inertia_text(masses: Array, places: Array, angles: Array) -> str:
+    c = masses @ places / masses.sum()
+    R = rotate_by_angles(angles)
+    moments = list_moments(R.T @ compute_tensor(masses, places - c) @ R)
     keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
     inertia = " ".join(
         f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True)
     )
-    origin, mass = (
-        f'xyz="{format_vector(c)}" rpy="{format_vector(angles)}"',
-        float(masses.sum()),
-    )
+    origin = f'xyz="{format_vector(c)}" rpy="{format_vector(angles)}"'
+    mass = float(masses.sum())
     return (
         f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
     )
@@ -179,7 +181,8 @@ def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
     joint's frame.
     """
     random = np.random.default_rng(seed)
-    angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
+    angles = random.uniform(-3, 3, (6, 3))
+    offsets = random.uniform(-1, 1, (6, 3))
     origins = [
         f'<origin xyz="{format_vector(x)}" rpy="{format_vector(a)}"/>'
         for x, a in zip(offsets, angles, strict=True)
@@ -189,24 +192,26 @@ def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
         inside = f'{origins[n]}<parent link="{parent}"/><child link="{child}"/><axis xyz="0 3 4"/>{LIMIT}'
         return f'<joint name="j{n}" type="{kind}">{inside}</joint>'
 
-    clouds = [points(random) for _ in range(4)]
-    text = robot(
+    clouds = [draw_points(random) for _ in range(4)]
+    text = robot_text(
         *(
-            link(f"l{n}", "" if n in (0, 1) else stated(*clouds[n - 2], angles[n]))
+            link_text(f"l{n}", "" if n in (0, 1) else inertia_text(*clouds[n - 2], angles[n]))
             for n in range(5)
         ),
         edge(0, "fixed", "l0", "l1"),
         edge(1, "revolute", "l1", "l2"),
         edge(2, "fixed", "l2", "l3"),
         edge(3, "revolute", "l2", "l4"),
-        link("tip", ""),
+        link_text("tip", ""),
         edge(4, "fixed", "l4", "tip"),
     )
     masses, places = clouds[3]
     c = masses @ places / masses.sum()
-    load = UrdfPayload(float(masses.sum()), tuple(c), six(tensor(masses, places - c)))
+    load = UrdfPayload(
+        float(masses.sum()), tuple(c), list_moments(compute_tensor(masses, places - c))
+    )
     chain = read_urdf(text, tip="tip", payload=load)
-    R = [rpy(a) for a in angles]
+    R = [rotate_by_angles(a) for a in angles]
     first, second = chain.joints
     assert np.abs(first.rotation - R[0] @ R[1]).max() < 1e-14
     assert np.abs(first.origin_m - (offsets[0] + R[0] @ offsets[1])).max() < 1e-14
@@ -220,27 +225,27 @@ def test_fixed_links_are_lumped_and_frames_composed(seed: int) -> None:
     ):
         m = np.concatenate([own[0], carried[0]])
         p = np.concatenate([own[1], offsets[n] + carried[1] @ R[n].T])
-        expected = [m.sum(), *(m @ p), *six(tensor(m, p))]
+        expected = [m.sum(), *(m @ p), *list_moments(compute_tensor(m, p))]
         assert np.abs(np.array(body.inertia) - expected).max() < 1e-13
 
 
 def test_limits_friction_and_kinds() -> None:
     inside = f'{LIMIT}<dynamics damping="0.5" friction="0.25"/>'
-    text = robot(
-        link("base", ""),
-        joint("one", "base", "a", "prismatic", inside),
-        link("a"),
-        joint("two", "a", "b", "continuous"),
-        link("b"),
-        joint("three", "b", "c", inside='<limit effort="0" velocity="0"/>'),
-        link("c"),
-        joint(
+    text = robot_text(
+        link_text("base", ""),
+        joint_text("one", "base", "a", "prismatic", inside),
+        link_text("a"),
+        joint_text("two", "a", "b", "continuous"),
+        link_text("b"),
+        joint_text("three", "b", "c", inside='<limit effort="0" velocity="0"/>'),
+        link_text("c"),
+        joint_text(
             "four",
             "c",
             "d",
             inside='<limit lower="-1e16" upper="1e16" effort="1e16" velocity="2"/>',
         ),
-        link("d"),
+        link_text("d"),
     ).replace('<axis xyz="0 0 1"/><limit lower="-1e16"', '<limit lower="-1e16"')
     one, two, three, four = read_urdf(text).joints
     inf = math.inf
@@ -293,8 +298,8 @@ def test_files_named_in_the_text_stay_closed() -> None:
 
 def test_thirteen_joints_are_one_too_many() -> None:
     def arm(n: int) -> str:
-        edges = [joint(f"j{i}", f"l{i}", f"l{i + 1}") for i in range(n)]
-        return robot(*edges, *(link(f"l{i}") for i in range(n + 1)))
+        edges = [joint_text(f"j{i}", f"l{i}", f"l{i + 1}") for i in range(n)]
+        return robot_text(*edges, *(link_text(f"l{i}") for i in range(n + 1)))
 
     assert len(read_urdf(arm(12)).joints) == 12
     assert "13 joints" in refusal(arm(13))
@@ -313,8 +318,8 @@ def test_hostile_texts_are_refused_at_once() -> None:
     mass = refusal(TWO.replace('mass value="', f'mass value="{"1" * 50_000}x', 1))
     assert "must be a finite number" in mass  # which took a minute and a half, digit by digit
     assert len(mass) < 400
-    links = "".join(link(f"l{n}") for n in range(2000))
-    ring = "".join(joint(f"j{n}", f"l{n}", f"l{(n + 1) % 2000}") for n in range(2000))
+    links = "".join(link_text(f"l{n}") for n in range(2000))
+    ring = "".join(joint_text(f"j{n}", f"l{n}", f"l{(n + 1) % 2000}") for n in range(2000))
     assert "loop" in refusal(f"<robot>{links}{ring}</robot>")
 
 
@@ -341,7 +346,7 @@ _NASTY = st.sampled_from(
 )
 
 
-def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
+def mutate_element(root: ElementTree.Element, data: st.DataObject) -> None:
     """Drops, doubles, garbles or scales one element or attribute."""
     parents = [e for e in root.iter() if len(e)]
     parent = data.draw(st.sampled_from(parents))
@@ -372,7 +377,7 @@ def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
             child.set(key, data.draw(_NASTY))
 
 
-def garble(text: str, data: st.DataObject) -> str:
+def garble_text(text: str, data: st.DataObject) -> str:
     """Cuts out a stretch of the text, or inserts characters."""
     start = data.draw(st.integers(0, len(text)))
     end = data.draw(st.integers(start, min(len(text), start + 80)))
@@ -409,10 +414,10 @@ def check_physical(chain: UrdfChain) -> None:
 def test_mutated_files_are_refused_or_physical(data: st.DataObject, source: tuple) -> None:
     text, tip = source
     if data.draw(st.booleans()):
-        text = garble(text, data)
+        text = garble_text(text, data)
     else:
         root = ElementTree.fromstring(text)
-        mutate(root, data)
+        mutate_element(root, data)
         text = ElementTree.tostring(root, encoding="unicode")
     try:
         chain = read_urdf(text, tip=tip)

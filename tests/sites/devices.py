@@ -1,4 +1,4 @@
-"""Devices of tests: one that follows a script, Haply's service as it is documented, the reports of a cap."""
+"""Devices for tests: one that follows a script, Haply's service as documented, and the reports of a cap."""
 
 import json
 import os
@@ -33,7 +33,9 @@ class ScriptedDevice:
         script: Callable[[float], DeviceState],
         hangs_s: tuple[float, float] = (1e9, 0.0),
     ) -> None:
-        self._clock, self._script, self._begun_ns = clock, script, 0
+        self._clock = clock
+        self._script = script
+        self._begun_ns = 0
         self._hangs_s = hangs_s  # from when, for how long
         self.rendered: list[tuple[float, Vector]] = []
         self.entered = 0
@@ -76,8 +78,11 @@ class HaplyService:
         self.pressed: set[str] = set()
         self.presses_anew = False
         self.asked: list[tuple[float, dict[str, Any]]] = []
-        self.silent, self.raw, self._key = threading.Event(), "", force_key
-        self.devices, self.answered_s = ["049D"], 0.0
+        self.silent = threading.Event()
+        self.raw = ""
+        self._key = force_key
+        self.devices = ["049D"]
+        self.answered_s = 0.0
         self._server = serve(
             self._attend, "127.0.0.1", port, compression=None, ping_interval=None
         )
@@ -97,7 +102,7 @@ class HaplyService:
         return f"ws://127.0.0.1:{self.port}"
 
     def kill(self) -> None:
-        """Ends the service like a killed process: connections break, and nobody listens."""
+        """Ends the service like a killed process: connections break, and the port is closed."""
         self._server.shutdown()
         for connection in self._open:
             with suppress(OSError):
@@ -123,7 +128,8 @@ class HaplyService:
                 self.asked.append((time.perf_counter(), json.loads(text)))
                 while self.silent.is_set():
                     time.sleep(0.001)
-                answer, self.raw = self.raw or json.dumps(self._state()), ""
+                answer = self.raw or json.dumps(self._state())
+                self.raw = ""
                 self.answered_s = time.perf_counter()
                 connection.send(answer)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from greenlet import greenlet
 
 LONGEST_NS = 3_600 * 10**9
-"""No session of a test lasts so long."""
+"""A time that no session of a test reaches."""
 
 
 class Relay:
@@ -95,13 +95,14 @@ class Killed(Exception):  # noqa: N818 - it is no error of the program
 
 class RelayClock:
     def __init__(self, relay: Relay, seat: int) -> None:
-        self._relay, self._seat = relay, seat
+        self._relay = relay
+        self._seat = seat
         self._stalls: list[tuple[int, int]] = []
         self._acts: list[tuple[int, Callable[[], None]]] = []
         self.dies_ns: int | None = None
-        """When its runner is killed."""
+        """The time at which the clock's runner is killed."""
         self.wall_ahead_ns = 0
-        """How far its wall clock was set ahead; the monotonic one is not."""
+        """The offset of the wall clock; the monotonic clock has none."""
 
     def begins(self, at_ns: int) -> None:
         self._relay.set_start(self._seat, at_ns)

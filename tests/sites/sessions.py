@@ -13,6 +13,7 @@ from sites import realtime
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import join_and_run
 from tests.net.local_bus import LocalNetwork
+from tests.net.waiting import sleep_for_ns
 from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import LogRefused, RunFailed, SessionError
@@ -52,20 +53,21 @@ class Session:
     clocks: dict[str, RelayClock] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     skews: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Of members on clocks of their own: how far ahead (ns), and how much faster (ns/s)."""
+    """Offset (ns) and drift (ns/s) of the clocks of members on other machines."""
     storage: LogStorage | None = None
-    """Where the log goes, if not simply to `path`."""
+    """Storage of the log, if the log is not simply written to `path`."""
     stay_s: float = 0.0
+    """The time for which the sites wait for the recorder to leave."""
     works_ns: int = 0
-    """How long the sites wait for the recorder to leave, and how long it works on when it has all."""
+    """The time for which the recorder works on once it has every record."""
     left_ns: dict[str, int] = field(default_factory=dict)
-    """When a member left, and when the log was whole ("log")."""
+    """The times at which each member left, and at which the log was complete ("log")."""
     options: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Further options of sites, by name."""
-    told: list[tuple[str, object]] = field(default_factory=list)
-    """What each start of a site came to, in order."""
+    start_ends: list[tuple[str, object]] = field(default_factory=list)
+    """The end of each start of a site, in order: an exit code, an error, or "killed"."""
     ends: dict[str, object] | None = None
-    """What each site came to, its exit code or its error; None where an error fails the test."""
+    """The end of each site, as an exit code or an error; if None, an error fails the test."""
 
     @classmethod
     def whole(cls, scenario: Scenario, folder: Path, **fields: Any) -> "Session":
@@ -87,7 +89,7 @@ class Session:
                 if self.ends is None:
                     raise
                 end = failed
-            self.told.append((name, end))
+            self.start_ends.append((name, end))
             if self.ends is not None:
                 self.ends[name] = end
             return end
@@ -112,11 +114,13 @@ class Session:
             **self.options.get(name, {}),
         )
         interrupt = interrupt or self.interrupts.get(name, Interrupt())
-        own = self._own(name, clock)
+        site_clock = self._own(name, clock)
         bus = self.join(name)
         try:
             return join_and_run(
-                SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append)
+                SiteParts(
+                    self.scenario, name, options, bus, site_clock, interrupt, self.said.append
+                )
             )
         finally:
             bus.close()
@@ -137,9 +141,13 @@ class Session:
         def run(clock: RelayClock) -> Sequence[str]:
             bus = self.join("recorder")
             try:
-                own = self._own("recorder", clock)
+                recorder_clock = self._own("recorder", clock)
                 recorder = Recorder(
-                    *(bus, own, SESSION, boot, self.storage or LogStorage(self.path)),
+                    bus,
+                    recorder_clock,
+                    SESSION,
+                    boot,
+                    self.storage or LogStorage(self.path),
                     make_scenario_reader(),
                     collect_provenance(),
                     stopped,
@@ -149,7 +157,7 @@ class Session:
                 assert epoch is not None
                 recording = recorder.record(epoch)
                 self.left_ns["log"] = clock.monotonic_ns()
-                clock.sleep_until(clock.monotonic_ns() + self.works_ns)
+                sleep_for_ns(clock, self.works_ns)
                 self.left_ns["recorder"] = clock.monotonic_ns()
                 problem = recording.describe_problem()
                 return [*recording.render_summary(), *([problem] if problem else [])]
@@ -214,39 +222,74 @@ class Session:
         return open_log(self.path)
 
 
-def computed(state: State) -> bytes:
-    return msgpack.packb(
-        [
-            *(
-                state.site,
-                state.tick,
-                state.t_ns,
-                state.mode,
-                state.q,
-                state.qd,
-                state.q_des,
-                state.qd_des,
-            ),
-            *(state.tau, state.tau_x, state.theta_hat, state.used, state.ch),
-        ]
-    )
+COMPUTED = (
+    "site",
+    "tick",
+    "t_ns",
+    "mode",
+    "q",
+    "qd",
+    "q_des",
+    "qd_des",
+    "tau",
+    "tau_x",
+    "theta_hat",
+    "used",
+    "ch",
+)
+"""Fields of a record that a site computes."""
 
 
-def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
+def run_session(
+    scenario: Scenario, folder: Path, orders: Sequence[tuple[float, str]] = ()
+) -> tuple[Log, dict[str, object]]:
+    """Returns the log of a session of all sites and a recorder, and how each site ended.
+
+    Args:
+        scenario: The scenario of the session.
+        folder: Folder of the log.
+        orders: Times, in s after the start, and orders that the site `s` gets then.
+    """
+    ends: dict[str, object] = {}
+    session = Session.whole(scenario, folder, ends=ends)
+
+    def give_orders(bus: Bus, clock: Clock) -> None:
+        start_ns = clock.monotonic_ns()
+        for at_s, order in orders:
+            clock.sleep_until(start_ns + int(at_s * 1e9))
+            reach_session(bus, clock).send_order(["s"], order)
+
+    if orders:
+        session.stranger(give_orders)
+    return session.run(), ends
+
+
+def pack_computed(state: State) -> bytes:
+    """Returns the computed fields of a record as bytes, which are equal if all bits are."""
+    return msgpack.packb([getattr(state, field) for field in COMPUTED])
+
+
+def execute_packed(scenario: Scenario) -> dict[str, list[bytes]]:
+    """Returns the packed records of each site of a run in virtual time."""
     ticks: dict[str, list[bytes]] = {name: [] for name in scenario.names}
     for site, arrivals, output in virtual.execute_virtual(scenario):
         payload = encode_state(site.name, 0, site.peers, output, arrivals, 0, 0)
-        ticks[site.name].append(computed(decode(payload, State)))
+        ticks[site.name].append(pack_computed(decode(payload, State)))
     return ticks
 
 
-def in_log(log: Log) -> dict[str, list[bytes]]:
-    return {name: [computed(state) for state in log[name].states] for name in log.sites}
+def pack_log(log: Log) -> dict[str, list[bytes]]:
+    """Returns the packed records of each site of a log."""
+    return {name: [pack_computed(state) for state in log[name].states] for name in log.sites}
 
 
-def gliding(duration_s: float, scenario: str = "two_sites", **keys: Any) -> Scenario:
+def make_gliding_scenario(
+    duration_s: float, scenario: str = "two_sites", **keys: Any
+) -> Scenario:
+    """Returns a shipped scenario at 200 Hz under the rule `glide`."""
     return load_scenario(scenario, {"duration_s": duration_s, **GLIDE, **keys})
 
 
-def reached(bus: Bus, clock: Clock) -> RunningSession:
+def reach_session(bus: Bus, clock: Clock) -> RunningSession:
+    """Returns the running session as a member of its network sees it."""
     return RunningSession(SESSION, Connection(), bus, clock)

@@ -33,8 +33,8 @@ class Asked:
         network = LocalNetwork()
         self.scenario = scenario or load_scenario("paper")
         self._client: Bus = network.join()
-        asked, stops = (network.join().query_inbox(key) for key in (KEY, STOP))
-        self.changes = ChangeServer(self.scenario, "s", asked, mode, stops=stops)
+        requests, stops = (network.join().query_inbox(key) for key in (KEY, STOP))
+        self.changes = ChangeServer(self.scenario, "s", requests, mode, stops=stops)
 
     def send(self, payload: bytes, key: str = KEY) -> Inbox:
         return self._client.query(key, payload)
@@ -129,11 +129,13 @@ def test_impossible_changes_are_refused_with_the_reason(
 GLIDES = load_scenario("free", {"on_stale.action": "glide"})
 
 
-def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
+def apply_orders(batches: list[list[str]]) -> tuple[list[bool], Mode]:
     """Returns the orders that a waiting site accepts, and its final mode; a batch is requested
     in one tick.
     """
-    site, mode, replies = Site(GLIDES.setup("s")), Mode.WAITING, []
+    site = Site(GLIDES.setup("s"))
+    mode = Mode.WAITING
+    replies = []
     requests = Asked(GLIDES, lambda: mode)
     for k in range(20):
         batch = batches[k] if k < len(batches) else ()
@@ -147,7 +149,7 @@ def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
 @given(st.lists(st.sampled_from(["stop", "enable", "reset"]), min_size=1, max_size=6))
 def test_orders_of_one_tick_act_as_in_several(orders: list[str]) -> None:
     """`enable` behind a `stop` of the same tick used to be refused: the site was not stopped yet."""
-    assert obey([orders]) == obey([[order] for order in orders])
+    assert apply_orders([orders]) == apply_orders([[order] for order in orders])
 
 
 def test_clients_of_other_versions_are_refused() -> None:

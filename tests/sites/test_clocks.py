@@ -4,14 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.truth import judge_link, members, offset_errors
+from tests.sites.sessions import execute_packed, pack_log
+from tests.truth import judge_link, list_members, offset_errors
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
 
 from .relay import Relay
-from .sessions import Session, in_log, in_virtual_time
+from .sessions import Session
 
 S = 1_000_000_000
 SKEWS = {
@@ -21,7 +22,7 @@ SKEWS = {
 }
 
 
-def run(
+def run_skewed_session(
     folder: Path,
     skews: dict[str, tuple[int, int]],
     duration_s: float,
@@ -34,13 +35,13 @@ def run(
 
 @pytest.fixture(scope="module")
 def skewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Log]:
-    return run(tmp_path_factory.mktemp("skewed"), SKEWS, 2.5)
+    return run_skewed_session(tmp_path_factory.mktemp("skewed"), SKEWS, 2.5)
 
 
 def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log]) -> None:
     session, log = skewed
     assert log.complete
-    assert in_log(log) == in_virtual_time(session.scenario)
+    assert pack_log(log) == execute_packed(session.scenario)
     assert verify(log).passed
     assert not compare_with_virtual(log).late
 
@@ -50,17 +51,17 @@ def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log])
 )
 def test_any_members_clock_may_differ(names: tuple[str, ...], tmp_path: Path) -> None:
     skews = {**SKEWS, "m1": (7 * S, 60_000)}
-    session, log = run(tmp_path, {name: skews[name] for name in names}, 0.3)
+    session, log = run_skewed_session(tmp_path, {name: skews[name] for name in names}, 0.3)
     assert log.complete
-    assert in_log(log) == in_virtual_time(session.scenario)
-    clocks = members(log)
+    assert pack_log(log) == execute_packed(session.scenario)
+    clocks = list_members(log)
     begun_ns = {name: clock.true_ns(0) for name, clock in clocks.items()}
     # one instant, but for drift since
     assert max(begun_ns.values()) - min(begun_ns.values()) <= 200_000
 
 
 def test_logged_delays_and_offsets_are_within_bounds(skewed: tuple[Session, Log]) -> None:
-    """Here messages take no time: the bound is the possible drift of the clocks, soon microseconds."""
+    """Messages take no time, so that the bound is the possible drift of the clocks, soon microseconds."""
     _, log = skewed
     for site in log.sites:
         for peer in log.scenario.peers(site):
@@ -75,7 +76,7 @@ def test_logged_delays_and_offsets_are_within_bounds(skewed: tuple[Session, Log]
 
 def test_grids_follow_the_leaders_as_logged(skewed: tuple[Session, Log]) -> None:
     _, log = skewed
-    clocks = members(log)
+    clocks = list_members(log)
     for site, drift_ppb in (("m1", 0), ("m2", 100_000), ("s", -100_000)):
         stats = log.link_stats(site)
         assert all(abs(statistics.grid_error_us) <= 150 for statistics in stats)
@@ -93,13 +94,13 @@ def test_members_on_other_clocks_are_reported(skewed: tuple[Session, Log]) -> No
     assert any(text.startswith("m2: clock of s: another one, offset -3.500") for text in texts)
     setups = {event.member: event for event in log.events if event.kind == "setup"}
     assert "clock of m2: another one" in setups["s"].text
-    assert setups["m2"].epoch_mono_ns == members(log)["m2"].epoch_ns
+    assert setups["m2"].epoch_mono_ns == list_members(log)["m2"].epoch_ns
     assert "skewed by 3000000000 ns" in setups["m2"].clock
     assert all("turn: 0 us after the grid" in event.text for event in setups.values())
 
 
 def test_on_one_clock_nothing_is_estimated(tmp_path: Path) -> None:
-    session, log = run(tmp_path, {"recorder": SKEWS["recorder"]}, 0.2)
+    session, log = run_skewed_session(tmp_path, {"recorder": SKEWS["recorder"]}, 0.2)
     assert not any(event.kind == "clock" for event in log.events)
     for site in log.sites:
         for stats in log.link_stats(site):
@@ -111,7 +112,7 @@ def test_on_one_clock_nothing_is_estimated(tmp_path: Path) -> None:
 
 
 def test_sites_on_one_clock_wake_up_in_turn(tmp_path: Path) -> None:
-    _, log = run(tmp_path, {}, 0.2)
+    _, log = run_skewed_session(tmp_path, {}, 0.2)
     setups = {event.member: event.text for event in log.events if event.kind == "setup"}
     for site, turn_us in (("m1", 0), ("m2", 166), ("s", 333)):
         assert f"turn: {turn_us} us after the grid" in setups[site]
@@ -134,10 +135,10 @@ class Stepping(Relay):
 @pytest.mark.long
 def test_a_stepping_wall_clock_changes_only_labels(tmp_path: Path) -> None:
     (tmp_path / "steady").mkdir()
-    _, steady = run(tmp_path / "steady", SKEWS, 0.3)
-    session, log = run(tmp_path, SKEWS, 0.3, Stepping())
+    _, steady = run_skewed_session(tmp_path / "steady", SKEWS, 0.3)
+    session, log = run_skewed_session(tmp_path, SKEWS, 0.3, Stepping())
     assert session.relay.readings > 0
-    assert in_log(log) == in_log(steady)
+    assert pack_log(log) == pack_log(steady)
     for site in log.sites:
         assert [state.rx for state in log[site].states] == [
             state.rx for state in steady[site].states
@@ -159,4 +160,4 @@ def test_hanging_members_on_other_clocks_are_awaited(at_ns: int, tmp_path: Path)
     session.clocks["s"].stall(at_ns, 900_000_000)
     log = session.run()
     assert log.complete
-    assert in_log(log) == in_virtual_time(session.scenario)
+    assert pack_log(log) == execute_packed(session.scenario)

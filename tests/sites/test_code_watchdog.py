@@ -16,8 +16,9 @@ from sites.code_watchdog import (
     CodeWatchdog,
     WatchedCode,
 )
-from tests.core.sites import setup
+from tests.core.builders import make_site_setup
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.errors import LawFailed
@@ -30,18 +31,21 @@ TICKS = 3000
 class Steps:
     """A site whose step takes a time chosen by the test, of which its thread computes a part."""
 
-    name, rate_hz = "s", 1000
+    name = "s"
+    rate_hz = 1000
 
     def __init__(
         self, takes_ns: Callable[[int], int], computes: float = 1.0, evicts: int = 0
     ) -> None:
         self.clock = ManualClock()
         self.computed_ns = self.evicted = 0
-        self._takes_ns, self._computes, self._evicts = takes_ns, computes, evicts
+        self._takes_ns = takes_ns
+        self._computes = computes
+        self._evicts = evicts
 
     def step(self, tick: TickInput) -> TickInput:
         took_ns = self._takes_ns(tick.k)
-        self.clock.sleep_until(self.clock.monotonic_ns() + took_ns)
+        sleep_for_ns(self.clock, took_ns)
         self.computed_ns += int(self._computes * took_ns)
         self.evicted += self._evicts
         return tick
@@ -121,7 +125,7 @@ class Hanging:
 
 
 def test_a_hanging_law_is_stopped() -> None:
-    site = Site(setup("s", "two_sites")._replace(law_factory=Hanging))
+    site = Site(make_site_setup("s", "two_sites")._replace(law_factory=Hanging))
     before = signal.getsignal(signal.SIGALRM)
     watched = WatchedCode(
         "the law laws:Hanging", 1000, fail_of("s", "laws:Hanging"), SystemClock()
@@ -137,7 +141,7 @@ def test_a_hanging_law_is_stopped() -> None:
 
 
 def test_every_call_of_a_first_tick_may_compile() -> None:
-    """In its first tick a plant is asked for the places of its bodies, and then to move."""
+    """In its first tick a plant returns the places of its bodies, and then moves."""
     watched = WatchedCode(
         "the plant mine:Scene", 1000, fail_of("s", "mine:Scene"), SystemClock()
     )

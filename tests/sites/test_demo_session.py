@@ -26,7 +26,7 @@ WAITS = ("record", "--session", "nobody", "--connect", "tcp/127.0.0.1:9", "-o", 
 
 
 def test_compilations_are_announced_before_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if loading the scenario has compiled, and announced, a part of the code before."""
+    """This holds also if loading the scenario has compiled and announced a part of the code before."""
     said: list[str] = []
     compiled = {"dispatcher": SimpleNamespace(py_func=site_tick.py_func)}
 
@@ -44,14 +44,14 @@ def test_compilations_are_announced_before_a_session(monkeypatch: pytest.MonkeyP
     assert said == [COMPILING]
 
 
-def started(folder: Path) -> ProcessStarter:
+def make_starter(folder: Path) -> ProcessStarter:
     (folder / "paper.toml").write_text(read_shipped("paper"))
     return ProcessStarter(folder / "paper.toml", folder)
 
 
 @pytest.fixture(scope="module")
 def starter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessStarter]:
-    with closing(started(tmp_path_factory.mktemp("processes"))) as starter:
+    with closing(make_starter(tmp_path_factory.mktemp("processes"))) as starter:
         yield starter
 
 
@@ -60,7 +60,7 @@ def wait_for_end(starter: ProcessStarter, process: SessionProcess) -> SessionPro
     return process
 
 
-def waiting(starter: ProcessStarter, name: str) -> SessionProcess:
+def start_waiting(starter: ProcessStarter, name: str) -> SessionProcess:
     process = starter.start(name, WAITS)
     until(
         lambda: (
@@ -71,7 +71,7 @@ def waiting(starter: ProcessStarter, name: str) -> SessionProcess:
     return process
 
 
-def parent(pid: int) -> int:
+def find_parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
@@ -90,7 +90,7 @@ def test_processes_run_their_words(starter: ProcessStarter, tmp_path: Path) -> N
 
 
 def test_processes_have_own_name_session_and_signals(starter: ProcessStarter) -> None:
-    process = waiting(starter, "recorder")
+    process = start_waiting(starter, "recorder")
     assert process.pid is not None
     assert (
         Path(f"/proc/{process.pid}/cmdline")
@@ -104,13 +104,13 @@ def test_processes_have_own_name_session_and_signals(starter: ProcessStarter) ->
 
 
 def test_a_killed_process_is_named_with_its_signal(starter: ProcessStarter) -> None:
-    process = waiting(starter, "m1")
+    process = start_waiting(starter, "m1")
     os.kill(int(process.pid or 0), signal.SIGKILL)
     assert wait_for_end(starter, process).problem() == "m1 was killed by SIGKILL"
 
 
 def test_unstarted_processes_end_with_their_starter(tmp_path: Path) -> None:
-    with closing(started(tmp_path)) as starter:
+    with closing(make_starter(tmp_path)) as starter:
         process = starter.start("m1", WAITS)
         process.end(signal.SIGINT)
         assert wait_for_end(starter, process).problem() is None
@@ -118,7 +118,7 @@ def test_unstarted_processes_end_with_their_starter(tmp_path: Path) -> None:
 
 def test_interrupted_starters_are_no_problem(tmp_path: Path) -> None:
     """An interpreter that a signal meets while it imports its first modules ends with code 1."""
-    with closing(started(tmp_path)) as starter:
+    with closing(make_starter(tmp_path)) as starter:
         process = SessionProcess(starter, "m1", tmp_path / "m1.txt")
         process.output.write_text("KeyboardInterrupt")
         process.code = 1
@@ -131,8 +131,8 @@ def test_interrupted_starters_are_no_problem(tmp_path: Path) -> None:
 
 def test_signals_before_the_handler_end_copies(tmp_path: Path) -> None:
     """The starter forks and signals at once: none of ten copies loses the signal."""
-    with closing(started(tmp_path)) as starter:
-        waiting(starter, "recorder")  # the starter serves orders
+    with closing(make_starter(tmp_path)) as starter:
+        start_waiting(starter, "recorder")  # the starter serves orders
         processes = []
         for n in range(10):
             processes.append(starter.start(f"m{n}", WAITS))
@@ -143,16 +143,16 @@ def test_signals_before_the_handler_end_copies(tmp_path: Path) -> None:
 
 
 def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
-    with closing(started(tmp_path)) as starter:
-        process = waiting(starter, "m1")
-        os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
+    with closing(make_starter(tmp_path)) as starter:
+        process = start_waiting(starter, "m1")
+        os.kill(find_parent(int(process.pid or 0)), signal.SIGKILL)
         assert wait_for_end(starter, process).problem() == "m1 was killed by SIGKILL"
     until(lambda: not is_running(int(process.pid or 0)))
 
 
 def test_processes_end_with_their_requester(tmp_path: Path) -> None:
-    starter = started(tmp_path)
-    processes = [waiting(starter, name) for name in ("m1", "recorder")]
+    starter = make_starter(tmp_path)
+    processes = [start_waiting(starter, name) for name in ("m1", "recorder")]
     starter.close()
     assert not any(is_running(int(process.pid or 0)) for process in processes)
 

@@ -64,7 +64,9 @@ class UnpunctualClock(ManualClock):
 
     def __init__(self, late_ns: int, every: int) -> None:
         super().__init__()
-        self._late_ns, self._every, self._sleeps = late_ns, every, 0
+        self._late_ns = late_ns
+        self._every = every
+        self._sleeps = 0
 
     def sleep_until(self, deadline_ns: int) -> None:
         self._sleeps += 1
@@ -73,7 +75,7 @@ class UnpunctualClock(ManualClock):
         )
 
 
-def states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
+def list_states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
     return [finding.state for finding in findings]
 
 
@@ -81,7 +83,7 @@ def test_valid_keys_pass(folder: Path) -> None:
     (finding,) = examine_keys(folder / "m1")
     assert finding.state == "ok"
     assert "m1 of m1, s, recorder, until" in finding.text
-    assert states(examine_keys(None)) == ["ok"]
+    assert list_states(examine_keys(None)) == ["ok"]
 
 
 def test_keys_ending_soon_or_open_are_reported(tmp_path: Path) -> None:
@@ -100,15 +102,17 @@ def test_keys_ending_soon_or_open_are_reported(tmp_path: Path) -> None:
     assert "chmod 600" in refused.text
 
 
-def links(
+def examine_connection(
     folder: Path | None, listen: list[str], connect: list[str], *, insecure: bool = False
 ) -> list[str]:
     owned = None if folder is None else read_member_keys(folder)
-    return states(examine_links(Connection(listen, connect), folder, owned, insecure=insecure))
+    return list_states(
+        examine_links(Connection(listen, connect), folder, owned, insecure=insecure)
+    )
 
 
 @contextmanager
-def member(folder: Path, place: str) -> Iterator[None]:
+def open_member(folder: Path, place: str) -> Iterator[None]:
     bus = ZenohBus([place], settings=read_member_keys(folder).settings)
     try:
         yield
@@ -121,12 +125,14 @@ def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) ->
     (endpoint, nobody) = (
         free_endpoint.replace("tcp", "tls") for free_endpoint in find_free_endpoints(2)
     )
-    with member(folder / "m1", endpoint):
-        assert links(folder / "s", [], [endpoint]) == ["ok"]
-        assert links(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]  # another authority
-        assert links(folder / "s", [endpoint], []) == ["fail"]  # the port is taken
-    assert links(folder / "s", [], [nobody]) == ["fail"]
-    assert links(folder / "s", [nobody], []) == ["ok"]
+    with open_member(folder / "m1", endpoint):
+        assert examine_connection(folder / "s", [], [endpoint]) == ["ok"]
+        assert examine_connection(tmp_path / "others" / "s", [], [endpoint]) == [
+            "fail"
+        ]  # another authority
+        assert examine_connection(folder / "s", [endpoint], []) == ["fail"]  # the port is taken
+    assert examine_connection(folder / "s", [], [nobody]) == ["fail"]
+    assert examine_connection(folder / "s", [nobody], []) == ["ok"]
 
 
 @pytest.mark.long
@@ -135,22 +141,24 @@ def test_members_answer_over_quic(folder: Path, tmp_path: Path) -> None:
     (endpoint, nobody) = (
         free_endpoint.replace("tcp", "quic") for free_endpoint in find_free_endpoints(2)
     )
-    with member(folder / "m1", endpoint):
-        assert links(folder / "s", [], [endpoint]) == ["ok"]
-        assert links(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]
-        assert links(None, [], [endpoint]) == ["warn"]
-        assert links(folder / "s", [endpoint], []) == ["fail"]
-    assert links(folder / "s", [], [nobody]) == ["fail"]
-    assert links(folder / "s", [nobody], []) == ["ok"]
+    with open_member(folder / "m1", endpoint):
+        assert examine_connection(folder / "s", [], [endpoint]) == ["ok"]
+        assert examine_connection(tmp_path / "others" / "s", [], [endpoint]) == ["fail"]
+        assert examine_connection(None, [], [endpoint]) == ["warn"]
+        assert examine_connection(folder / "s", [endpoint], []) == ["fail"]
+    assert examine_connection(folder / "s", [], [nobody]) == ["fail"]
+    assert examine_connection(folder / "s", [nobody], []) == ["ok"]
 
 
 def test_endpoints_open_to_networks_are_reported() -> None:
-    assert links(None, ["tcp/0.0.0.0:0"], []) == ["fail"]
-    assert links(None, ["tcp/0.0.0.0:0"], [], insecure=True) == ["warn"]
-    assert links(None, ["tcp/127.0.0.1:0"], []) == ["ok"]
-    assert links(None, [], ["quic/127.0.0.1:1"]) == ["warn"]  # not tried
+    assert examine_connection(None, ["tcp/0.0.0.0:0"], []) == ["fail"]
+    assert examine_connection(None, ["tcp/0.0.0.0:0"], [], insecure=True) == ["warn"]
+    assert examine_connection(None, ["tcp/127.0.0.1:0"], []) == ["ok"]
+    assert examine_connection(None, [], ["quic/127.0.0.1:1"]) == ["warn"]  # not tried
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        assert links(None, [], [f"tcp/127.0.0.1:{listener.getsockname()[1]}"]) == ["ok"]
+        assert examine_connection(None, [], [f"tcp/127.0.0.1:{listener.getsockname()[1]}"]) == [
+            "ok"
+        ]
 
 
 class OddClock(ManualClock):
@@ -158,7 +166,10 @@ class OddClock(ManualClock):
 
     def __init__(self, odd_ns: int = 0, wall_step_ns: int = 0) -> None:
         super().__init__()
-        self._reads, self._now, self._odd, self._step = 0, 0, odd_ns, wall_step_ns
+        self._reads = 0
+        self._now = 0
+        self._odd = odd_ns
+        self._step = wall_step_ns
 
     def monotonic_ns(self) -> int:
         self._reads += 1
@@ -173,7 +184,7 @@ class OddClock(ManualClock):
     ("clock", "state"), [((), "ok"), ((-5_000_000,), "fail"), ((0, 1 << 30), "warn")]
 )
 def test_clocks_that_go_back_are_reported(clock: tuple[int, ...], state: str) -> None:
-    assert states(examine_clock(OddClock(*clock))) == [state]
+    assert list_states(examine_clock(OddClock(*clock))) == [state]
 
 
 @pytest.mark.parametrize(
@@ -199,7 +210,7 @@ def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     done = SimpleNamespace(returncode=0, stdout=json.dumps(obtained))
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
-    assert states(doctor.examine_rights()) == ["warn", "ok", "ok"]
+    assert list_states(doctor.examine_rights()) == ["warn", "ok", "ok"]
 
 
 @pytest.mark.parametrize(
@@ -265,12 +276,12 @@ def test_promised_findings_are_reported(
 def test_open_rights_are_no_finding_on_windows(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On Windows a mode only says whether a file can be written."""
+    """The mode of a file on Windows only says whether the file can be written."""
     (folder / "m1" / "private.key").chmod(0o666)
     try:
         monkeypatch.setattr("trilat_net.net.member_keys.sys", SimpleNamespace(platform="win32"))
         monkeypatch.setattr("trilat_net.files.os", replace_os())
-        assert states(examine_keys(folder / "m1")) == ["ok"]
+        assert list_states(examine_keys(folder / "m1")) == ["ok"]
     finally:
         (folder / "m1" / "private.key").chmod(0o600)
 

@@ -22,10 +22,12 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
-from tests.analysis.logs import rewritten
+from tests.log.builders import rewrite_log
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from tests.scenario.chains import six
+from tests.net.waiting import sleep_for_ns
+from tests.scenario.builders import make_six_joint_scenario
+from tests.sites.sessions import reach_session
 from trilat_net.analysis.file_overview import info, summarise_run
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.core.step.site_step import Site
@@ -44,7 +46,7 @@ from trilat_net.presentation.page_sites import render_loops
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, reached
+from .sessions import SESSION, Session
 
 ARM = {
     "sites.s.plant": "external",
@@ -65,7 +67,8 @@ class Pendulum:
     """Uncoupled joints with friction, as an external arm."""
 
     def __init__(self, q: Sequence[float]) -> None:
-        self.q, self.qd = list(q), [0.0] * len(q)
+        self.q = list(q)
+        self.qd = [0.0] * len(q)
 
     def move(self, tau: tuple[float, ...] | None) -> None:
         for i in range(len(self.q)):
@@ -77,7 +80,7 @@ class Pendulum:
 Act = Callable[[Bus, RelayClock], None]
 
 
-def driving(
+def make_arm_program(
     sent: list[list[float]],
     torques: list[tuple[float, ...]],
     until_ns: int = 2**62,
@@ -111,7 +114,7 @@ def driving(
     return drive
 
 
-def session_of(
+def make_external_session(
     folder: Path, act: Act | None, **overrides: object
 ) -> tuple[Session, dict[str, object]]:
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
@@ -124,7 +127,7 @@ def session_of(
 def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     sent: list[list[float]] = []
     torques: list[tuple[float, ...]] = []
-    session, ends = session_of(tmp_path, driving(sent, torques))
+    session, ends = make_external_session(tmp_path, make_arm_program(sent, torques))
     log = session.run()
     assert ends == {"m": 0, "s": 0}
     records = [[*state.q, *state.qd] for state in log["s"].states]
@@ -137,13 +140,13 @@ def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     assert set(taus[:-1]) <= set(torques)
     moved = abs(log["s"].q[-1] - log["s"].q[0]).max()
     assert moved > 0.05
-    whole(log)
+    assert_reproduced(log)
     assert any("waiting for its arm on trilat/t/s/measured" in line for line in session.said)
     assert any("0.3 rad off q0_rad" in line for line in session.said)
     assert [event.member for event in log.events if event.kind == "arm"] == ["s"]
 
 
-def whole(log: Log) -> None:
+def assert_reproduced(log: Log) -> None:
     """Asserts that the log is executed again, and equals virtual time fed with the log, bit for bit."""
     assert log.complete
     verdict = verify(log)
@@ -158,12 +161,15 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
     execution.
     """
     changes = {**ARM, "duration_s": 0.3}
-    Site(six(**changes).setup("s")).step(TickInput(0))  # compiles, before anybody waits
+    Site(make_six_joint_scenario(**changes).setup("s")).step(
+        TickInput(0)
+    )  # compiles, before anybody waits
     sent: list[list[float]] = []
-    session = Session.whole(six(**changes), tmp_path, ends={})
-    start = six().sites["s"].q0_rad
+    session = Session.whole(make_six_joint_scenario(**changes), tmp_path, ends={})
+    start = make_six_joint_scenario().sites["s"].q0_rad
     session.stranger(
-        driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000
+        make_arm_program(sent, [], arm=Pendulum(start), senses=True),
+        at_ns=A_SECOND + 200_250_000,
     )
     log = session.run()
     assert set(session.ends.values()) == {0}
@@ -172,14 +178,15 @@ def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
         sent[n : n + 300] for n, record_sent in enumerate(sent) if record_sent == records[0]
     ]
     assert abs(log["s"].tau_x).min(axis=0).max() > 0.0
-    whole(log)
+    assert_reproduced(log)
 
 
 def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
-    scenario = six(**ARM)
+    scenario = make_six_joint_scenario(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
     session.stranger(
-        driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND
+        make_arm_program([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)),
+        at_ns=A_SECOND,
     )
 
     def alone(clock: RelayClock) -> None:
@@ -198,7 +205,9 @@ def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def test_silent_arms_are_held_then_in_fault(tmp_path: Path) -> None:
-    session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_300_000_000))
+    session, ends = make_external_session(
+        tmp_path, make_arm_program([], [], until_ns=A_SECOND + 1_300_000_000)
+    )
     log = session.run()
     assert ends == {"m": 0, "s": 0}
     modes = log["s"].mode
@@ -211,7 +220,7 @@ def test_silent_arms_are_held_then_in_fault(tmp_path: Path) -> None:
         re.search("s is in FAULT from .*: its arm is silent", event.text)
         for event in log.events
     )
-    whole(log)
+    assert_reproduced(log)
 
 
 @pytest.mark.parametrize(
@@ -222,11 +231,12 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
     session = Session.whole(scenario, tmp_path, ends={})
-    session.stranger(driving([], [], poses=poses), at_ns=A_SECOND + 200_250_000)
+    session.stranger(make_arm_program([], [], poses=poses), at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].stall(at_ns, int(frozen_s * A_SECOND))
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    part, missed = log["s"], round(1e3 * frozen_s)
+    part = log["s"]
+    missed = round(1e3 * frozen_s)
     (jump,) = np.flatnonzero(np.diff(part.tick) > 1)
     assert abs(int(part.tick[jump + 1] - part.tick[jump]) - missed) <= 1
     assert part.skipped == int(part.tick[jump + 1] - part.tick[jump]) - 1
@@ -241,18 +251,19 @@ def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
         )
         < 0.05
     )
-    before, after = part.theta_hat[jump], part.theta_hat[-1]
+    before = part.theta_hat[jump]
+    after = part.theta_hat[-1]
     assert np.abs(after - before).max() <= 0.01 * np.abs(before).max()
     assert np.abs(np.diff(part.tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log["m"].mode[-1] in ("run", "hold", "return")
-    whole(log)
+    assert_reproduced(log)
 
 
 def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     """Ticks that a late site skipped are named as skipped by sites, recorder, file and links."""
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 1.5})
     session = Session.whole(scenario, tmp_path, ends={})
-    session.stranger(driving([], []), at_ns=A_SECOND + 200_250_000)
+    session.stranger(make_arm_program([], []), at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].stall(2 * A_SECOND, A_SECOND // 100)
     log = session.run()
     skipped = log["s"].skipped
@@ -275,8 +286,8 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     (of_recorder,) = [line for line in summary if line.startswith("recorder: s:")]
     assert f", {skipped} skipped" in of_recorder
     assert "not made" not in of_recorder
-    own = "of them late by a period or more"
-    assert any(f"{own}, {skipped} of them skipped" in line for line in session.said)
+    phrase = "of them late by a period or more"
+    assert any(f"{phrase}, {skipped} of them skipped" in line for line in session.said)
     assert any(
         f"{skipped} missing (lost, or ticks that s skipped)" in line for line in session.said
     )
@@ -284,7 +295,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     def delay(state: State) -> State:
         return msgspec.structs.replace(state, late_us=1000 if state.tick in (7, 9) else 1)
 
-    late = rewritten(log, change=delay)
+    late = rewrite_log(log, change=delay)
     page = render_loops(late, summarise_run(late))
     assert "; 4 ticks began a period or more late and were made all the same; " in page
     assert f"{skipped} ticks were skipped." in page
@@ -292,26 +303,26 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
 
 def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
     """Held from 0.2 s to 0.5 s, then silent; again from 0.8 s, and let go at 1.1 s."""
-    session, ends = session_of(
-        tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
+    session, ends = make_external_session(
+        tmp_path, make_arm_program([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
     )
     answers: list[tuple[bool, str]] = []
 
     def hold(bus: Bus, clock: RelayClock) -> None:
         with SwitchClient(bus, clock, SESSION, "s") as switch:
             while switch.record is None:
-                clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
+                sleep_for_ns(clock, PERIOD_NS)
             begun_ns = clock.monotonic_ns() - switch.record.t_ns
             for from_s, to_s in ((0.2, 0.5), (0.8, 1.1)):
                 clock.sleep_until(begun_ns + round(from_s * 1e9))
                 while clock.monotonic_ns() < begun_ns + round(to_s * 1e9):
                     switch.send(held=True)
-                    clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+                    sleep_for_ns(clock, 20_000_000)
             switch.send(held=False)
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
             answers.extend(
-                (one.accepted, one.text)
-                for one in reached(bus, clock).send_order(["s"], "enable")
+                (answer.accepted, answer.text)
+                for answer in reach_session(bus, clock).send_order(["s"], "enable")
             )
 
     session.stranger(hold, at_ns=A_SECOND)
@@ -335,7 +346,7 @@ def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
         )
     ]
     assert np.abs(np.diff(log["s"].tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
-    whole(log)
+    assert_reproduced(log)
 
 
 def test_switches_need_external_arms() -> None:
@@ -349,7 +360,8 @@ class Switch:
     """A switch, and programs that report whether they hold the switch."""
 
     def __init__(self) -> None:
-        self.clock, self.dropped = ManualClock(), Counter[str]()
+        self.clock = ManualClock()
+        self.dropped = Counter[str]()
         self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
         self.switch = DeadManSwitch("s", self.ring, self.clock, self.dropped)
 
@@ -357,7 +369,7 @@ class Switch:
         self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0
     ) -> bool:
         """Processes a message of one program; returns whether the switch is held then."""
-        self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
+        sleep_for_ns(self.clock, after_ns)
         self.ring.receive(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
         self.switch.poll()
         return self.switch.held
@@ -365,7 +377,10 @@ class Switch:
 
 def test_switches_hold_until_released_or_silent() -> None:
     dead_man = Switch()
-    switch, clock, ring, hear = dead_man.switch, dead_man.clock, dead_man.ring, dead_man.hear
+    switch = dead_man.switch
+    clock = dead_man.clock
+    ring = dead_man.ring
+    hear = dead_man.hear
     assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
     assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == "released"
     assert switch.pop_order(Mode.STOPPED, LifeReason.STOP_RELEASED) == ""
@@ -375,7 +390,7 @@ def test_switches_hold_until_released_or_silent() -> None:
     assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
     assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
     assert hear(2, 0, held=False)  # of one that does not hold it
-    clock.sleep_until(clock.monotonic_ns() + SWITCH_SILENCE_NS)
+    sleep_for_ns(clock, SWITCH_SILENCE_NS)
     assert switch.held
     assert not hear(1, 5, after_ns=1)  # said before
     assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == ""
@@ -390,7 +405,8 @@ def test_switches_hold_until_released_or_silent() -> None:
 @pytest.mark.parametrize("first", [1, 2])
 def test_of_two_holders_either_release_stops(first: int) -> None:
     """The other one has to let go and press anew: a hand-over goes by way of a stop."""
-    switch, other = Switch(), 3 - first
+    switch = Switch()
+    other = 3 - first
     assert switch.hear(1, 0)
     assert switch.hear(2, 0)
     assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
@@ -440,13 +456,13 @@ def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     )
     session = Session.whole(scenario, tmp_path, ends={})
     poses: list[tuple[int, list[float]]] = []
-    drive = driving([], [], poses=poses)
+    drive = make_arm_program([], [], poses=poses)
     session.stranger(drive, at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].dies_ns = 3 * A_SECOND
     session.stranger(drive, at_ns=4 * A_SECOND + 250_000)
     session.site("s", at_ns=4 * A_SECOND)
     log = session.run()
-    assert [end for _, end in session.told] == ["killed", 0, 0]
+    assert [end for _, end in session.start_ends] == ["killed", 0, 0]
     ((first, _),) = log.starts["s"]
     (gone,) = log.absences["s"]
     before = [(now_ns, q) for now_ns, q in poses if now_ns < 4 * A_SECOND]
@@ -477,7 +493,7 @@ def test_without_an_arm_nothing_begins(tmp_path: Path) -> None:
 
 
 def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
-    session, ends = session_of(tmp_path, driving([], []))
+    session, ends = make_external_session(tmp_path, make_arm_program([], []))
 
     def shout(bus: Bus, clock: RelayClock) -> None:
         other = ArmClient(bus, clock, SESSION, "s")
@@ -485,7 +501,7 @@ def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
         for _ in range(50):
             other.send([9.0, 9.0], [0.0, 0.0])
             publish(b"garbage")
-            clock.sleep_until(clock.monotonic_ns() + 3_000_000)
+            sleep_for_ns(clock, 3_000_000)
 
     session.stranger(shout, at_ns=A_SECOND + 1_200_000_000)
     log = session.run()
@@ -493,10 +509,10 @@ def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
     assert abs(log["s"].q).max() < 2.0
     dropped = log.link_stats("s")[-1].dropped
     assert (dropped["stranger"], dropped["malformed"]) == (50, 50)
-    whole(log)
+    assert_reproduced(log)
 
 
-def measurement(**changed: object) -> bytes:
+def encode_measurement(**changed: object) -> bytes:
     fields = {
         "v": VERSION,
         "site": "s",
@@ -529,17 +545,17 @@ class Heard:
         (b"", "malformed"),
         (b"\xc1", "malformed"),
         (bytes(70_000), "oversized"),
-        (measurement(v=VERSION + 1), "version"),
-        (measurement(q=[1.0]), "of 1 joint; the scenario has 2"),
-        (measurement(qd=[1.0]), "malformed"),
-        (measurement(q=[1.0] * 13), "malformed"),
-        (measurement(q=[1.0, math.nan]), "not finite"),
-        (measurement(qd=[math.inf, 0.0]), "not finite"),
-        (measurement(tau_x=[1.0]), "malformed"),
-        (measurement(tau_x=[1.0, math.nan]), "malformed"),
-        (measurement(n=-1), "malformed"),
-        (measurement(more=1), "malformed"),
-        (measurement(site="m"), "stranger"),
+        (encode_measurement(v=VERSION + 1), "version"),
+        (encode_measurement(q=[1.0]), "of 1 joint; the scenario has 2"),
+        (encode_measurement(qd=[1.0]), "malformed"),
+        (encode_measurement(q=[1.0] * 13), "malformed"),
+        (encode_measurement(q=[1.0, math.nan]), "not finite"),
+        (encode_measurement(qd=[math.inf, 0.0]), "not finite"),
+        (encode_measurement(tau_x=[1.0]), "malformed"),
+        (encode_measurement(tau_x=[1.0, math.nan]), "malformed"),
+        (encode_measurement(n=-1), "malformed"),
+        (encode_measurement(more=1), "malformed"),
+        (encode_measurement(site="m"), "stranger"),
     ],
 )
 def test_invalid_measurements_are_counted_and_dropped(payload: bytes, reason: str) -> None:
@@ -552,11 +568,11 @@ def test_invalid_measurements_are_counted_and_dropped(payload: bytes, reason: st
 @given(order=st.permutations(range(8)), bound=st.booleans())
 def test_the_newest_measurement_counts_in_any_order(order: list[int], bound: bool) -> None:
     heard = Heard()
-    heard.hear(measurement(n=0, q=[-0.001, 0.0]))
+    heard.hear(encode_measurement(n=0, q=[-0.001, 0.0]))
     if bound:
         heard.arm.bind((-0.001, 0.0))
     for n in order:
-        heard.hear(measurement(n=n + 1, q=[n / 1000, 0.0]))
+        heard.hear(encode_measurement(n=n + 1, q=[n / 1000, 0.0]))
         assert heard.arm.newest.q[0] == max(order[: order.index(n) + 1]) / 1000
     records = sum(n > max(order[:i], default=-1) for i, n in enumerate(order))
     assert heard.arm.accepted == 1 + records
@@ -565,20 +581,20 @@ def test_the_newest_measurement_counts_in_any_order(order: list[int], bound: boo
 
 def test_a_flood_of_measurements_is_bounded_and_counted() -> None:
     heard = Heard()
-    heard.hear(measurement(n=0))
+    heard.hear(encode_measurement(n=0))
     heard.arm.bind((0.5, 0.25))
-    heard.hear(measurement(n=1), *(measurement(n=n) for n in range(2, 502)))
+    heard.hear(encode_measurement(n=1), *(encode_measurement(n=n) for n in range(2, 502)))
     assert heard.arm.accepted == 1 + MEASUREMENTS_KEPT
-    heard.hear(measurement(n=510))
+    heard.hear(encode_measurement(n=510))
     assert heard.dropped["missing measurement"] == 8
 
 
 def test_restarted_programs_count_until_the_session_begins() -> None:
     heard = Heard()
-    heard.hear(measurement(boot=1, n=900), measurement(boot=2, n=0, q=[2.0, 2.0]))
+    heard.hear(encode_measurement(boot=1, n=900), encode_measurement(boot=2, n=0, q=[2.0, 2.0]))
     assert heard.arm.newest.q == [2.0, 2.0]
     heard.arm.bind((2.0, 2.0))
-    heard.hear(measurement(boot=3, n=0))
+    heard.hear(encode_measurement(boot=3, n=0))
     assert heard.arm.newest.q == [2.0, 2.0]
     assert heard.dropped == {"stranger": 1}
 
@@ -586,13 +602,13 @@ def test_restarted_programs_count_until_the_session_begins() -> None:
 def test_silence_counts_only_hearing_time() -> None:
     """A process that slept for a minute has heard nothing, and knows nothing of the arm."""
     heard = Heard()
-    heard.hear(measurement())
+    heard.hear(encode_measurement())
     heard.arm.bind((0.5, 0.25))
     heard.clock.sleep_until(60 * A_SECOND)
     heard.hear()
     orders = [heard.arm.pop_order(Mode.RUN)]
     for _ in range(SILENCE_LIMIT_NS // PERIOD_NS + 1):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
+        sleep_for_ns(heard.clock, PERIOD_NS)
         heard.hear()
         orders.append(heard.arm.pop_order(Mode.HOLD if "arm_silent" in orders else Mode.RUN))
     # the sleep counts as 20 ms: no longer is it known that nothing came
@@ -600,22 +616,22 @@ def test_silence_counts_only_hearing_time() -> None:
     assert orders.index("arm_lost") == (SILENCE_LIMIT_NS - 20_000_000) // PERIOD_NS + 1
     assert heard.arm.pop_order(Mode.FAULT) == ""
     assert heard.arm.pop_order(Mode.WAITING) == "arm_lost"  # reset too early
-    heard.hear(measurement(boot=9, n=0))  # its program was started anew
+    heard.hear(encode_measurement(boot=9, n=0))  # its program was started anew
     assert heard.arm.pop_order(Mode.FAULT) == ""
     assert heard.arm.newest.q == [0.5, 0.25]
 
 
 def test_short_silences_end_with_a_measurement() -> None:
     heard = Heard()
-    heard.hear(measurement())
+    heard.hear(encode_measurement())
     heard.arm.bind((0.5, 0.25))
     for _ in range(40):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
+        sleep_for_ns(heard.clock, PERIOD_NS)
         heard.hear()
     assert heard.arm.pop_order(Mode.RUN) == "arm_silent"
-    heard.hear(measurement(boot=9, n=1))
+    heard.hear(encode_measurement(boot=9, n=1))
     assert heard.arm.pop_order(Mode.HOLD) == ""
-    heard.hear(measurement(n=1))
+    heard.hear(encode_measurement(n=1))
     assert heard.arm.pop_order(Mode.HOLD) == "arm_back"
     assert heard.arm.pop_order(Mode.RETURN) == ""
 
@@ -623,22 +639,23 @@ def test_short_silences_end_with_a_measurement() -> None:
 def test_encoder_glitches_count_as_silence() -> None:
     """The arm of two_sites may move at 100 rad/s, 0.1 rad in a period."""
     heard = Heard()
-    heard.hear(measurement(n=0))
+    heard.hear(encode_measurement(n=0))
     heard.arm.bind((0.5, 0.25))
     for n in range(1, 6):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
-        heard.hear(measurement(n=n, q=[1.5, 0.25] if n == 3 else [0.5, 0.25]))
+        sleep_for_ns(heard.clock, PERIOD_NS)
+        heard.hear(encode_measurement(n=n, q=[1.5, 0.25] if n == 3 else [0.5, 0.25]))
         assert heard.arm.newest.q == [0.5, 0.25]
     assert heard.dropped["implausible measurement"] == 1
     for n in range(6, 80):
-        heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS // 10)
-        heard.hear(measurement(n=n, q=[40.0, 0.25]))
+        sleep_for_ns(heard.clock, PERIOD_NS // 10)
+        heard.hear(encode_measurement(n=n, q=[40.0, 0.25]))
     assert heard.arm.newest.q == [0.5, 0.25]
     assert heard.dropped["implausible measurement"] == 75
 
 
 def test_torque_counts_while_fresh_and_running() -> None:
-    network, clock = LocalNetwork(), ManualClock()
+    network = LocalNetwork()
+    clock = ManualClock()
     site = network.join()
     port = ArmClient(network.join(), clock, "t", "s")
     assert port.torque() is None
@@ -708,7 +725,7 @@ def test_a_missing_site_is_over() -> None:
 
 def test_the_example_of_a_message_is_one() -> None:
     message = ArmMeasurement(site="s", boot=7, n=0, q=[0.5, 0.25], qd=[1.0, 2.0], sent_ns=5)
-    assert encode(message) == measurement(tau_x=[])
+    assert encode(message) == encode_measurement(tau_x=[])
 
 
 def test_the_page_names_every_field_of_a_message() -> None:

@@ -12,6 +12,7 @@ import pytest
 from sites.hand_server import MESSAGES_KEPT, HandServer
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.app.running_session import open_hand
 from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
 from trilat_net.errors import UsageError
@@ -41,17 +42,19 @@ class Felt:
         self.poses: list[tuple[float, ...]] = []
 
 
-def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) -> Any:
+def make_holding_program(
+    site: str, say: Say, felt: Felt, first: int = 12, last: int = 60
+) -> Any:
     """A program that holds an arm, sixty times a second; it lets go at the end of its context."""
 
     def act(bus: Bus, clock: RelayClock) -> None:
         with open_hand(bus, clock, SESSION, site, SCENARIO, f"hand at {site}") as hand:
             while hand.record is None:
-                clock.sleep_until(clock.monotonic_ns() + 1_000_000)
+                sleep_for_ns(clock, 1_000_000)
             for n in range(last):
                 if n >= first:
                     say(hand, n)
-                clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
+                sleep_for_ns(clock, PERIOD_NS)
                 if hand.record is not None:
                     felt.ticks.append(hand.record.tick)
                     felt.forces.append(hand.force)
@@ -62,13 +65,22 @@ def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) ->
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Felt]:
-    made, felt = Session.whole(SCENARIO, tmp_path_factory.mktemp("held")), Felt()
-    made.stranger(
-        holding("m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt)
+    held = Session.whole(SCENARIO, tmp_path_factory.mktemp("held"))
+    felt = Felt()
+    held.stranger(
+        make_holding_program(
+            "m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt
+        )
     )
-    made.stranger(holding("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt()))
-    made.stranger(holding("m1", lambda hand, _: hand.move(0.0, 0.0), Felt(), first=30, last=50))
-    return made.run(), felt
+    held.stranger(
+        make_holding_program("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt())
+    )
+    held.stranger(
+        make_holding_program(
+            "m1", lambda hand, _: hand.move(0.0, 0.0), Felt(), first=30, last=50
+        )
+    )
+    return held.run(), felt
 
 
 def test_a_session_with_people_is_verified_and_repeated(
@@ -94,9 +106,11 @@ def test_events_name_holders_and_count_refusals(session: tuple[Log, Felt]) -> No
 def test_felt_torque_equals_the_arms_torque(session: tuple[Log, Felt]) -> None:
     log, felt = session
     part = log["m1"]
-    (l1, l2), seen = SCENARIO.arms["m1"].lengths_m, 0
+    l1, l2 = SCENARIO.arms["m1"].lengths_m
+    seen = 0
     for tick, force, pose in zip(felt.ticks, felt.forces, felt.poses, strict=True):
-        q1, q12 = part.q[tick, 0], part.q[tick].sum()
+        q1 = part.q[tick, 0]
+        q12 = part.q[tick].sum()
         x, y = l1 * math.cos(q1) + l2 * math.cos(q12), l1 * math.sin(q1) + l2 * math.sin(q12)
         assert pose == pytest.approx((x, y))
         J = np.array([[-y, -l2 * math.sin(q12)], [x, l2 * math.cos(q12)]])
@@ -106,7 +120,8 @@ def test_felt_torque_equals_the_arms_torque(session: tuple[Log, Felt]) -> None:
 
 
 def test_hands_follow_their_mode() -> None:
-    bus, clock = LocalNetwork().join(), ManualClock()
+    bus = LocalNetwork().join()
+    clock = ManualClock()
     with open_hand(bus, clock, "t", "m1", SCENARIO) as hand:
         with pytest.raises(UsageError, match="can move, not push"):
             hand.push(1.0, 2.0)
@@ -120,7 +135,8 @@ class Served:
     def __init__(self) -> None:
         network = LocalNetwork()
         self.dropped: Counter[str] = Counter()
-        live, arm = SCENARIO.sites["m1"].find_live_hand(), SCENARIO.arms["m1"]
+        live = SCENARIO.sites["m1"].find_live_hand()
+        arm = SCENARIO.arms["m1"]
         assert live is not None
         key = topics.key("t", "m1", topics.HAND)
         inbox = network.join().inbox(key, MESSAGES_KEPT)
@@ -136,7 +152,7 @@ class Served:
         return HandInForce.read(self.server.track(self._site, self.k))
 
 
-def message(**fields: Any) -> bytes:
+def encode_message(**fields: Any) -> bytes:
     return encode(
         HandMessage(
             **{"site": "m1", "boot": 5, "n": 0, "target": [1.5, 0.5], "sent_ns": 0, **fields}
@@ -148,13 +164,13 @@ def message(**fields: Any) -> bytes:
     ("payload", "reason"),
     [
         (b"\xc1", "hand: malformed"),
-        (message(target=[math.nan, 0.0]), "hand: not finite"),
-        (message(target=[math.inf, 0.0]), "hand: not finite"),
-        (message(target=[1000.0, 0.0]), "hand: out of range"),
-        (message(target=[1e308, 1e308]), "hand: out of range"),
-        (message(target=[1.0, 0.0, 0.0]), "hand: no target of 2 numbers"),
-        (message(target=[], force=[1e9, 0.0]), "hand: no target of 2 numbers"),
-        (message(site="m2"), "hand: stranger"),
+        (encode_message(target=[math.nan, 0.0]), "hand: not finite"),
+        (encode_message(target=[math.inf, 0.0]), "hand: not finite"),
+        (encode_message(target=[1000.0, 0.0]), "hand: out of range"),
+        (encode_message(target=[1e308, 1e308]), "hand: out of range"),
+        (encode_message(target=[1.0, 0.0, 0.0]), "hand: no target of 2 numbers"),
+        (encode_message(target=[], force=[1e9, 0.0]), "hand: no target of 2 numbers"),
+        (encode_message(site="m2"), "hand: stranger"),
         (bytes(70_000), "hand: oversized"),
     ],
 )
@@ -167,10 +183,10 @@ def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -
 def test_floods_are_read_slowly_and_move_nobody() -> None:
     """A hundred messages a tick of others: the holder's arm stays still, and few messages are read."""
     served = Served()
-    served.take(message())
+    served.take(encode_message())
     for k in range(1, 100):
-        flood = [message(boot=100 + n, n=k, target=[9.0, 9.0]) for n in range(100)]
-        hand = served.take(*flood, message(n=k, target=[1.5, 0.5]))
+        flood = [encode_message(boot=100 + n, n=k, target=[9.0, 9.0]) for n in range(100)]
+        hand = served.take(*flood, encode_message(n=k, target=[1.5, 0.5]))
     assert hand.source == 5
     assert hand.number == 99
     assert served.dropped == {ANOTHER_HOLDS: 99 * (MESSAGES_KEPT - 1)}

@@ -8,13 +8,14 @@ import pytest
 from sites.site_parts import warm_up
 from tests.control_laws.law_settings import LAWS
 from tests.energy_runs import FOLLOWER
+from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.errors import LawFailed
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
 
-from .sessions import Session, in_log, in_virtual_time
+from .sessions import Session
 
 
 def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, object]]:
@@ -27,8 +28,8 @@ def test_own_paper_law_has_live_bits(tmp_path: Path) -> None:
     law = {"law": "tests.laws:Adaptive"}
     log, ends = lived(tmp_path, "two_sites", control=law)
     assert ends == {"m": 0, "s": 0}
-    assert in_log(log) == in_virtual_time(log.scenario)
-    assert in_log(log) == in_virtual_time(load_scenario("two_sites", {"duration_s": 0.5}))
+    assert pack_log(log) == execute_packed(log.scenario)
+    assert pack_log(log) == execute_packed(load_scenario("two_sites", {"duration_s": 0.5}))
     verdict = verify(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 1000
@@ -38,7 +39,7 @@ def test_law_messages_equal_those_of_virtual_time(tmp_path: Path) -> None:
     log, _ = lived(
         tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3
     )
-    assert in_log(log) == in_virtual_time(log.scenario)
+    assert pack_log(log) == execute_packed(log.scenario)
     assert verify(log).identical == 900
     assert log["m1"].sent["target[s]"].any()
 
@@ -58,7 +59,7 @@ def test_every_plugged_law_has_live_bits(law: str, tmp_path: Path) -> None:
     digital = {"scheme": "digital"} if law in ENERGY_LAWS else {}
     keys = {"link.delay_ms": 20.0, "control.law": law, **digital, **settings}
     log, _ = lived(tmp_path, name, duration_s=0.3, **keys)
-    assert in_log(log) == in_virtual_time(log.scenario)
+    assert pack_log(log) == execute_packed(log.scenario)
     assert verify(log).identical == 300 * len(log.sites)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.sites.sessions import make_gliding_scenario
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.link_summary import summarise_links
@@ -19,19 +20,19 @@ from trilat_net.log.session_check import check_file
 from trilat_net.net import topics
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, gliding
+from .sessions import SESSION, Session
 
 S = 1_000_000_000
 
 
-def engaged_after_s(log: Log, site: str, tick: int) -> float:
+def measure_engagement_s(log: Log, site: str, tick: int) -> float:
     part = log[site]
     after = (part.tick >= tick) & (part.mode == "run")
     return float(part.tick[np.argmax(after)] - tick) / part.rate_hz
 
 
 def test_killed_sites_return_and_logs_are_whole(tmp_path: Path) -> None:
-    session = Session.whole(gliding(7.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 4 * S
     session.site("m", at_ns=5 * S)
     log = session.run()
@@ -43,7 +44,7 @@ def test_killed_sites_return_and_logs_are_whole(tmp_path: Path) -> None:
     held = log["s"].mode[log.absences["m"][0][0] + 20 : first]
     assert set(held) == {"hold"}
     for site in ("m", "s"):
-        assert engaged_after_s(log, site, first) < 2.0
+        assert measure_engagement_s(log, site, first) < 2.0
         assert log.missing(site) == 0
         assert log[site].mode[-1] == "run"
     result = verify(log)
@@ -60,7 +61,7 @@ def kinds_about(log: Log, member: str, about: str) -> list[str]:
 
 
 def test_ended_sites_are_named_to_the_others(tmp_path: Path) -> None:
-    session = Session.whole(gliding(4.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(4.0), tmp_path, ends={})
     session.interrupt("s", 3 * S)
     log = session.run()
     assert session.ends is not None
@@ -82,7 +83,7 @@ def test_ended_sites_are_named_to_the_others(tmp_path: Path) -> None:
 
 def test_departed_sites_are_awaited_only_as_configured(tmp_path: Path) -> None:
     session = Session.whole(
-        gliding(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}}
+        make_gliding_scenario(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}}
     )
     session.clocks["s"].dies_ns = 3 * S
     log = session.run()
@@ -96,7 +97,7 @@ def test_departed_sites_are_awaited_only_as_configured(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
-    session = Session.whole(gliding(9.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(9.0), tmp_path, ends={})
     session.interrupt("s", 3 * S, 15)
     session.site("s", at_ns=4 * S)
     session.clocks["s"].dies_ns = 6 * S
@@ -114,7 +115,7 @@ def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
 
 
 def test_late_sites_may_join_a_flexible_start(tmp_path: Path) -> None:
-    scenario = gliding(5.0, "asymmetric")
+    scenario = make_gliding_scenario(5.0, "asymmetric")
     session = Session(
         scenario,
         tmp_path / "run.mcap",
@@ -139,7 +140,9 @@ def test_late_sites_may_join_a_flexible_start(tmp_path: Path) -> None:
 def test_sites_on_other_clocks_find_the_grid(dies: str, tmp_path: Path) -> None:
     """The first site, whose grid the others follow, as well as another."""
     skews = {"m1": (7 * S, 60_000), "s": (-500_000_000, -100_000)}
-    session = Session.whole(gliding(8.0, "asymmetric"), tmp_path, ends={}, skews=skews)
+    session = Session.whole(
+        make_gliding_scenario(8.0, "asymmetric"), tmp_path, ends={}, skews=skews
+    )
     session.clocks[dies].dies_ns = 4 * S
     session.site(dies, at_ns=5 * S)
     log = session.run()
@@ -162,7 +165,7 @@ def test_second_starts_wait_for_present_ones(tmp_path: Path) -> None:
 
     A frozen one does not answer, but its token keeps its place.
     """
-    session = Session.whole(gliding(4.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(4.0), tmp_path, ends={})
     refused: list[object] = []
 
     def second(clock: RelayClock) -> None:
@@ -180,7 +183,7 @@ def test_second_starts_wait_for_present_ones(tmp_path: Path) -> None:
 
 
 def test_late_recorders_learn_of_ticks_not_made(tmp_path: Path) -> None:
-    session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
+    session = Session(make_gliding_scenario(8.0), tmp_path / "run.mcap", ends={})
     for name in ("m", "s"):
         session.site(name, needs_recorder=False)
     session.clocks["m"].dies_ns = 3 * S
@@ -200,11 +203,8 @@ def test_late_recorders_learn_of_ticks_not_made(tmp_path: Path) -> None:
 
 
 def test_samples_without_record_leave_few_ticks_open(tmp_path: Path) -> None:
-    """Its peer used such a sample until it held: those ticks cannot be executed.
-
-    The held sample is in the peer's records.
-    """
-    session = Session.whole(gliding(7.0), tmp_path, ends={})
+    """The peer used such a sample until it held, so that those ticks cannot be executed."""
+    session = Session.whole(make_gliding_scenario(7.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/state", 4 * S - 14_000_000, 5 * S)
     session.clocks["m"].dies_ns = 4 * S
     session.site("m", at_ns=5 * S)
@@ -217,7 +217,7 @@ def test_samples_without_record_leave_few_ticks_open(tmp_path: Path) -> None:
 
 
 def test_one_way_cuts_are_in_last_messages(tmp_path: Path) -> None:
-    session = Session.whole(gliding(3.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(3.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/sample", 3 * S, 60 * S)
     log = session.run()
     ends = {event.member: event.text for event in log.events if event.kind == "end"}
@@ -228,8 +228,8 @@ def test_one_way_cuts_are_in_last_messages(tmp_path: Path) -> None:
 
 
 def test_a_site_not_admitted_names_the_refusers(tmp_path: Path) -> None:
-    """Its messages do not reach one of them: the site waits, and reports why it does not join."""
-    session = Session.whole(gliding(9.0, "asymmetric"), tmp_path, ends={})
+    """The site's messages do not reach one peer; the site waits, and reports why it does not join."""
+    session = Session.whole(make_gliding_scenario(9.0, "asymmetric"), tmp_path, ends={})
     session.clocks["s"].dies_ns = 3 * S
     failed: list[str] = []
 
@@ -247,7 +247,7 @@ def test_a_site_not_admitted_names_the_refusers(tmp_path: Path) -> None:
 
 
 def test_sites_report_peers_that_cannot_hear_them(tmp_path: Path) -> None:
-    session = Session.whole(gliding(4.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(4.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/sample", 3 * S, 3 * S + 600_000_000)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
@@ -265,14 +265,15 @@ def test_sites_report_peers_that_cannot_hear_them(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
-    session = Session.whole(gliding(7.0, "paper"), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(7.0, "paper"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4 * S
     session.site("m1", at_ns=5 * S)
     log = session.run()
     certificate = certify(log)
     premises = {premise.name: premise for premise in certificate.premises}
     assert premises["presence"].holds is False
-    (first, last), rate_hz = log.absences["m1"][0], 200
+    first, last = log.absences["m1"][0]
+    rate_hz = 200
     assert (
         f"m1 {first / rate_hz:.4g} to {(last + 1) / rate_hz:.4g} s" in premises["presence"].text
     )
@@ -295,8 +296,8 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
 def test_starts_dead_before_tick_0_free_places(
     dies_ms: int, again_ms: int, tmp_path: Path
 ) -> None:
-    """Also if the other site admits the dead start only when the next one is there already."""
-    session = Session.whole(gliding(7.0), tmp_path, ends={})
+    """The place is free also if the other site admits the dead start only after the next start has come."""
+    session = Session.whole(make_gliding_scenario(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 3 * S
     session.site("m", at_ns=4 * S)
     session.clocks["m"].dies_ns = dies_ms * 1_000_000  # it has said `coming` alone
@@ -311,7 +312,7 @@ def test_starts_dead_before_tick_0_free_places(
 
 
 def test_returning_sites_ignore_leaving_ones(tmp_path: Path) -> None:
-    session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(6.0, "asymmetric"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 3 * S
     session.site("m1", at_ns=4 * S)
     # its token was seen, and it has answered nothing
@@ -332,7 +333,7 @@ def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: 
     """The second site learns of the first start from those that admit both, which know of that
     start only since then.
     """
-    session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(6.0, "asymmetric"), tmp_path, ends={})
     for name, wait_ms in (("m2", 0), ("m1", later_ms)):
         session.interrupt(name, 3 * S + wait_ms * 1_000_000, 15)
         session.site(name, at_ns=3 * S + (140 + wait_ms) * 1_000_000)
@@ -347,13 +348,13 @@ def test_frozen_starts_end_after_their_replacement(tmp_path: Path) -> None:
     """The token of the frozen start went, like that of a process that is stopped for longer
     than its lease.
     """
-    session = Session.whole(gliding(8.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(8.0), tmp_path, ends={})
     session.clocks["m"].stall(3 * S, 3 * S)
     session.clocks["s"].at(3 * S + 500_000_000, lambda: session.lose_token("m"))
     session.site("m", at_ns=4 * S)
     log = session.run()
     assert len(log.starts["m"]) == 1
-    frozen, _, again = (end for _, end in session.told)
+    frozen, _, again = (end for _, end in session.start_ends)
     assert "another start of m has replaced this site" in str(frozen)
     assert again == 0
     assert log["m"].mode[-1] == "run"
@@ -364,7 +365,7 @@ def test_frozen_starts_end_after_their_replacement(tmp_path: Path) -> None:
 def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
     """The first recorder is gone before a site returns, the second begins while the site is away."""
     stops_ns = 3 * S + 500_000_000
-    session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
+    session = Session(make_gliding_scenario(8.0), tmp_path / "run.mcap", ends={})
     session.recorder(lambda: session.relay.now_ns >= stops_ns)
     for name in ("m", "s"):
         session.site(name)
@@ -386,9 +387,9 @@ def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
 
 
 def test_lost_tokens_alone_are_no_departure(tmp_path: Path) -> None:
-    """As a reconnection may report the end of a connection after its return."""
+    """A reconnection may report the end of a connection after its return."""
     session = Session.whole(
-        gliding(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}}
+        make_gliding_scenario(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}}
     )
     session.clocks["s"].at(3 * S, lambda: session.lose_token("m"))
     log = session.run()
@@ -400,7 +401,7 @@ def test_ending_sites_await_disconnected_recorders(tmp_path: Path) -> None:
     """The recorder's token is gone, and it received neither the last records nor the end; then
     it asks for them.
     """
-    session = Session.whole(gliding(2.0), tmp_path, ends={})
+    session = Session.whole(make_gliding_scenario(2.0), tmp_path, ends={})
     session.clocks["s"].at(3 * S + 600_000_000, lambda: session.lose_token("recorder"))
     for name in ("m", "s"):
         for channel in (topics.STATE, topics.EVENT, topics.LINK):

@@ -9,6 +9,8 @@ import pytest
 
 from sites.site_loop import PeerInbox, StateBlock, run_loop
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
+from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import RunFailed, SessionError
@@ -22,7 +24,7 @@ from trilat_net.net.wire import decode
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, in_log, in_virtual_time
+from .sessions import SESSION, Session
 
 EPOCH_NS = 5_000_000_123
 
@@ -53,7 +55,8 @@ class Alone:
         self.links: list[LinkStats] = []
         self.slack: list[tuple[int, int]] = []
         self.stopped: Callable[[], bool] = lambda: False
-        self._clock, self._ticks = clock, scenario.ticks("m")
+        self._clock = clock
+        self._ticks = scenario.ticks("m")
 
     def run(self, turn_ns: int = 0, *, catches_up: bool = True) -> object:
         inbox = PeerInbox((), (), (), (), self.stats.dropped)
@@ -106,7 +109,8 @@ def test_missed_ticks_run_back_to_back() -> None:
 
 
 def test_lateness_enters_no_formula() -> None:
-    prompt, late = Alone(LateClock()), Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
+    prompt = Alone(LateClock())
+    late = Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
     prompt.run()
     late.run()
     on_time = [
@@ -117,7 +121,8 @@ def test_lateness_enters_no_formula() -> None:
 
 
 def test_turns_shift_only_wake_ups() -> None:
-    clock, prompt = LateClock(), Alone(LateClock())
+    clock = LateClock()
+    prompt = Alone(LateClock())
     in_turn = Alone(clock)
     prompt.run()
     in_turn.run(turn_ns=333_000)
@@ -197,7 +202,7 @@ def test_ten_timed_changes_have_live_bits(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.2, **changes})
     log = Session.whole(scenario, tmp_path).run()
     assert len(log.scenario.timeline) == 10
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     assert verify(log).passed
     assert set(log["s"].mode) == {"run", "hold"}
 
@@ -221,7 +226,7 @@ def test_live_loops_equal_virtual_time_bitwise(name: str, tmp_path: Path) -> Non
     assert [len(log[site]) for site in log.sites] == [
         scenario.ticks(site) for site in scenario.names
     ]
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     assert verify(log).passed
 
 
@@ -251,7 +256,7 @@ def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
     session.clocks["m2"].stall(2_000_000_000, 190_000_000)
     log = session.run()
     assert max(log["m2"].late_us) > 150_000
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
 
 
 def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
@@ -265,14 +270,15 @@ def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
     assert twins.late
     first = twins.late[0]
     assert first.peer == "m2"
-    live, plain = in_log(log), in_virtual_time(scenario)
+    live = pack_log(log)
+    plain = execute_packed(scenario)
     for site in log.sites:
         assert live[site][: first.due_tick] == plain[site][: first.due_tick]
     assert live != plain
     assert verify(log).passed
 
 
-def shout(bus: Bus, clock: RelayClock) -> None:
+def publish_garbage(bus: Bus, clock: RelayClock) -> None:
     """Publishes invalid messages on every key of a session, while the session runs."""
     targets = [
         bus.publisher(topics.key(SESSION, member, channel))
@@ -282,23 +288,23 @@ def shout(bus: Bus, clock: RelayClock) -> None:
     for n in range(100):
         for publish in targets:
             publish((b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000)[n % 5])
-        clock.sleep_until(clock.monotonic_ns() + 17_000_000)
+        sleep_for_ns(clock, 17_000_000)
 
 
 def come_and_go(bus: Bus, clock: RelayClock) -> None:
     """Publishes a token that is no number of a start."""
     bus.announce(f"trilat/{SESSION}/m1/alive/no-number")
-    clock.sleep_until(clock.monotonic_ns() + 300_000_000)
+    sleep_for_ns(clock, 300_000_000)
     bus.close()
 
 
 def test_strangers_and_their_garbage_change_no_bit(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
-    session.stranger(shout)
+    session.stranger(publish_garbage)
     session.stranger(come_and_go, at_ns=2_000_000_000)
     log = session.run()
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     dropped = log.link_stats("m1")[-1].dropped
     assert dropped["malformed"] > 0
     assert dropped["oversized"] > 0

@@ -16,7 +16,8 @@ class MeteredClock(ManualClock):
 
     def __init__(self, path: Path, after: str) -> None:
         super().__init__()
-        self._path, self._after = path, after
+        self._path = path
+        self._after = after
 
     def sleep_until(self, deadline_ns: int) -> None:
         super().sleep_until(deadline_ns)

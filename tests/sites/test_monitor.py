@@ -9,6 +9,7 @@ import pytest
 import trilat_net
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
 from trilat_net.app.monitor import LINES_NS, SessionDisplay, SessionMonitor
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
@@ -27,8 +28,10 @@ STATISTICS = LoopStats(SITE, 1).pop_stats(SITE.step(TickInput(0)))
 @pytest.mark.parametrize("terminal", [False, True])
 def test_strangers_messages_are_shown_or_ignored(terminal: bool) -> None:
     moved = trilat_net.simulate(SCENARIO, duration_s=0.01)["m1"]
-    network, clock = LocalNetwork(), ManualClock()
-    mine, out = network.join(), io.StringIO()
+    network = LocalNetwork()
+    clock = ManualClock()
+    mine = network.join()
+    out = io.StringIO()
     display = SessionDisplay(TextConsole(file=out, force_terminal=terminal, width=200), clock)
     watch = SessionMonitor(mine, "t", SCENARIO, display)
     stranger = network.join()
@@ -52,7 +55,7 @@ def test_strangers_messages_are_shown_or_ignored(terminal: bool) -> None:
     with display:
         watch.poll()
         assert list(watch.latest) == ["m1"]
-        clock.sleep_until(clock.monotonic_ns() + LINES_NS)
+        sleep_for_ns(clock, LINES_NS)
         watch.poll()
     assert out.getvalue().count("s is gone") == 1
     assert "[/red] s is gone [x]" in out.getvalue()

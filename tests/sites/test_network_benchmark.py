@@ -34,7 +34,8 @@ class SlowFarEnd:
     def __init__(
         self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0
     ) -> None:
-        relayed, self.came = LocalNetwork(), 0
+        relayed = LocalNetwork()
+        self.came = 0
         answer_benchmarks(relayed.join(), "far")
         forward = relayed.join()
         to_near = network.join().publisher(topics.key(SESSION, "far", topics.SAMPLE))
@@ -54,7 +55,8 @@ class SlowFarEnd:
 
 @pytest.mark.parametrize("trip_ms", [0.4, 35.0])
 def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
-    relay, network = Relay(), LocalNetwork()
+    relay = Relay()
+    network = LocalNetwork()
     far = SlowFarEnd(relay, network, round(trip_ms * MS), lost_every=10)
     network.join().publisher(topics.key(SESSION, "other", topics.SAMPLE))(b"junk")
 
@@ -76,12 +78,13 @@ def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
 
 
 def test_an_absent_far_end_is_reported() -> None:
-    relay, network = Relay(), LocalNetwork()
+    relay = Relay()
+    network = LocalNetwork()
     relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").wait_for_far_end())
     assert relay.run()["near"] is False
 
 
-def row(needs, p99_ms: float, lost: int = 0) -> dict:
+def make_row(needs, p99_ms: float, lost: int = 0) -> dict:
     times = {"p50": 500 * p99_ms, "p99": 1e3 * p99_ms, "max": 2e3 * p99_ms}
     facts = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
     return {**facts, "lost": lost, "one_way_us": times}
@@ -97,15 +100,17 @@ def test_delay_margins_judge_a_network() -> None:
     ]
     edge_ms = needs.stable_ms[0][1]
     assert edge_ms == pytest.approx(229.8, abs=0.05)
-    hidden = judge_network(needs, row(needs, 150.0))
+    hidden = judge_network(needs, make_row(needs, 150.0))
     assert hidden["hidden"]
     assert (hidden["good"], hidden["age_ms"]) == (True, 200.0)
     assert hidden["spare_ms"] == pytest.approx(edge_ms - 200.0)
-    near = judge_network(needs, row(needs, 228.4))
+    near = judge_network(needs, make_row(needs, 228.4))
     assert (near["good"], near["hidden"], near["age_ms"]) == (True, False, 229.0)
-    assert not judge_network(needs, row(needs, 230.0))["good"]
-    assert not judge_network(needs, row(needs, 150.0, lost=2))["good"]
-    assert not judge_network(needs, {**row(needs, 1.0, lost=1000), "one_way_us": None})["good"]
+    assert not judge_network(needs, make_row(needs, 230.0))["good"]
+    assert not judge_network(needs, make_row(needs, 150.0, lost=2))["good"]
+    assert not judge_network(needs, {**make_row(needs, 1.0, lost=1000), "one_way_us": None})[
+        "good"
+    ]
 
 
 def test_measured_links_add_their_play_out() -> None:
@@ -113,22 +118,22 @@ def test_measured_links_add_their_play_out() -> None:
         tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40})
     )
     assert (needs.playout_ms, needs.held_ms, needs.in_use_ms) == (40.0, 40.0, None)
-    assert judge_network(needs, row(needs, 12.3))["age_ms"] == 40.0
-    assert judge_network(needs, row(needs, 41.3))["age_ms"] == 42.0
-    assert judge_network(needs, row(needs, 41.3))["playout_ms"] == 83
+    assert judge_network(needs, make_row(needs, 12.3))["age_ms"] == 40.0
+    assert judge_network(needs, make_row(needs, 41.3))["age_ms"] == 42.0
+    assert judge_network(needs, make_row(needs, 41.3))["playout_ms"] == 83
 
 
 def check_result(result: Result, transports: list[str]) -> None:
     facts = result.to_dict()
-    assert [one["transport"] for one in facts["transports"]] == transports
+    assert [transport["transport"] for transport in facts["transports"]] == transports
     assert len(facts["rows"]) == 6 * len(transports)
-    assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
+    assert all(0 <= row["lost"] <= row["sent"] for row in facts["rows"])
     # a machine that stands still for half a second loses all of a row
-    for one in facts["rows"]:
-        assert (one["one_way_us"] is None) == (one["lost"] == one["sent"])
+    for row in facts["rows"]:
+        assert (row["one_way_us"] is None) == (row["lost"] == row["sent"])
         assert (
-            one["one_way_us"] is None
-            or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
+            row["one_way_us"] is None
+            or 0 < row["one_way_us"]["p50"] <= row["one_way_us"]["max"]
         )
     assert is_documented("ping --benchmark", facts)
     assert facts["connect"] or result.summary().startswith(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sites.hand_process import HandProcess
+from tests.net.waiting import sleep_for_ns
 from tests.own_code import Circle, Failing, Follower
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
@@ -28,14 +29,14 @@ SIGNALS = ("q", "qd", "tau", "q_des", "hand")
 MS_NS = 1_000_000
 
 
-def at_m2(kind: str, **keys: Any) -> Scenario:
+def make_hand_scenario(kind: str, **keys: Any) -> Scenario:
     hand = {"kind": "own", "class": f"tests.own_code:{kind}", **keys}
     return load_scenario(
         "paper", {"sites.m2.hands": [hand], "link.delay_ms": 50, "duration_s": 1.0}
     )
 
 
-def begin(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
+def make_hand_session(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
     """Returns a session whose hand at m2 runs in a process of its own."""
     at = HandSite.find(scenario, "m2")
     assert at is not None
@@ -46,7 +47,9 @@ class Thinking:
     """A program that takes a time over each view."""
 
     def __init__(self, program: HandProgram, clock: RelayClock, thinks_ns: int) -> None:
-        self._program, self._clock, self._thinks_ns = program, clock, thinks_ns
+        self._program = program
+        self._clock = clock
+        self._thinks_ns = thinks_ns
 
     def act(self, now: HandView) -> Any:
         self._clock.sleep_until(self._clock.monotonic_ns() + self._thinks_ns)
@@ -65,7 +68,7 @@ def add_program(
         with HandProcess(at, thinking, session.network.join(), clock, SESSION) as hand:
             while not hand.over and (dies_ns is None or clock.monotonic_ns() < dies_ns):
                 hand.serve()
-                clock.sleep_until(clock.monotonic_ns() + MS_NS)
+                sleep_for_ns(clock, MS_NS)
 
     session.relay.add("hand", run)
 
@@ -81,31 +84,31 @@ def assert_same(log: Log, other: Log) -> None:
 
 @pytest.mark.parametrize("kind", [Circle, Follower])
 def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path) -> None:
-    """In virtual time, live in the process of its site, and live in a process of its own."""
-    alone = at_m2(kind.__name__, process=True)
-    at, session = begin(alone, tmp_path)
+    """The hand runs in virtual time, live in the process of its site, and live in its own process."""
+    alone = make_hand_scenario(kind.__name__, process=True)
+    at, session = make_hand_session(alone, tmp_path)
     add_program(session, kind(at.describe()))
     log = session.run()
     assert_same(log, simulate_scenario(alone))
     (tmp_path / "within").mkdir()
-    within = at_m2(kind.__name__)
-    found = Session.whole(within, tmp_path / "within").run()
-    assert_same(found, simulate_scenario(within))
-    assert_same(log, found)
+    within = make_hand_scenario(kind.__name__)
+    inner_log = Session.whole(within, tmp_path / "within").run()
+    assert_same(inner_log, simulate_scenario(within))
+    assert_same(log, inner_log)
     assert verify(log).passed
 
 
 def test_thinking_within_the_delay_changes_nothing(tmp_path: Path) -> None:
-    scenario = at_m2("Follower", process=True, delay_ms=20.0)
-    at, session = begin(scenario, tmp_path)
+    scenario = make_hand_scenario("Follower", process=True, delay_ms=20.0)
+    at, session = make_hand_session(scenario, tmp_path)
     add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
     assert_same(session.run(), simulate_scenario(scenario))
     assert not any("hand:" in text for text in session.said)
 
 
 def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
-    scenario = at_m2("Circle", process=True, delay_ms=20.0)
-    at, session = begin(scenario, tmp_path)
+    scenario = make_hand_scenario("Circle", process=True, delay_ms=20.0)
+    at, session = make_hand_session(scenario, tmp_path)
     add_program(session, Circle(at.describe()), thinks_ns=70 * MS_NS)
     log = session.run()
     assert any("hand: late" in text for text in session.said)
@@ -114,8 +117,8 @@ def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
 
 
 def test_killed_programs_let_go_without_harm(tmp_path: Path) -> None:
-    scenario = at_m2("Circle", process=True)
-    at, session = begin(scenario, tmp_path)
+    scenario = make_hand_scenario("Circle", process=True)
+    at, session = make_hand_session(scenario, tmp_path)
     add_program(session, Circle(at.describe()), dies_ns=2_100 * MS_NS)
     log = session.run()
     assert log.complete
@@ -127,8 +130,8 @@ def test_killed_programs_let_go_without_harm(tmp_path: Path) -> None:
 
 
 def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
-    scenario = at_m2("Failing", process=True)
-    at, session = begin(scenario, tmp_path)
+    scenario = make_hand_scenario("Failing", process=True)
+    at, session = make_hand_session(scenario, tmp_path)
     failing = Failing(at.describe(), at_s=0.4)
     ended: list[str] = []
 
@@ -137,7 +140,7 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
             try:
                 while not hand.over:
                     hand.serve()
-                    clock.sleep_until(clock.monotonic_ns() + MS_NS)
+                    sleep_for_ns(clock, MS_NS)
             except RunFailed as failed:
                 ended.append(str(failed))
 
@@ -154,8 +157,8 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
 
 
 def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
-    scenario = at_m2("Circle", process=True)
-    at, session = begin(scenario, tmp_path)
+    scenario = make_hand_scenario("Circle", process=True)
+    at, session = make_hand_session(scenario, tmp_path)
     add_program(session, Circle(at.describe()))
 
     def meddle(clock: RelayClock) -> None:
@@ -172,7 +175,7 @@ def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
             )
             publish(encode(moved))
             publish(b"\x00 nothing")
-            clock.sleep_until(clock.monotonic_ns() + 5 * MS_NS)
+            sleep_for_ns(clock, 5 * MS_NS)
 
     session.relay.add("stranger", meddle)
     assert_same(session.run(), simulate_scenario(scenario))
@@ -181,8 +184,8 @@ def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
 
 def test_announcements_decide_nothing(tmp_path: Path) -> None:
     """A message of a program before its first view may arrive after the site's request."""
-    scenario = at_m2("Circle", process=True)
-    at, session = begin(scenario, tmp_path)
+    scenario = make_hand_scenario("Circle", process=True)
+    at, session = make_hand_session(scenario, tmp_path)
     add_program(session, Circle(at.describe()), thinks_ns=3 * MS_NS)
 
     def say(clock: RelayClock) -> None:
@@ -193,7 +196,7 @@ def test_announcements_decide_nothing(tmp_path: Path) -> None:
                     HandMessage(site="m2", boot=9, source=at.source, n=0, grip=False, sent_ns=1)
                 )
             )
-            clock.sleep_until(clock.monotonic_ns() + MS_NS)
+            sleep_for_ns(clock, MS_NS)
 
     session.relay.add("here", say)
     assert_same(session.run(), simulate_scenario(scenario))
@@ -201,7 +204,7 @@ def test_announcements_decide_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["raise", "nan"])
 def test_hands_failing_within_sites_let_go(how: str, tmp_path: Path) -> None:
-    scenario = at_m2("Failing", settings={"how": how})
+    scenario = make_hand_scenario("Failing", settings={"how": how})
     log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
     assert [

@@ -27,7 +27,7 @@ BOOTS = (11, 12)
 RATE_HZ = 1000
 
 
-def payload(tick: int = 0, peer: int = 0, **changed: Any) -> bytes:
+def encode_sample(tick: int = 0, peer: int = 0, **changed: Any) -> bytes:
     message = {"v": VERSION, "site": PEERS[peer], "boot": BOOTS[peer], "tick": tick}
     vectors = {"q": [0.1 * tick, 0.2], "qd": [0.3, 0.4], "tau_x": [0.5, 0.6]}
     return msgpack.packb({**message, **vectors, "sent_ns": tick * 1_000_000, **changed})
@@ -46,12 +46,13 @@ class Desk:
         links: Sequence[LinkSetup] = SETUP.links,
     ) -> None:
         network = LocalNetwork()
-        receiver, sender = network.join(), network.join()
+        receiver = network.join()
+        sender = network.join()
         self.clock = ManualClock(EPOCH_NS)
         read = make_sample_readers(SETUP)
         rings = [
-            receiver.stamped_inbox(name, self.clock.monotonic_ns, one, capacity)
-            for name, one in zip(PEERS, read, strict=True)
+            receiver.stamped_inbox(name, self.clock.monotonic_ns, reader, capacity)
+            for name, reader in zip(PEERS, read, strict=True)
         ]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
@@ -71,8 +72,8 @@ class Desk:
 def test_samples_come_by_peer_in_order() -> None:
     desk = Desk()
     for tick in (0, 1, 3, 2):
-        desk.send[1](payload(tick, 1))
-        desk.send[0](payload(tick, 0))
+        desk.send[1](encode_sample(tick, 1))
+        desk.send[0](encode_sample(tick, 0))
     arrivals = desk.intake.drain(5_000_000)
     assert [(a.peer, a.tick) for a in arrivals] == [
         (p, t) for p in (0, 1) for t in (0, 1, 3, 2)
@@ -84,8 +85,8 @@ def test_samples_come_by_peer_in_order() -> None:
 def test_delay_is_stamp_to_arrival() -> None:
     desk = Desk(rates=(300, 1000))
     desk.wait(40_000_000)
-    desk.send[0](payload(3, 0, sent_ns=12_345_678))
-    desk.send[1](payload(20, 1, sent_ns=19_999_001))
+    desk.send[0](encode_sample(3, 0, sent_ns=12_345_678))
+    desk.send[1](encode_sample(20, 1, sent_ns=19_999_001))
     desk.wait(900_000_000)
     assert [a.latency_us for a in desk.intake.drain(900_000_000)] == [27_654, 20_000]
 
@@ -93,8 +94,8 @@ def test_delay_is_stamp_to_arrival() -> None:
 def test_early_arrivals_are_counted_and_used() -> None:
     desk = Desk()
     desk.wait(5_000_000)
-    desk.send[0](payload(0, 0, sent_ns=5_000_001))
-    desk.send[0](payload(1, 0, sent_ns=4_000_000))
+    desk.send[0](encode_sample(0, 0, sent_ns=5_000_001))
+    desk.send[0](encode_sample(1, 0, sent_ns=4_000_000))
     assert [(a.tick, a.latency_us) for a in desk.intake.drain(5_000_000)] == [
         (0, -1),
         (1, 1000),
@@ -110,21 +111,27 @@ REFUSED = {
         b"\xc1",
         b"garbage",
         msgpack.packb([1, 2]),
-        payload(qd=[1.0, 2.0, 3.0]),
-        payload(sent_ns=-(2**63)),
-        payload(sent_ns=0.5),
-        payload(echo=7),
-        payload(echo=[[0, 0, 0]] * 33),
+        encode_sample(qd=[1.0, 2.0, 3.0]),
+        encode_sample(sent_ns=-(2**63)),
+        encode_sample(sent_ns=0.5),
+        encode_sample(echo=7),
+        encode_sample(echo=[[0, 0, 0]] * 33),
         b"\x91" * 2_000,
     ],
-    "of 1 joint; the scenario has 2": [payload(q=[1.0])],
-    "oversized": [payload(padding="x" * 3_000), bytes(MAX_BYTES + 1)],  # thousands may wait
-    "version": [payload(v=VERSION + 1), payload(v=0)],
-    "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],
-    "stranger": [payload(boot=99), payload(site="s"), payload(site="nobody")],
+    "of 1 joint; the scenario has 2": [encode_sample(q=[1.0])],
+    "oversized": [
+        encode_sample(padding="x" * 3_000),
+        bytes(MAX_BYTES + 1),
+    ],  # thousands may wait
+    "version": [encode_sample(v=VERSION + 1), encode_sample(v=0)],
+    "not finite": [
+        encode_sample(q=[float("nan"), 0.0]),
+        encode_sample(qd=[0.0, float("-inf")]),
+    ],
+    "stranger": [encode_sample(boot=99), encode_sample(site="s"), encode_sample(site="nobody")],
     "ahead": [
-        payload(tick=AHEAD_LIMIT_NS // 1_000_000 + 1),
-        payload(tick=2**40 - 1, sent_ns=0),
+        encode_sample(tick=AHEAD_LIMIT_NS // 1_000_000 + 1),
+        encode_sample(tick=2**40 - 1, sent_ns=0),
     ],
 }
 
@@ -134,9 +141,9 @@ def test_invalid_samples_are_counted_and_dropped(reason: str, sent: bytes) -> No
     desk = Desk()
     # the last that is taken
     for message in (
-        payload(0),
+        encode_sample(0),
         sent,
-        payload(AHEAD_LIMIT_NS // 1_000_000),
+        encode_sample(AHEAD_LIMIT_NS // 1_000_000),
     ):
         desk.send[0](message)
     assert [a.tick for a in desk.intake.drain(0)] == [0, 10_000]
@@ -165,7 +172,7 @@ def test_invalid_samples_are_counted_and_dropped(reason: str, sent: bytes) -> No
 )
 def test_no_field_of_any_type_raises(changed: dict[str, Any]) -> None:
     desk = Desk()
-    desk.send[0](msgpack.packb({**msgpack.unpackb(payload(3)), **changed}))
+    desk.send[0](msgpack.packb({**msgpack.unpackb(encode_sample(3)), **changed}))
     arrivals = desk.intake.drain(10_000_000_000)
     assert len(arrivals) + sum(desk.dropped.values()) - desk.dropped["missing"] == 1
 
@@ -173,9 +180,9 @@ def test_no_field_of_any_type_raises(changed: dict[str, Any]) -> None:
 def test_one_tick_takes_a_bounded_number() -> None:
     desk = Desk()
     for tick in range(MAX_ARRIVALS + 10):
-        desk.send[0](payload(tick, 0))
+        desk.send[0](encode_sample(tick, 0))
     for tick in range(5):
-        desk.send[1](payload(tick, 1))
+        desk.send[1](encode_sample(tick, 1))
     first = desk.intake.drain(10_000_000_000)
     assert [(a.peer, a.tick) for a in first] == [(0, tick) for tick in range(MAX_ARRIVALS)]
     rest = desk.intake.drain(10_000_000_000)
@@ -188,7 +195,7 @@ def test_one_tick_takes_a_bounded_number() -> None:
 def test_lost_ring_entries_count_as_missing() -> None:
     desk = Desk(capacity=4)
     for tick in range(10):
-        desk.send[0](payload(tick, 0))
+        desk.send[0](encode_sample(tick, 0))
     assert [a.tick for a in desk.intake.drain(1_000_000_000)] == [6, 7, 8, 9]
     assert desk.dropped == {"missing": 6}
 
@@ -196,7 +203,7 @@ def test_lost_ring_entries_count_as_missing() -> None:
 def test_duplicates_are_kept_for_the_record() -> None:
     desk = Desk()
     for tick in (0, 1, 1, 0):
-        desk.send[0](payload(tick, 0))
+        desk.send[0](encode_sample(tick, 0))
     assert [a.tick for a in desk.intake.drain(1_000_000_000)] == [0, 1, 1, 0]
     assert not desk.dropped
 
@@ -223,20 +230,20 @@ def test_guarded_sites_drop_impossible_samples(
     q: list[float], qd: list[float], taken: bool
 ) -> None:
     desk = Desk(links=GUARDED)
-    desk.send[0](payload(7, q=[0.0, 0.2], qd=[0.0, 0.0]))
-    desk.send[0](payload(8, q=q, qd=qd))
-    desk.send[0](payload(9, q=[0.003, 0.2], qd=[0.0, 0.0]))
+    desk.send[0](encode_sample(7, q=[0.0, 0.2], qd=[0.0, 0.0]))
+    desk.send[0](encode_sample(8, q=q, qd=qd))
+    desk.send[0](encode_sample(9, q=[0.003, 0.2], qd=[0.0, 0.0]))
     assert [a.tick for a in desk.intake.drain(9_000_000)] == ([7, 8, 9] if taken else [7, 9])
     assert desk.dropped["implausible"] == (not taken)
 
 
 def test_restarted_peers_may_be_at_any_tick() -> None:
     desk = Desk(links=GUARDED)
-    desk.send[0](payload(100, q=[0.5, 0.2]))
-    desk.send[0](payload(20, q=[0.15, 0.2]))  # 80 ms earlier
+    desk.send[0](encode_sample(100, q=[0.5, 0.2]))
+    desk.send[0](encode_sample(20, q=[0.15, 0.2]))  # 80 ms earlier
     assert len(desk.intake.drain(100_000_000)) == 2
     desk.intake.admit(0, 99, 200)
-    desk.send[0](payload(200, boot=99, q=[-2.0, 0.2]))
+    desk.send[0](encode_sample(200, boot=99, q=[-2.0, 0.2]))
     assert len(desk.intake.drain(200_000_000)) == 1
     assert not desk.dropped["implausible"]
 
@@ -245,5 +252,5 @@ def test_guarded_sites_refuse_stamps_one_second_ahead() -> None:
     for links, ahead in ((GUARDED, [1000]), (SETUP.links, [1000, 1001])):
         desk = Desk(links=links)
         for tick in (1000, 1001):
-            desk.send[0](payload(tick, q=[0.0, 0.2]))
+            desk.send[0](encode_sample(tick, q=[0.0, 0.2]))
         assert [a.tick for a in desk.intake.drain(0)] == ahead

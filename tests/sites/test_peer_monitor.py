@@ -42,7 +42,7 @@ class Desk:
         )
         self.network.join().publisher(topics.key("t", member, topics.EVENT))(encode(event))
 
-    def told(self) -> Sequence[tuple[str, str]]:
+    def list_news(self) -> Sequence[tuple[str, str]]:
         self.company.watch(self._publisher, 0)
         return [(event.kind, event.about) for event in read_messages(self._heard, Event)]
 
@@ -61,23 +61,23 @@ def test_departed_peers_are_lost_without_an_end(
 ) -> None:
     desk = Desk()
     bus = desk.comes("m2", boot)
-    assert desk.told() == []
+    assert desk.list_news() == []
     if event:
         desk.says("m2", boot, event)
     bus.close()
-    assert (desk.told(), desk.company.ended_by) == (news, ended_by)
+    assert (desk.list_news(), desk.company.ended_by) == (news, ended_by)
 
 
 def test_later_recorders_are_reported_and_counted() -> None:
     desk = Desk()
     first = desk.comes(topics.RECORDER, 9)
-    assert desk.told() == []
+    assert desk.list_news() == []
     assert desk.company.recorders == {"9"}
     first.close()
-    assert desk.told() == [("lost", topics.RECORDER)]
+    assert desk.list_news() == [("lost", topics.RECORDER)]
     assert desk.company.recorders == set()
     desk.comes(topics.RECORDER, 10)
-    assert desk.told() == [("back", topics.RECORDER)]
+    assert desk.list_news() == [("back", topics.RECORDER)]
     assert desk.company.recorders == {"10"}
 
 

@@ -21,7 +21,9 @@ print(json.dumps([obtained, gc.isenabled(), sorted(os.sched_getaffinity(0))]))
 """
 
 
-def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool, list[int]]:
+def run_prepared(
+    cpu: object = None, before: str = ""
+) -> tuple[dict[str, str], bool, list[int]]:
     program = PROGRAM.format(before=before, cpu=cpu)
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
@@ -32,7 +34,7 @@ def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool
 
 def test_steps_report_settings_and_pin_processes() -> None:
     cpu = min(os.sched_getaffinity(0))
-    obtained, collecting, cpus = prepared(cpu)
+    obtained, collecting, cpus = run_prepared(cpu)
     assert list(obtained) == ["affinity", "timer_slack", "memory", "scheduling", "collector"]
     assert all(obtained.values())
     assert not collecting
@@ -54,7 +56,7 @@ REFUSE = "def refuse(*_): raise PermissionError(1, 'Operation not permitted')\n"
 
 def test_without_privileges_the_loop_still_runs() -> None:
     refuse = f"{REFUSE}os.sched_setscheduler = os.setpriority = realtime._call_libc = refuse"
-    obtained, collecting, _ = prepared(before=refuse)
+    obtained, collecting, _ = run_prepared(before=refuse)
     assert obtained["scheduling"].startswith("normal (")
     assert (
         obtained["memory"]
@@ -66,7 +68,10 @@ def test_without_privileges_the_loop_still_runs() -> None:
 
 def test_another_priority_is_better_than_none() -> None:
     refuse = f"{REFUSE}os.sched_setscheduler = refuse\nos.setpriority = lambda *_: None"
-    assert prepared(before=refuse)[0]["scheduling"] == "nice -10 (SCHED_FIFO was not permitted)"
+    assert (
+        run_prepared(before=refuse)[0]["scheduling"]
+        == "nice -10 (SCHED_FIFO was not permitted)"
+    )
 
 
 @pytest.mark.parametrize(("sites", "crowded"), [(4, False), (5, True)])
@@ -112,7 +117,7 @@ def test_other_platforms_have_less_and_go_on() -> None:
         "for name in ('sched_setaffinity', 'sched_setscheduler', 'SCHED_FIFO', 'setpriority'):\n"
         "    delattr(os, name)"
     )
-    obtained, _, _ = prepared(0, before=lack)
+    obtained, _, _ = run_prepared(0, before=lack)
     assert obtained["affinity"] == "not obtained (not on this platform)"
     assert obtained["memory"] == "not obtained (not on this platform)"
     assert obtained["scheduling"].startswith("normal (")

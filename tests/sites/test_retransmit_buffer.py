@@ -38,7 +38,7 @@ class Desk:
             pass
         return replies
 
-    def told(self, channel: str, first: int, last: int) -> Backfill:
+    def request_range(self, channel: str, first: int, last: int) -> Backfill:
         reply = self.ask(
             encode(BackfillRequest(channel=channel, first=first, last=last))
         ).poll()  # type: ignore[arg-type]
@@ -62,7 +62,9 @@ def test_rings_send_their_content_in_chunks(
     payloads = [str(n).encode()[-size:].zfill(size) for n, size in enumerate(sizes)]
     for payload in payloads:
         ring.store(payload)
-    last, told, at = first + length - 1, [], first
+    last = first + length - 1
+    sent = []
+    at = first
     while True:
         begun, chunk = ring.read_chunk(at, last)
         assert begun == max(at, ring.oldest)
@@ -70,10 +72,10 @@ def test_rings_send_their_content_in_chunks(
         assert sum(map(len, chunk)) <= BACKFILL_BYTES
         if not chunk:
             break
-        told += [(begun + n, payload) for n, payload in enumerate(chunk)]
+        sent += [(begun + n, payload) for n, payload in enumerate(chunk)]
         at = begun + len(chunk)
     left = range(max(first, ring.oldest), min(last + 1, ring.next_number))
-    assert told == [(n, payloads[n]) for n in left]
+    assert sent == [(n, payloads[n]) for n in left]
 
 
 @given(**memories)
@@ -97,7 +99,7 @@ def test_channels_are_sent_separately() -> None:
         for m in range(n + 2):
             ring.store(b"%d %d" % (n, m))
     for n, channel in enumerate(desk.history.channels):
-        past = desk.told(channel, 1, 9)
+        past = desk.request_range(channel, 1, 9)
         assert (past.member, past.boot, past.channel) == ("m1", BOOT, channel)
         assert (past.first, past.made) == (1, n + 2)
         assert past.payloads == [b"%d %d" % (n, m) for m in range(1, n + 2)]
@@ -120,7 +122,9 @@ def test_the_largest_messages_fit_an_answer() -> None:
     desk = Desk()
     for _ in range(3):
         desk.history.channels[topics.EVENT].store(b"x" * MAX_BYTES)
-    assert [len(payload) for payload in desk.told(topics.EVENT, 0, 9).payloads] == [MAX_BYTES]
+    assert [len(payload) for payload in desk.request_range(topics.EVENT, 0, 9).payloads] == [
+        MAX_BYTES
+    ]
 
 
 def test_invalid_requests_get_no_answer() -> None:

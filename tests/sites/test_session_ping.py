@@ -5,6 +5,7 @@ import pytest
 from tests.json_outline import is_documented
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Member, Party, answer_info
+from tests.net.waiting import sleep_for_ns
 from trilat_net.app.session_ping import GATHERING_NS, ping_topic
 from trilat_net.errors import RunFailed
 from trilat_net.net import topics
@@ -55,7 +56,7 @@ def test_members_without_answer_lack_their_clock() -> None:
         visit.probe.poll()
         while (question := questions.poll()) is not None:
             question.reply(encode(answer_info("s", 9, clock="far away")))
-        party.clock.sleep_until(party.clock.monotonic_ns() + S // 10)
+        sleep_for_ns(party.clock, S // 10)
     facts = visit.look().report().members[-1]
     assert (facts["member"], facts["answers"]) == ("s", 0)
     assert not {"rtt_us", "jitter_us", "offset_ns", "bound_us"} & facts.keys()
@@ -90,7 +91,7 @@ def test_pings_wait_briefly_for_others() -> None:
         for present in (party.members["m"], member):
             if present is not None:
                 present.poll()
-        party.clock.sleep_until(party.clock.monotonic_ns() + 2_000_000)
+        sleep_for_ns(party.clock, 2_000_000)
         if member is None and party.clock.monotonic_ns() - visit.begun_ns > GATHERING_NS // 3:
             member = party.member("s")
     assert {facts["member"] for facts in visit.probe.report().members} == {"m", "s"}

@@ -19,7 +19,7 @@ from .sessions import SESSION, Session
 MS_NS = 1_000_000
 
 
-def watch(
+def add_watcher(
     session: Session, what: Any, first_ms: int = 2_200, every_ms: int = 33, times: int = 20
 ) -> None:
     def run(clock: RelayClock) -> None:
@@ -51,20 +51,20 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
             for way in self._ways:
                 way.__exit__(*error)
 
-    watch(session, Both)
+    add_watcher(session, Both)
     session.play()
     log = open_log(session.path)
     # it listens for longer than the delay
-    for one, true in list(zip(seen, newest, strict=True))[5:]:
-        own_state = one["m1"]
+    for states, true in list(zip(seen, newest, strict=True))[5:]:
+        own_state = states["m1"]
         for peer in ("m2", "s"):
             assert (
-                one[peer].tick
+                states[peer].tick
                 == own_state.used[peer]
                 == log["m1"].states[own_state.tick].used[peer]
             )
-            assert np.array_equal(one[peer].q, log[peer].q[own_state.used[peer]])
-            assert true[peer].tick - one[peer].tick >= 120 - 11  # records come ten at a time
+            assert np.array_equal(states[peer].q, log[peer].q[own_state.used[peer]])
+            assert true[peer].tick - states[peer].tick >= 120 - 11  # records come ten at a time
     assert seen
 
 

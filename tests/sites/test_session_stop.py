@@ -12,6 +12,8 @@ from trilat_people.live_page.terminal_watch import SessionWatch
 
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
+from tests.net.waiting import sleep_for_ns
+from tests.sites.sessions import reach_session
 from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
@@ -21,7 +23,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, reached
+from .sessions import SESSION, Session
 
 LIVE = {"sites.m1.hands": [{"kind": "live"}]}
 
@@ -35,8 +37,8 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     titles: list[str] = []
 
     def stop(bus: Bus, clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 2_500_000_000)
-        said.extend(reached(bus, clock).end())
+        sleep_for_ns(clock, 2_500_000_000)
+        said.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
@@ -44,7 +46,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
             watch.update()
             shown.append(watch.rows())
             titles.append(watch.title)
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
 
     session.stranger(stop)
     session.stranger(look)
@@ -104,22 +106,23 @@ def stopped_arm(tmp_path_factory: pytest.TempPathFactory) -> StoppedArm:
 
     def order(bus: Bus, clock: RelayClock) -> None:
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
-            clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
+            sleep_for_ns(clock, 1_200_000_000)
             answers.extend(
                 (answer.accepted, answer.text)
-                for answer in reached(bus, clock).send_order(sites, name)
+                for answer in reach_session(bus, clock).send_order(sites, name)
             )
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
-        pages, console = SessionFrames(watch.view), Console(file=screen, width=100)
+        pages = SessionFrames(watch.view)
+        console = Console(file=screen, width=100)
         while not watch.view.ended:
             watch.update()
             frames.extend([frame] if (frame := pages.make_frame()) else [])
             if watch.alarms and watch.alarms != alarms[-1:]:
                 alarms.extend(watch.alarms)
                 console.print(*frame_alarms(watch.alarms))
-            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+            sleep_for_ns(clock, 50_000_000)
         events = [render_event(event) for event in watch.view.events.since(0, 400)]
         changes.extend(
             re.sub(r"[\d.]+ s$", "", event["text"])
@@ -197,10 +200,10 @@ def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
     said: list[str] = []
 
     def order(bus: Bus, clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
+        sleep_for_ns(clock, 1_200_000_000)
         said.extend(
             one.text
-            for one in reached(bus, clock).send_order(["s"], "stop")
+            for one in reach_session(bus, clock).send_order(["s"], "stop")
             if not one.accepted
         )
 
@@ -211,7 +214,7 @@ def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
 
 def test_an_absent_session_is_not_stopped() -> None:
     with pytest.raises(SessionError, match="no site of session"):
-        reached(LocalNetwork().join(), ManualClock()).end()
+        reach_session(LocalNetwork().join(), ManualClock()).end()
 
 
 @pytest.mark.long
@@ -227,13 +230,13 @@ def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
     seen: dict[str, int] = {}
 
     def stop(bus: Bus, clock: RelayClock) -> None:
-        said.extend(reached(bus, clock).end())
+        said.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
         while clock.monotonic_ns() < 9_000_000_000:
             watch.update()
-            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            sleep_for_ns(clock, 20_000_000)
         seen.update(
             {name: site.record.tick for name, site in watch.view.sites.items() if site.record}
         )
@@ -265,14 +268,14 @@ def test_killed_masters_are_replaced_and_return(tmp_path: Path) -> None:
         while not watch.view.ended:
             watch.update()
             raised.update((name, alarm.word) for name, alarm in watch.alarms)
-            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+            sleep_for_ns(clock, 50_000_000)
 
     session.stranger(look)
     log = session.run()
     assert {("m2", "WITHOUT m1"), ("s", "WITHOUT m1")} <= raised
     assert not [name for name, word in raised if word.startswith("WITHOUT") and name == "m1"]
     assert any("s: *** WITHOUT m1" in line for line in session.said)
-    assert [end for _, end in session.told] == ["killed", 0, 0, 0]
+    assert [end for _, end in session.start_ends] == ["killed", 0, 0, 0]
     for name in ("m2", "s"):
         reasons = [int(state.mem[5]) for state in log[name].states]
         assert "hold" not in set(log[name].mode)

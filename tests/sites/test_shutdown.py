@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.net.waiting import sleep_for_ns
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.membership import liveliness_token
@@ -17,7 +18,7 @@ from .sessions import SESSION, Session
 S = 1_000_000_000
 
 
-def ending(folder: Path, stay_s: float) -> Session:
+def make_slow_session(folder: Path, stay_s: float) -> Session:
     """A session of two sites whose recorder works on for half a minute when it has every record."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
     return Session.whole(scenario, folder, stay_s=stay_s, works_ns=30 * S, ends={})
@@ -44,7 +45,7 @@ def ending(folder: Path, stay_s: float) -> Session:
 def test_how_long_a_site_stays(
     stay_s: float, after: str, least_s: int, most_s: int, tmp_path: Path
 ) -> None:
-    session = ending(tmp_path, stay_s)
+    session = make_slow_session(tmp_path, stay_s)
     session.run()
     assert session.ends == {"m": 0, "s": 0}
     for name in ("m", "s"):
@@ -52,10 +53,10 @@ def test_how_long_a_site_stays(
 
 
 def test_signals_end_waits_without_spoiling_complete_runs(tmp_path: Path) -> None:
-    session = ending(tmp_path, 120.0)
+    session = make_slow_session(tmp_path, 120.0)
 
     def ask(clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 10 * S)
+        sleep_for_ns(clock, 10 * S)
         for interrupt in session.interrupts.values():
             interrupt.number = 15
 
@@ -72,10 +73,10 @@ def test_interrupted_sites_wait_for_all_recorders(tmp_path: Path) -> None:
 
     def come_late(bus: Bus, clock: RelayClock) -> None:
         bus.announce(liveliness_token(SESSION, topics.RECORDER, 78))
-        clock.sleep_until(clock.monotonic_ns() + S)
+        sleep_for_ns(clock, S)
         for interrupt in session.interrupts.values():
             interrupt.number = 2
-        clock.sleep_until(clock.monotonic_ns() + 3 * S)
+        sleep_for_ns(clock, 3 * S)
         session.left_ns["late"] = clock.monotonic_ns()
         say = bus.publisher(topics.key(SESSION, topics.RECORDER, topics.EVENT))
         for n, name in enumerate(("m", "s")):

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.chains import six_joints
+from tests.net.waiting import sleep_for_ns
+from tests.scenario.builders import six_joint_text
+from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
@@ -17,7 +19,7 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, in_log, in_virtual_time
+from .sessions import SESSION, Session
 
 A_SECOND = 1_000_000_000
 
@@ -36,7 +38,7 @@ def listen_to_sites(
     def listen(bus: Bus, clock: RelayClock) -> None:
         keys = [(name, channel) for name in sites for channel in (topics.SAMPLE, topics.STATE)]
         rings = {key: bus.inbox(topics.key(SESSION, *key)) for key in keys}
-        clock.sleep_until(clock.monotonic_ns() + 8 * A_SECOND)
+        sleep_for_ns(clock, 8 * A_SECOND)
         for (name, channel), ring in rings.items():
             (samples if channel == topics.SAMPLE else blocks)[name] = take_payloads(ring)
 
@@ -49,7 +51,7 @@ def listen_to_sites(
     [
         load_scenario("two_sites", {"duration_s": 0.25, "sites.m.rate_hz": 333}),
         load_scenario("two_sites", {"duration_s": 0.1, "rate_hz": 4000}),
-        parse_scenario(six_joints(0.25)),
+        parse_scenario(six_joint_text(0.25)),
     ],
     ids=["two joints", "four ticks a millisecond", "six joints"],
 )
@@ -58,7 +60,7 @@ def test_samples_are_records_and_blocks_hold_10_ms(scenario: Scenario, tmp_path:
     samples, blocks = listen_to_sites(session, scenario.names)
     log = session.run()
     assert verify(log).passed
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     for name in scenario.names:
         small = [
             decode(payload, PeerSample, layout=scenario.layout(name))
@@ -66,10 +68,10 @@ def test_samples_are_records_and_blocks_hold_10_ms(scenario: Scenario, tmp_path:
         ]
         split = [[*split_states(block)] for block in blocks[name]]
         assert [payload for block in split for payload in block] == log[name].payloads
-        assert [one.tick for one in small] == list(range(scenario.ticks(name)))
-        for one, state in zip(small, log[name].states, strict=True):
+        assert [sample.tick for sample in small] == list(range(scenario.ticks(name)))
+        for sample, state in zip(small, log[name].states, strict=True):
             assert all(
-                getattr(one, f) == getattr(state, f) for f in PeerSample.__struct_fields__
+                getattr(sample, f) == getattr(state, f) for f in PeerSample.__struct_fields__
             )
         stamps = [[decode(payload, State).t_ns for payload in block] for block in split]
         assert max(last[-1] - last[0] for last in stamps) < 10_000_000
@@ -122,7 +124,7 @@ def test_samples_of_long_delays_come_together(
 ) -> None:
     scenario = load_scenario("two_sites", {"duration_s": 0.5, "link.delay_ms": delay_ms})
     log = Session.whole(scenario, tmp_path).run()
-    assert in_log(log) == in_virtual_time(scenario)
+    assert pack_log(log) == execute_packed(scenario)
     for name in scenario.names:
         counts = [len(state.rx) for state in log[name].states if state.rx]
         assert counts[1:-1].count(together) > 0.8 * len(counts)
@@ -146,12 +148,12 @@ def test_a_delay_made_short_finds_no_sample_held(at_ns: int, tmp_path: Path) -> 
     def shorten(bus: Bus, clock: RelayClock) -> None:
         running = bus.inbox(topics.key(SESSION, "s", topics.SAMPLE))
         while running.poll() is None:
-            clock.sleep_until(clock.monotonic_ns() + 1_000_000)
-        clock.sleep_until(clock.monotonic_ns() + 200_000_000 + at_ns)
+            sleep_for_ns(clock, 1_000_000)
+        sleep_for_ns(clock, 200_000_000 + at_ns)
         order = ChangeRequest(link="m->s", to={"delay_ms": 1.0})
         answers = bus.query(topics.key(SESSION, "s", topics.SET), encode(order))
         while answers.poll() is None:
-            clock.sleep_until(clock.monotonic_ns() + 1_000_000)
+            sleep_for_ns(clock, 1_000_000)
 
     session.stranger(shorten)
     log = session.run()

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.log.disks import SmallDisk, file_on
+from tests.log.disks import SmallDisk, open_file_on
+from tests.net.waiting import sleep_for_ns
+from tests.sites.sessions import pack_computed
 from trilat_net.errors import LogRefused
 from trilat_net.execution.verification import verify
 from trilat_net.log import log_writer
@@ -20,31 +22,31 @@ from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session, computed
+from .sessions import SESSION, Session
 
 MS = 1_000_000
 SITES = ("m", "s")
 
 
-def session_of(folder: Path, duration_s: float, storage: LogStorage | None = None) -> Session:
+def make_session(folder: Path, duration_s: float, storage: LogStorage | None = None) -> Session:
     return Session.whole(
         load_scenario("two_sites", {"duration_s": duration_s}), folder, storage=storage
     )
 
 
-def records(path: Path) -> dict[str, int]:
+def count_records(path: Path) -> dict[str, int]:
     with path.open("rb") as stream:
         return Counter(item.topic for item in McapReader(stream, str(path)).messages())
 
 
 def test_records_100_ms_before_a_crash_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    session = session_of(tmp_path, 0.4)
+    session = make_session(tmp_path, 0.4)
     looks: list[tuple[int, int]] = []
 
     def look(_: Bus, clock: RelayClock) -> None:
         while not path.exists():
-            clock.sleep_until(clock.monotonic_ns() + 19 * MS)
+            sleep_for_ns(clock, 19 * MS)
             if not active_path(path).exists():
                 continue
             with active_path(path).open("rb") as stream:
@@ -66,8 +68,10 @@ def test_on_a_full_disk_accounts_match_the_file(
     room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.mcap"
-    monkeypatch.setattr(log_writer, "LogFile", lambda path, **_: file_on(SmallDisk(room), path))
-    session = session_of(tmp_path, 2.0)
+    monkeypatch.setattr(
+        log_writer, "LogFile", lambda path, **_: open_file_on(SmallDisk(room), path)
+    )
+    session = make_session(tmp_path, 2.0)
     with pytest.raises(
         LogRefused, match="the disk is full; the log ends there, finished"
     ) as refusal:
@@ -79,7 +83,7 @@ def test_on_a_full_disk_accounts_match_the_file(
     assert verdict.agreed
     assert verdict.integrity.passed
     assert not verdict.passed  # no site could say how it ended
-    stored = records(path)
+    stored = count_records(path)
     for name in SITES:
         assert [state.tick for state in log[name].states] == list(range(len(log[name])))
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
@@ -90,9 +94,9 @@ def test_on_a_full_disk_accounts_match_the_file(
 
 def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
-    whole = session_of(tmp_path / "whole", 0.5).run()
+    whole = make_session(tmp_path / "whole", 0.5).run()
     path = tmp_path / "run.mcap"
-    session = session_of(tmp_path, 0.5, LogStorage(path, split_ns=125 * MS))
+    session = make_session(tmp_path, 0.5, LogStorage(path, split_ns=125 * MS))
     with pytest.raises(Exception, match="No such file"):
         session.run()  # there is no file of that name
     names = [part.name for part in sorted(find_parts(path).values())]
@@ -100,24 +104,30 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
     assert len(names) >= 4
     log = open_log(*(tmp_path / name for name in names))
     for site in SITES:
-        assert [computed(state) for state in log[site].states] == [
-            computed(state) for state in whole[site].states
+        assert [pack_computed(state) for state in log[site].states] == [
+            pack_computed(state) for state in whole[site].states
         ]
-    made = 0
+    tick_count = 0
     for name in names:
         part = open_log(tmp_path / name)
-        made += len(part["m"])
+        tick_count += len(part["m"])
         said = part.accounts[f"/trilat/{SESSION}/m/state"]
         # the message that begins the next part has come when this one ends
-        assert any(f"received {known}, missing 0" in said for known in (made, made + 1))
+        assert any(
+            f"received {known}, missing 0" in said for known in (tick_count, tick_count + 1)
+        )
 
 
 def test_excluded_channels_are_neither_stored_nor_missing(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     choice = ChannelFilter(("**/m/**", "**/s/event"), ("**/link",))
-    log = session_of(tmp_path, 0.3, LogStorage(path, choice=choice)).run()
+    log = make_session(tmp_path, 0.3, LogStorage(path, choice=choice)).run()
     assert len(log["m"]) == 300
     assert len(log["s"]) == 0
     kept = {f"/trilat/{SESSION}/{what}" for what in ("m/state", "m/event", "s/event")}
-    assert set(records(path)) == kept == {name for name in log.accounts if name.startswith("/")}
+    assert (
+        set(count_records(path))
+        == kept
+        == {name for name in log.accounts if name.startswith("/")}
+    )
     assert (log.session["include"], log.session["exclude"]) == ("**/m/** **/s/event", "**/link")

@@ -1,10 +1,11 @@
-"""A visitor of a party: a ping of a session that starts or runs, on the party's clock."""
+"""A ping of a session that starts or runs, on the clock of a party of members."""
 
 from collections.abc import Callable
 from functools import partial
 
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Party
+from tests.net.waiting import sleep_for_ns
 from trilat_net.app.session_ping import PingReport, SessionPing, TopicDelays, ping_topic
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
@@ -29,7 +30,7 @@ class Visit:
             if n % 10 == 0:
                 for member in self._party.members.values():
                     member.poll()
-            self._party.clock.sleep_until(self._party.clock.monotonic_ns() + 2_000_000)
+            sleep_for_ns(self._party.clock, 2_000_000)
         return self.probe
 
 
@@ -52,16 +53,18 @@ def ping_sites() -> PingReport:
 
 
 class Publishers:
-    """A graph of ROS with two publishers of a topic, of which the second loses a third of its messages."""
+    """A graph of ROS with two publishers of a topic; the second one loses a third of its messages."""
 
     def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
         del topic
-        self._take, self._n = take, 0
+        self._take = take
+        self._n = 0
 
     def publish(self, clock: ManualClock) -> bool:
         """Publishes at one instant; the first takes 2 ms, and every tenth message 12 ms."""
         self._n += 1
-        kind, now_ns = "std_msgs::msg::dds_::String_", clock.unix_ns()
+        kind = "std_msgs::msg::dds_::String_"
+        now_ns = clock.unix_ns()
         late_ns = 12_000_000 if self._n % 10 == 0 else 2_000_000
         self._take(kind, Attachment(self._n, now_ns - late_ns, b"a" * 16))
         if self._n % 3:  # its clock is ahead
@@ -71,6 +74,7 @@ class Publishers:
 
 def ping_publishers(lasts_s: float = 2.0) -> TopicDelays:
     """Returns the measured delays of these publishers, a message every 10 ms."""
-    graph, clock = Publishers(), ManualClock(0, 10**18)
+    graph = Publishers()
+    clock = ManualClock(0, 10**18)
     stopped = partial(graph.publish, clock)
     return ping_topic(graph, clock, "chatter", lasts_s, stopped)  # type: ignore[arg-type]

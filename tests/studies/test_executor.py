@@ -23,7 +23,7 @@ from trilat_net.work.executor import (
 def test_any_executor_gives_the_results_of_this_process() -> None:
     progress: list[tuple[int, int]] = []
     with ThreadPoolExecutor(3) as threads, open_worker_pool(None, threads) as pool:
-        assert pool.map(abs, range(-50, 0), lambda *one: progress.append(one)) == list(
+        assert pool.map(abs, range(-50, 0), lambda *counts: progress.append(counts)) == list(
             range(50, 0, -1)
         )
     assert progress == [(n, 50) for n in range(1, 51)]
@@ -63,7 +63,7 @@ def test_batches_fit_measured_times_and_shrink() -> None:
     assert len(feed.pop_batch(idle=False)) == 1
 
 
-def failing(n: int) -> int:
+def fail_at_five(n: int) -> int:
     if n == 5:
         raise ValueError("five")
     return n
@@ -71,7 +71,7 @@ def failing(n: int) -> int:
 
 def test_errors_come_after_earlier_results() -> None:
     with ThreadPoolExecutor(1) as threads:
-        results = WorkerPool(threads, 1).iterate_results(failing, range(9))
+        results = WorkerPool(threads, 1).iterate_results(fail_at_five, range(9))
         assert [next(results) for _ in range(5)] == [(n, n) for n in range(5)]
         with pytest.raises(ValueError, match="five"):
             next(results)

@@ -29,7 +29,7 @@ def section_of(
     return analyse_ports(scenario, find_equilibrium(scenario, POSE), of)
 
 
-def criterion(network: Network) -> Minima:
+def find_failing_frequencies(network: Network) -> Minima:
     """Returns the frequencies at which the two ports of a network fail Llewellyn's criterion."""
     Y = build_admittance(network.loop)
     return find_minima(

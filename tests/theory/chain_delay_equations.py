@@ -28,8 +28,10 @@ class ChainEquations(DelayEquations):
     def accelerate(
         self, q: Array, qd: Array, e: Array, ed: Array, r: Array, estimate: Array, pushed: Array
     ) -> tuple[Array, Array]:
-        qdd, gradient = np.empty_like(q), np.empty_like(estimate)
-        v, a = -self.Lambda * e, -self.Lambda * ed
+        qdd = np.empty_like(q)
+        gradient = np.empty_like(estimate)
+        v = -self.Lambda * e
+        a = -self.Lambda * ed
         for i in range(len(q)):
             Y = regressor(self.model, q[i], qd[i], v[i], a[i])
             tau = (

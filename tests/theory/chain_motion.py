@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tests.core.chain_references import Array
-from tests.scenario.chains import six
+from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.scenario import Scenario
 
 PATH = Path(__file__).with_name("chain_motion.json")
@@ -22,7 +22,7 @@ def pushed_chains(**changes: Any) -> Scenario:
         "end_s": 1.5,
         "peak_nm": [10.0, 10.0, 8.0, 2.0, 2.0, 1.0],
     }
-    return six(**{"sites.m1.hands": [push], **changes})
+    return make_six_joint_scenario(**{"sites.m1.hands": [push], **changes})
 
 
 def exact_motion() -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from tests.virtual_runs import sampled
+from tests.execution.builders import sample_records
 from trilat_net.scenario import load_scenario
 
 Array = NDArray[np.float64]
@@ -26,7 +26,11 @@ TIMES_S = np.arange(0.01, DURATION_S, 0.01)
 
 def theta_of(arm) -> Array:
     """Eq. (24), with m2 lc2 for theta_5."""
-    m1, m2, l1, lc1, lc2 = arm.m1_kg, arm.m2_kg, arm.l1_m, arm.lc1_m, arm.lc2_m
+    m1 = arm.m1_kg
+    m2 = arm.m2_kg
+    l1 = arm.l1_m
+    lc1 = arm.lc1_m
+    lc2 = arm.lc2_m
     outer = m2 * lc2**2 + arm.I2_kg_m2
     return np.array(
         [
@@ -49,10 +53,16 @@ def inertia(theta: Array, q: Array) -> Array:
 
 def regressor(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
     """Returns Y(q, qd, v, a) of Eq. (12), shape (..., 2, 5): C multiplies v."""
-    c2, s2 = np.cos(q[..., 1]), np.sin(q[..., 1])
-    g1, g12 = g * np.cos(q[..., 0]), g * np.cos(q[..., 0] + q[..., 1])
-    v1, v2, a1, a2 = v[..., 0], v[..., 1], a[..., 0], a[..., 1]
-    d1, d2 = qd[..., 0], qd[..., 1]
+    c2 = np.cos(q[..., 1])
+    s2 = np.sin(q[..., 1])
+    g1 = g * np.cos(q[..., 0])
+    g12 = g * np.cos(q[..., 0] + q[..., 1])
+    v1 = v[..., 0]
+    v2 = v[..., 1]
+    a1 = a[..., 0]
+    a2 = a[..., 1]
+    d1 = qd[..., 0]
+    d2 = qd[..., 1]
     zero = np.zeros_like(c2)
     y12 = c2 * (2 * a1 + a2) - s2 * (d2 * v1 + (d1 + d2) * v2)
     y22 = c2 * a1 + s2 * d1 * v1
@@ -95,8 +105,11 @@ class DelayEquations:
         return self.pieces[bisect_right(self.starts, t) - 1](t).reshape(-1, self.width)
 
     def rate(self, t: float, flat: Array) -> Array:
-        x, n = flat.reshape(-1, self.width), self.joints
-        q, qd, estimate = x[:, :n], x[:, n : 2 * n], x[:, 2 * n :]
+        x = flat.reshape(-1, self.width)
+        n = self.joints
+        q = x[:, :n]
+        qd = x[:, n : 2 * n]
+        estimate = x[:, 2 * n :]
         before = x if self.delay_s == 0 else self.past(t - self.delay_s)
         e = q - self.alpha @ before[:, :n]
         ed = qd - self.alpha @ before[:, n : 2 * n]
@@ -125,14 +138,16 @@ class DelayEquations:
         cuts = sorted(
             {round(float(t), 9) for t in [*steps, *self.edges_s, end_s] if 0 < t <= end_s}
         )
-        x, t = self.past(-1.0).ravel(), 0.0
+        x = self.past(-1.0).ravel()
+        t = 0.0
         for cut in cuts:
             accuracy = {"rtol": self.tolerance, "atol": 0.1 * self.tolerance}
             done = solve_ivp(self.rate, (t, cut), x, "DOP853", dense_output=True, **accuracy)
             assert done.success
             self.starts.append(t)
             self.pieces.append(done.sol)
-            x, t = done.y[:, -1], cut
+            x = done.y[:, -1]
+            t = cut
         return self
 
     def at(self, times: Array) -> Array:
@@ -142,7 +157,7 @@ class DelayEquations:
         return np.hstack(parts).reshape(len(self.q0), self.width, -1).swapaxes(1, 2)
 
 
-def equations(scenario) -> DelayEquations:
+def make_equations(scenario) -> DelayEquations:
     """Returns the equations of a scenario whose arms, gains and delays are all alike."""
     specs = list(scenario.sites.values())
     assert all((spec.arm, spec.control) == (specs[0].arm, specs[0].control) for spec in specs)
@@ -184,25 +199,26 @@ def common_terms(scenario) -> dict[str, Any]:
 
 
 @cache
-def exact(name: str) -> DelayEquations:
+def solve_exactly(name: str) -> DelayEquations:
     """Returns the exact solution of a shipped scenario."""
-    return equations(load_scenario(name)).solve(DURATION_S)
+    return make_equations(load_scenario(name)).solve(DURATION_S)
 
 
 @cache
-def distance(name: str, scheme: str, rate_hz: int) -> float:
+def measure_distance(name: str, scheme: str, rate_hz: int) -> float:
     """Returns max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
-    trajectory_at_times = sampled(
+    trajectory_at_times = sample_records(
         load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S
     )
     return float(
         np.abs(
-            trajectory_at_times[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]
+            trajectory_at_times[..., :2]
+            - solve_exactly(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]
         ).max()
     )
 
 
-def order(name: str, scheme: str) -> list[float]:
+def measure_orders(name: str, scheme: str) -> list[float]:
     """Returns the orders of the distance from 500 Hz to 1 kHz, and from there to 2 kHz."""
-    errors = [distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
+    errors = [measure_distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
     return [float(np.log2(coarse / fine)) for coarse, fine in pairwise(errors)]

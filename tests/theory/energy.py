@@ -13,18 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.execution.builders import Trajectories, make_shipped_trajectories
 from tests.theory.delay_equations import DURATION_S, inertia, theta_of
-from tests.virtual_runs import Run, run
 
 Array = NDArray[np.float64]
 
 
-def cumulative(values: Array, h: float) -> Array:
+def integrate(values: Array, h: float) -> Array:
     """Returns the integral from the first tick on, by the trapezoid rule on the ticks."""
     return np.concatenate([[0.0], np.cumsum(0.5 * h * (values[1:] + values[:-1]))])
 
 
-def delayed(values: Array, ticks: int, before: float = 0.0) -> Array:
+def delay_values(values: Array, ticks: int, before: float = 0.0) -> Array:
     """Returns the values `ticks` ago; before the start, those of the history."""
     past = np.full_like(values, before)
     past[ticks:] = values[: len(values) - ticks] if ticks else values
@@ -53,16 +53,20 @@ def left_null_vector(scenario) -> Array:
     return beta / beta.sum()
 
 
-def balance(run: Run, beta: Array) -> Balance:
+def compute_balance(run: Trajectories, beta: Array) -> Balance:
     """Computes the balance of a run whose sites share one rate."""
     scenario = run.scenario
     names = list(scenario.sites)
     rate_hz = scenario.sites[names[0]].rate_hz
     h = 1.0 / rate_hz
-    V, taken, given = 0.0, 0.0, 0.0
+    V = 0.0
+    taken = 0.0
+    given = 0.0
     for weight, name in zip(beta, names, strict=True):
-        site, spec = run.sites[name], scenario.sites[name]
-        theta, control = theta_of(spec.arm), spec.control
+        site = run.sites[name]
+        spec = scenario.sites[name]
+        theta = theta_of(spec.arm)
+        control = spec.control
         Lambda, Kp, Kd = (np.array(getattr(control, gain)) for gain in ("Lambda", "Kp", "Kd"))
         e = site.q - site.q_des
         r = site.qd + Lambda * e
@@ -73,21 +77,23 @@ def balance(run: Run, beta: Array) -> Balance:
         for peer, share in scenario.dominance[name].items():
             qd = run.sites[peer].qd
             ticks = round(scenario.links[f"{peer}->{name}"].delay_ms * 1e-3 * rate_hz)
-            norm = cumulative((Kd * qd**2).sum(1), h)
-            v += share * (norm - delayed(norm, ticks))
+            norm = integrate((Kd * qd**2).sum(1), h)
+            v += share * (norm - delay_values(norm, ticks))
             delayed_speeds = np.stack(
-                [delayed(qd[:, joint], ticks) for joint in (0, 1)], axis=1
+                [delay_values(qd[:, joint], ticks) for joint in (0, 1)], axis=1
             )
             loss += 0.5 * share * (Kd * (site.qd - delayed_speeds) ** 2).sum(1)
         V = V + weight * 0.5 * v
-        taken = taken + weight * cumulative(loss, h)
-        given = given + weight * cumulative((r * -site.tau_x).sum(1), h)
+        taken = taken + weight * integrate(loss, h)
+        given = given + weight * integrate((r * -site.tau_x).sum(1), h)
     return Balance(np.asarray(V), np.asarray(taken), np.asarray(given))
 
 
-def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Balance:
+def compute_shipped_balance(
+    name: str, scheme: str = "second_order", rate_hz: int = 1000
+) -> Balance:
     """Returns the balance of a shipped scenario."""
-    trajectory_of_run = run(
+    trajectory_of_run = make_shipped_trajectories(
         name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
     )
-    return balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))
+    return compute_balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))

@@ -14,12 +14,10 @@ from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, window_quantities
 Overrides = dict[str, Any]
 
 
-def measured(
+def measure_run(
     name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]
 ) -> RunMetrics:
-    """Returns a shipped scenario, changed, in virtual time; its windows are (from, to, site),
-    "" for all sites.
-    """
+    """Returns the metrics of a shipped scenario; windows are (from s, to s, site), with "" for all sites."""
     windows_of_run = [
         {
             "from_s": from_s,
@@ -34,12 +32,12 @@ def measured(
     )
 
 
-def peak(figures: RunMetrics, n: int = 0) -> float:
+def find_peak(figures: RunMetrics, n: int = 0) -> float:
     """Returns the largest |e| of a window."""
     return figures.windows[n]["error_peak_rad"].most
 
 
-def value(figures: RunMetrics, key: str, n: int = 0) -> float:
+def find_value(figures: RunMetrics, key: str, n: int = 0) -> float:
     """Returns a quantity of a window that has one value."""
     return figures.windows[n][key].most
 

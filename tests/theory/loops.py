@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 RODS = {"arm.lc1_m": 0.5, "arm.lc2_m": 0.5, "arm.I1_kg_m2": 1 / 12, "arm.I2_kg_m2": 1 / 12}
 
 
-def loop(A: Any, *delayed: tuple[float, Any]) -> LinearLoop:
+def make_loop(A: Any, *delayed: tuple[float, Any]) -> LinearLoop:
     """Returns x' = A x + sum A_k x(t - T_k), without operators."""
     matrix = np.atleast_2d(np.asarray(A, dtype=float))
     n = len(matrix)
@@ -29,13 +29,14 @@ def loop(A: Any, *delayed: tuple[float, Any]) -> LinearLoop:
     return LinearLoop(names, (), (), matrix, np.zeros((n, 0)), np.zeros((0, n)), tuple(entries))
 
 
-def residual(system: LinearLoop, s: complex) -> float:
+def compute_residual(system: LinearLoop, s: complex) -> float:
     """Returns the smallest singular value of Delta(s) over the size of its terms, from the definition."""
     delta = s * np.eye(len(system.A)) - system.A
     size = abs(s) + np.linalg.norm(system.A)
     for delayed in system.delayed:
         late = delayed.A * np.exp(-s * delayed.delay_s)
-        delta, size = delta - late, size + np.linalg.norm(late)
+        delta = delta - late
+        size = size + np.linalg.norm(late)
     return float(np.linalg.svd(delta, compute_uv=False)[-1] / size)
 
 
@@ -73,7 +74,9 @@ GAINS = {
 }
 
 
-def site(rng: np.random.Generator, law: str, actors: Sequence[TorqueSource] = ()) -> SiteSetup:
+def draw_site(
+    rng: np.random.Generator, law: str, actors: Sequence[TorqueSource] = ()
+) -> SiteSetup:
     """Draws a site with a random physical arm and random gains."""
     l1, m1, l2, m2 = rng.uniform(0.5, 2, 4)
     links = ArmLinks(l1, m1, 0.6 * l1, m1 * l1**2 / 12, l2, m2, 0.4 * l2, m2 * l2**2 / 12)
@@ -94,7 +97,7 @@ def site(rng: np.random.Generator, law: str, actors: Sequence[TorqueSource] = ()
     )
 
 
-def actors(rng: np.random.Generator) -> list[TorqueSource]:
+def draw_actors(rng: np.random.Generator) -> list[TorqueSource]:
     """Draws one of each kind that depends on the arm: hands, an environment, and a wall that is
     touched or not.
     """

@@ -36,31 +36,31 @@ class Network(NamedTuple):
     def loop(self) -> LinearLoop:
         count = len(self.m)
         names = tuple(f"{site}.{x}1" for site in "abcd"[:count] for x in ("q", "qd"))
-        A, B, C = (
-            np.zeros((2 * count, 2 * count)),
-            np.zeros((2 * count, count)),
-            np.zeros((count, 2 * count)),
-        )
+        A = np.zeros((2 * count, 2 * count))
+        B = np.zeros((2 * count, count))
+        C = np.zeros((count, 2 * count))
         late: dict[float, DelayedTerm] = {}
         for i in range(count):
-            q, qd = 2 * i, 2 * i + 1
+            q = 2 * i
+            qd = 2 * i + 1
             A[q, qd] = C[i, qd] = 1.0
-            A[qd, q], A[qd, qd], B[qd, i] = (
-                -self.k[i] / self.m[i],
-                -self.d[i] / self.m[i],
-                1.0 / self.m[i],
-            )
+            A[qd, q] = -self.k[i] / self.m[i]
+            A[qd, qd] = -self.d[i] / self.m[i]
+            B[qd, i] = 1.0 / self.m[i]
         for wire in self.wires:
-            at, of, m = 2 * wire.at + 1, 2 * wire.of, self.m[wire.at]
+            at = 2 * wire.at + 1
+            of = 2 * wire.of
+            m = self.m[wire.at]
             A[at, at - 1 : at + 1] -= np.array([wire.K, wire.B]) / m
-            there = late.setdefault(
+            delayed_term = late.setdefault(
                 wire.delay_s, DelayedTerm(wire.delay_s, np.zeros_like(A), np.zeros_like(B))
             )
-            there.A[at, of : of + 2] += np.array([wire.K, wire.B]) / m
-            there.B[at, wire.of] += wire.k_f / m
+            delayed_term.A[at, of : of + 2] += np.array([wire.K, wire.B]) / m
+            delayed_term.B[at, wire.of] += wire.k_f / m
         if 0.0 in late:
             now = late.pop(0.0)
-            A, B = A + now.A, B + now.B
+            A = A + now.A
+            B = B + now.B
         ports = [tuple(f"{site}.{x}1" for site in "abcd"[:count]) for x in ("tau", "qd")]
         return LinearLoop(
             names, ports[0], ports[1], A, B, C, tuple(late[T] for T in sorted(late))
@@ -74,7 +74,8 @@ class Network(NamedTuple):
         for i, (m, d, k) in enumerate(zip(self.m, self.d, self.k, strict=True)):
             Z[:, i, i] = m * s + d + k / s
         for wire in self.wires:
-            late, link = np.exp(-s * wire.delay_s), wire.B + wire.K / s
+            late = np.exp(-s * wire.delay_s)
+            link = wire.B + wire.K / s
             Z[:, wire.at, wire.at] += link
             Z[:, wire.at, wire.of] -= link * late
             reflected[:, wire.at, wire.of] += wire.k_f * late
@@ -95,7 +96,7 @@ def hold_by_spring(loop: LinearLoop, site: str, K: float, B: float = 0.0) -> Lin
     return loop._replace(A=loop.A - loop.B @ back, delayed=delayed)
 
 
-def pair(
+def make_pair(
     K: tuple[float, float] = (10.0, 10.0),
     d: tuple[float, float] = (1.0, 1.0),
     T: tuple[float, float] = (0.2, 0.2),

@@ -56,7 +56,7 @@ def position_network(
     return load_scenario(scenario, changes) if changes else scenario
 
 
-def rods(mass_kg: float, q2_rad: float) -> Array:
+def compute_rod_inertia(mass_kg: float, q2_rad: float) -> Array:
     """Returns M of two uniform rods of 1 m, kg m^2."""
     c = np.cos(q2_rad)
     return mass_kg * np.array([[5 / 3 + c, 1 / 3 + c / 2], [1 / 3 + c / 2, 1 / 3]])
@@ -75,17 +75,18 @@ def count_growing(
     A tick of `second_order`: M (2 / h^2) (z - 1)^2 z q = -(1.5 z - 0.5) (2 d (z - 1) / h + (z + 1) K (I -
     alpha z^-n)) q, from q' = q + h qd + h^2 u / 2, qd' = qd + h u, M u = 1.5 tau - 0.5 tau of the last tick.
     """
-    joints, count = len(inertias[0]), len(alpha)
-    mass, size = block_diag(*inertias), joints * count
+    joints = len(inertias[0])
+    count = len(alpha)
+    mass = block_diag(*inertias)
+    size = joints * count
     stiffness, damping = (np.repeat(np.broadcast_to(gain, count), joints) for gain in (K, d))
-    shares, late = (
-        np.kron(np.asarray(alpha), np.eye(joints)),
-        np.kron(np.broadcast_to(ticks, (count, count)), np.ones((joints, joints))),
-    )
+    shares = np.kron(np.asarray(alpha), np.eye(joints))
+    late = np.kron(np.broadcast_to(ticks, (count, count)), np.ones((joints, joints)))
 
     def angle(phi: Array) -> Array:
         s = growth_per_s * H_S + 1j * phi
-        z, less = np.exp(s)[:, None, None], np.expm1(s)[:, None, None]
+        z = np.exp(s)[:, None, None]
+        less = np.expm1(s)[:, None, None]
         seen = np.eye(size) - shares * np.exp(-s[:, None, None] * late)
         control = 2.0 / H_S * less * np.diag(damping) + (z + 1.0) * stiffness[:, None] * seen
         sign, _ = np.linalg.slogdet(
@@ -102,10 +103,8 @@ def count_growing(
         if not len(wide):
             break
         between = 0.5 * (phi[wide] + phi[wide + 1])
-        phi, turned = (
-            np.insert(phi, wide + 1, between),
-            np.insert(turned, wide + 1, angle(between)),
-        )
+        phi = np.insert(phi, wide + 1, between)
+        turned = np.insert(turned, wide + 1, angle(between))
     growing = 3 * size - steps.sum() / np.pi
     assert abs(growing - round(growing)) < 1e-6
     return round(growing)

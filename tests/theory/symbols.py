@@ -6,7 +6,8 @@ import sympy as sp
 
 G = sp.Symbol("g", positive=True)
 THETA = sp.Matrix(sp.symbols("theta1:6", positive=True))
-Q, QD = sp.Matrix(sp.symbols("q1:3", real=True)), sp.Matrix(sp.symbols("qd1:3", real=True))
+Q = sp.Matrix(sp.symbols("q1:3", real=True))
+QD = sp.Matrix(sp.symbols("qd1:3", real=True))
 
 
 def diagonal(name: str) -> sp.Matrix:
@@ -14,7 +15,7 @@ def diagonal(name: str) -> sp.Matrix:
     return sp.diag(*sp.symbols(f"{name}1:3", positive=True))
 
 
-def pair(name: str) -> sp.Matrix:
+def make_symbols(name: str) -> sp.Matrix:
     return sp.Matrix(sp.symbols(f"{name}1:3", real=True))
 
 
@@ -26,7 +27,7 @@ def dot(a: sp.Matrix, b: sp.Matrix) -> Any:
     return (a.T * b)[0]
 
 
-def plain(expression: Any) -> Any:
+def normalise(expression: Any) -> Any:
     """Returns the normal form of a polynomial in sines and cosines of q1 and q2."""
     angles = {sp.sin(x): sp.Symbol(f"sin_{x}") for x in Q}
     written = sp.expand(sp.expand_trig(expression)).subs(angles)
@@ -40,7 +41,7 @@ def plain(expression: Any) -> Any:
 
 
 def zero(expression: Any) -> bool:
-    return bool(plain(expression) == 0)
+    return bool(normalise(expression) == 0)
 
 
 def inertia() -> sp.Matrix:

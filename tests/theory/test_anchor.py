@@ -11,23 +11,23 @@ Dominance is force sharing: at rest, with equal Kp Lambda and known gravity, sum
 import numpy as np
 import pytest
 
+from tests.execution.builders import make_shipped_trajectories, sample_records
 from tests.theory.delay_equations import theta_of
 from tests.theory.energy import left_null_vector
-from tests.theory.figures_of_runs import measured, value
-from tests.virtual_runs import run, sampled
+from tests.theory.figures_of_runs import find_value, measure_run
 from trilat_net.scenario import load_scenario
 
 G = 9.81
 PERIOD_S = 1e-3
 
 
-def angles(records: np.ndarray) -> np.ndarray:
+def read_last_angles(records: np.ndarray) -> np.ndarray:
     """Returns q1 and q1 + q2 of the slave in the last of some records."""
     q = records[2, -1, :2]
     return np.array([q[0], q.sum()])
 
 
-def predicted(name: str, delay_s: float) -> np.ndarray:
+def predict_sines(name: str, delay_s: float) -> np.ndarray:
     """Returns sin q1 and sin (q1 + q2) in the end, from level arms and estimates of zero, with
     Gamma = Lambda = 1.
     """
@@ -48,12 +48,14 @@ def test_the_final_pose_follows_from_the_first_estimates(
     name: str, delay_s: float, end_s: float, bar: dict[str, float]
 ) -> None:
     """The least delay is one period."""
-    end = sampled(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
-    assert np.sin(angles(end)) == pytest.approx(predicted(name, max(delay_s, PERIOD_S)), **bar)
+    end = sample_records(load_scenario(name, {"link.delay_ms": 1e3 * delay_s}), (end_s,))
+    assert np.sin(read_last_angles(end)) == pytest.approx(
+        predict_sines(name, max(delay_s, PERIOD_S)), **bar
+    )
 
 
 def test_gravity_alone_is_learnt() -> None:
-    theta_hat = sampled(load_scenario("paper"), (60.0,))[0, -1, 12:]
+    theta_hat = sample_records(load_scenario("paper"), (60.0,))[0, -1, 12:]
     assert theta_hat[3:] == pytest.approx([2.0, 1.0], abs=0.02)
     assert theta_hat[2] < 0.0  # inertial estimates are free to be anything
 
@@ -63,7 +65,7 @@ def test_the_derivations_integral_is_conserved(name: str) -> None:
     """theta_hat_4 + Gamma g (sin q1 + int cos(q1) Lambda e1 dt), whatever the hands do; the
     same with q1 + q2.
     """
-    trajectory_of_run = run(name, {"duration_s": 20.0})
+    trajectory_of_run = make_shipped_trajectories(name, {"duration_s": 20.0})
     for site in trajectory_of_run.sites.values():
         e = site.q - site.q_des
         turned = np.stack([site.q[:, 0], site.q.sum(axis=1)], axis=1)
@@ -82,11 +84,12 @@ def test_hands_see_115_nm_per_rad() -> None:
     hands = [
         {"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}
     ]
-    rest = sampled(load_scenario("paper_rods").without_hands(), (20.0,))
-    pushed = sampled(
+    rest = sample_records(load_scenario("paper_rods").without_hands(), (20.0,))
+    pushed = sample_records(
         load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,)
     )
-    pushed_angles, from_where = angles(pushed), angles(rest)
+    pushed_angles = read_last_angles(pushed)
+    from_where = read_last_angles(rest)
     # equal torques act on q1 + q2 alone
     assert pushed_angles[0] == pytest.approx(from_where[0], abs=2e-3)
     # no error: nothing is felt
@@ -101,10 +104,10 @@ def test_hands_see_115_nm_per_rad() -> None:
 def test_small_gains_let_arms_hang() -> None:
     """Gamma = 0.1: |sin q1(inf)| would have to be 1.7."""
     hanging = load_scenario("paper", {"control.Gamma": 0.1}).without_hands()
-    assert predicted("paper", 0.2)[0] / 0.1 < -1.0
-    assert sampled(hanging, np.arange(20.0, 30.0, 0.01))[2, :, 0].mean() == pytest.approx(
-        -np.pi / 2, abs=0.1
-    )
+    assert predict_sines("paper", 0.2)[0] / 0.1 < -1.0
+    assert sample_records(hanging, np.arange(20.0, 30.0, 0.01))[
+        2, :, 0
+    ].mean() == pytest.approx(-np.pi / 2, abs=0.1)
 
 
 LOAD_NM = 5.0
@@ -114,10 +117,10 @@ HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
 
 @pytest.mark.long
 def test_hands_feel_loads_by_ratios_of_beta() -> None:
-    """Of 5 N m on the slave: 4.79 at the expert, 16.4 at the trainee, 5.00 with all shares 1/2; 2 %."""
+    """A load of 5 N m on the slave is felt as 4.79 at the expert, 16.4 at the trainee, and 5.00 with all shares 1/2."""
     b1, b2, bs = left_null_vector(load_scenario("force_sharing"))
-    windows = measured("force_sharing", {}, *HELD)
-    felt = [-value(windows, "push1_mean_nm", n) for n in range(len(HELD))]
+    windows = measure_run("force_sharing", {}, *HELD)
+    felt = [-find_value(windows, "push1_mean_nm", n) for n in range(len(HELD))]
     assert felt == pytest.approx([4.79, 16.4, 5.00], rel=0.02)
     assert felt == pytest.approx([LOAD_NM * bs / b1, LOAD_NM * bs / b2, LOAD_NM], rel=0.02)
     assert felt[::2] == pytest.approx([LOAD_NM * bs / b1, LOAD_NM], rel=1e-3)  # both at rest

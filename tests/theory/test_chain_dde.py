@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from tests.core.chain_references import Array
+from tests.execution.builders import sample_records
 from tests.theory.chain_motion import TIMES_S, exact_motion, pushed_chains
-from tests.virtual_runs import sampled
 
 LONG_TIMES_S = np.arange(0.05, 10.01, 0.05)
 
 
-def motion(rate_hz: int, times_s: Array) -> Array:
+def sample_motion(rate_hz: int, times_s: Array) -> Array:
     """Returns q of the tick at each of these times, shape (3, K, 6)."""
-    motion_at_times = sampled(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
+    motion_at_times = sample_records(pushed_chains(rate_hz=rate_hz), times_s + 1.0 / rate_hz)
     return motion_at_times[..., :6]
 
 
 @pytest.mark.long
 def test_second_order_follows_the_stored_motion() -> None:
     errors = [
-        float(np.abs(motion(rate_hz, TIMES_S) - exact_motion()).max())
+        float(np.abs(sample_motion(rate_hz, TIMES_S) - exact_motion()).max())
         for rate_hz in (500, 1000)
     ]
     assert errors[1] <= 5e-5
@@ -41,7 +41,9 @@ def test_chains_keep_order_two_over_ten_seconds() -> None:
     equations = chain_equations(pushed_chains()).solve(float(LONG_TIMES_S[-1]))
     exact = equations.at(LONG_TIMES_S)[..., :6]
     assert np.abs(equations.at(TIMES_S)[..., :6] - exact_motion()).max() < 1e-8
-    errors = [float(np.abs(motion(hz, LONG_TIMES_S) - exact).max()) for hz in (500, 1000, 2000)]
+    errors = [
+        float(np.abs(sample_motion(hz, LONG_TIMES_S) - exact).max()) for hz in (500, 1000, 2000)
+    ]
     assert errors[1] <= 5e-5
     orders = [float(np.log2(coarse / fine)) for coarse, fine in pairwise(errors)]
     assert orders == pytest.approx([2.0, 2.0], abs=0.1)

@@ -9,7 +9,7 @@ import sympy as sp
 from trilat_studies.sweep.stability_map import evaluate_criterion
 
 from tests.theory.networks import Network, Wire
-from tests.theory.position_networks import count_growing, position_network, rods
+from tests.theory.position_networks import compute_rod_inertia, count_growing, position_network
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
@@ -31,12 +31,12 @@ MANY_TICKS = 20
 """From so many ticks of delay on, the worst mass is that of continuous time."""
 
 
-def equal(count: int) -> Any:
+def make_equal_shares(count: int) -> Any:
     """Returns equal shares."""
     return (np.ones((count, count)) - np.eye(count)) / (count - 1)
 
 
-def shares(rng: np.random.Generator, count: int, *, reversible: bool) -> Any:
+def draw_shares(rng: np.random.Generator, count: int, *, reversible: bool) -> Any:
     """Returns random shares; reversible ones from weights that are the same both ways."""
     weights = rng.uniform(0.0, 1.0, (count, count)) ** 2 * (1.0 - np.eye(count))
     weights = weights + weights.T if reversible else weights
@@ -47,13 +47,14 @@ def test_balanced_shares_are_reversible() -> None:
     """Kolmogorov's criterion for three sites, and weights that make D alpha symmetric for any number."""
     rng = np.random.default_rng(1)
     for count in (2, 3, 5, 8):
-        alpha = shares(rng, count, reversible=True)
+        alpha = draw_shares(rng, count, reversible=True)
         D = find_balancing_weights(alpha)
         assert D is not None
         np.testing.assert_allclose(D[:, None] * alpha, (D[:, None] * alpha).T, rtol=1e-12)
         assert np.abs(np.linalg.eigvals(alpha).imag).max() < 1e-9
         assert (
-            count == 2 or find_balancing_weights(shares(rng, count, reversible=False)) is None
+            count == 2
+            or find_balancing_weights(draw_shares(rng, count, reversible=False)) is None
         )
     assert find_balancing_weights(np.array(LAB)) is None
     assert find_balancing_weights(np.array(RING)) is None
@@ -88,20 +89,25 @@ def test_irreversible_shares_have_no_bound(
     assert rightmost is not None
     assert rightmost.s.real == pytest.approx(growth_per_s, abs=1e-3)
     assert (
-        count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
+        count_growing(
+            alpha, [compute_rod_inertia(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)
+        )
+        > 0
     )
 
 
 def test_seven_equal_shares_exceed_their_eigenvalue() -> None:
     """K T = 2, d = 0.36: 1/6 of it is 0.333, 0.2172 of it 0.434."""
     lacking, enough = (
-        evaluate_criterion(position_network(equal(7), d=d)) for d in (0.36, 0.44)
+        evaluate_criterion(position_network(make_equal_shares(7), d=d)) for d in (0.36, 0.44)
     )
     assert lacking is not None
     assert enough is not None
     assert lacking.excess < 0.0 < enough.excess
     worst = [np.eye(1) * 1.2172 * 10.0 * 0.2**2 / 20.19] * 7
-    below, above = (count_growing(equal(7), worst, 10.0, d, 200) for d in (0.36, 0.44))
+    below, above = (
+        count_growing(make_equal_shares(7), worst, 10.0, d, 200) for d in (0.36, 0.44)
+    )
     assert below > 0 == above
 
 
@@ -131,14 +137,16 @@ def check_sharpness(alpha: Any, K: float, ticks: int) -> None:
 @pytest.mark.parametrize("seed", range(8))
 def test_the_bound_is_the_worst_masss_edge(count: int, seed: int) -> None:
     rng = np.random.default_rng(100 * count + seed)
-    alpha = shares(rng, count, reversible=True) if seed else equal(count)
+    alpha = draw_shares(rng, count, reversible=True) if seed else make_equal_shares(count)
     check_sharpness(alpha, rng.uniform(2.0, 50.0), int(rng.integers(20, 800)))
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 3])
 def test_few_ticks_give_the_computed_edge(ticks: int) -> None:
     """Errata 13: 0.667 K h for one tick, and any masses above d h."""
-    criterion = evaluate_criterion(position_network(equal(3), d=0.0, delay_ms=float(ticks)))
+    criterion = evaluate_criterion(
+        position_network(make_equal_shares(3), d=0.0, delay_ms=float(ticks))
+    )
     assert criterion is not None
     assert -criterion.excess == pytest.approx(10.0e-3 * max(0.6667, 0.5 * ticks), rel=1e-3)
 
@@ -187,8 +195,9 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
     sharp.
     """
     count = int(rng.integers(2, 9))
-    alpha = shares(rng, count, reversible=bool(rng.integers(2)))
-    ticks, K = int(rng.integers(0, 1001)), float(10.0 ** rng.uniform(0.0, 1.5))
+    alpha = draw_shares(rng, count, reversible=bool(rng.integers(2)))
+    ticks = int(rng.integers(0, 1001))
+    K = float(10.0 ** rng.uniform(0.0, 1.5))
     need = (
         K
         * max(ticks, 1)
@@ -198,7 +207,8 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
     d: Any = need * rng.uniform(0.8, 1.3)
     K_all: Any = K
     if count == 2:  # of two sites gains may differ
-        K_all, d = K * rng.uniform(0.5, 2.0, 2), d * rng.uniform(0.5, 2.0, 2)
+        K_all = K * rng.uniform(0.5, 2.0, 2)
+        d = d * rng.uniform(0.5, 2.0, 2)
     masses = 10.0 ** rng.uniform(-0.5, 0.5, count)
     criterion = evaluate_criterion(position_network(alpha, K_all, d, float(ticks), masses))
     if criterion is None:
@@ -206,7 +216,8 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
     if sharp and ticks >= MANY_TICKS:
         check_sharpness(alpha, K, ticks)
     inertias = [
-        rods(mass, q2) for mass, q2 in zip(masses, rng.uniform(-3.1, 3.1, count), strict=True)
+        compute_rod_inertia(mass, q2)
+        for mass, q2 in zip(masses, rng.uniform(-3.1, 3.1, count), strict=True)
     ]
     if criterion.excess > 0.0:
         assert count_growing(alpha, inertias, K_all, d, max(ticks, 1)) == 0
@@ -227,14 +238,18 @@ def test_the_bound_never_accepts_growth(seed: int, *, sharp: bool) -> None:
     assert outcomes.count(None) > 40
 
 
-K_PAIR, TICK_S = 50.0, 1.0 / 30.0
+K_PAIR = 50.0
+TICK_S = 1.0 / 30.0
 
 
-def judged(count: int, ticks: int, d: float) -> StabilityCondition:
+def judge_equal_sites(count: int, ticks: int, d: float) -> StabilityCondition:
     """Returns the condition of equal sites at 30 Hz whose torques are held."""
     laws = (SimpleNamespace(K=(K_PAIR,), d=(d,)),) * count
-    names, delay_s = tuple(map(str, range(count))), ticks * TICK_S * (equal(count) > 0.0)
-    situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=TICK_S)
+    names = tuple(map(str, range(count)))
+    delay_s = ticks * TICK_S * (make_equal_shares(count) > 0.0)
+    situation = LawSituation(
+        0, names, laws, make_equal_shares(count), delay_s, (1e3,), 30, hold_s=TICK_S
+    )
     condition = judge_position_exchange(situation, "d")
     assert condition is not None
     return condition
@@ -244,34 +259,31 @@ def judged(count: int, ticks: int, d: float) -> StabilityCondition:
 def test_springs_need_exact_gravity_everywhere(law: str) -> None:
     """A site that compensates 0.9 of gravity has no condition, and its peer an undecided one."""
     control = {"law": law, "leads": True} if law == "authority" else {"law": law}
-    alike, unlike = (
-        load_scenario(
-            "two_sites",
-            {
-                "link.delay_ms": 5.0,
-                "sites.m.control": {**control, "gravity": factor},
-                "sites.s.control": control,
-            },
-        )
-        for factor in (1.0, 0.9)
-    )
+    settings = {"link.delay_ms": 5.0, "sites.s.control": control}
+    alike = load_scenario("two_sites", {**settings, "sites.m.control": control})
+    lighter = {**control, "gravity": 0.9}
+    unlike = load_scenario("two_sites", {**settings, "sites.m.control": lighter})
     (line,) = describe_law_conditions(alike)
     assert line.startswith(f"condition of {law} at m, s holds")
     (line,) = describe_law_conditions(unlike)
     assert line.startswith(f"condition of {law} at s is undecided: known for gravity = 1")
 
 
-def growth(count: int, ticks: int, d: float, mass: float) -> float:
+def compute_growth(count: int, ticks: int, d: float, mass: float) -> float:
     """Returns the rate, 1/s, of the loop from tick to tick, mode by mode of equal shares: x,
     its speed, x before.
     """
     rates = []
     for share in (1.0, -1.0 / (count - 1)):
         row = np.zeros(2 + ticks)
-        row[:2], row[-1] = (-K_PAIR, -d), row[-1] + K_PAIR * share
+        row[:2] = (-K_PAIR, -d)
+        row[-1] += K_PAIR * share
         step = np.eye(2 + ticks, k=-1)
         step[:2] = 0.0
-        step[0, :2], step[1, 1], step[2, 0], step[2, 1] = (1.0, TICK_S), 1.0, 1.0, 0.0
+        step[0, :2] = (1.0, TICK_S)
+        step[1, 1] = 1.0
+        step[2, 0] = 1.0
+        step[2, 1] = 0.0
         step[:2] += np.outer([0.5 * TICK_S**2 / mass, TICK_S / mass], row)
         z = np.linalg.eigvals(step)
         others = np.delete(z, np.abs(z - 1.0).argmin()) if share == 1.0 else z
@@ -281,26 +293,28 @@ def growth(count: int, ticks: int, d: float, mass: float) -> float:
 
 def test_held_torques_need_more_than_continuous_time() -> None:
     """K 50, d 2 at 30 Hz over a tick: 1.667 would suffice in continuous time."""
-    assert judged(2, 1, 3.33).holds is False
-    assert judged(2, 1, 3.34).holds
-    assert growth(2, 1, 2.0, 1.0) == pytest.approx(0.595, abs=5e-3)
-    assert judged(2, 1, 2.0).holds is False
+    assert judge_equal_sites(2, 1, 3.33).holds is False
+    assert judge_equal_sites(2, 1, 3.34).holds
+    assert compute_growth(2, 1, 2.0, 1.0) == pytest.approx(0.595, abs=5e-3)
+    assert judge_equal_sites(2, 1, 2.0).holds is False
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 7])
 @pytest.mark.parametrize("ticks", [1, 2, 3, 20])
 def test_held_torques_bound_the_worst_mass(count: int, ticks: int) -> None:
     """Above it no arm heavier than d h / 2 grows; 3 % below it some arm does."""
-    text = judged(count, ticks, 1e3).text
+    text = judge_equal_sites(count, ticks, 1e3).text
     sides = (
         K_PAIR * TICK_S * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])
     )
     for d, grows in ((0.97 * sides, True), (1.01 * sides, False)):
-        assert judged(count, ticks, d).holds is not grows
+        assert judge_equal_sites(count, ticks, d).holds is not grows
         masses = np.concatenate(
             [0.5 * d * TICK_S * (1.0 + np.logspace(-4, 1, 300)), np.logspace(-1, 4, 300)]
         )
-        most = max(growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * TICK_S)
+        most = max(
+            compute_growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * TICK_S
+        )
         assert (most > 0.0) is grows
 
 
@@ -314,7 +328,7 @@ def test_slopes_of_tanh_obey_p_d_bounds() -> None:
     rng = np.random.default_rng(13)
     for count in (2, 3, 4, 6):
         for _ in range(50):
-            alpha = shares(rng, count, reversible=True)
+            alpha = draw_shares(rng, count, reversible=True)
             D = find_balancing_weights(alpha)
             assert D is not None
             S = np.sqrt(D)[:, None] * alpha / np.sqrt(D)
@@ -326,7 +340,7 @@ def test_slopes_of_tanh_obey_p_d_bounds() -> None:
             assert product.max() <= 10.0 + 1e-12
 
 
-def sloped(slopes: Any, d: float) -> Network:
+def make_sloped_network(slopes: Any, d: float) -> Network:
     """Returns three heavy sites of equal shares, whose pulls have these slopes; T = 100 ms."""
     wires = tuple(
         Wire(i, j, 0.5 * slopes[i][j], 0.0, 0.1) for i in range(3) for j in range(3) if i != j
@@ -341,15 +355,18 @@ def test_slopes_up_to_k_do_not_suffice() -> None:
     least = np.linalg.eigvalsh(0.5 * (chain - K * np.eye(3))).min()
     assert least == pytest.approx(-0.7071 * K, abs=1e-3)
     assert np.linalg.eigvalsh(chain).min() < -0.4 * K  # so no tanh has these slopes
-    assert compute_delay_spectrum(sloped(chain, 0.6 * K * 0.1).loop, 1).verdict == "unstable"
+    assert (
+        compute_delay_spectrum(make_sloped_network(chain, 0.6 * K * 0.1).loop, 1).verdict
+        == "unstable"
+    )
     for poses in ([0.0, 0.0, 0.0], [0.0, 0.3, 0.6], [0.0, 0.1, 1.0]):
         slopes = slopes_of_tanh(np.array(poses), K, 5.0)
-        spectrum = compute_delay_spectrum(sloped(slopes, 0.6 * K * 0.1).loop, 2)
+        spectrum = compute_delay_spectrum(make_sloped_network(slopes, 0.6 * K * 0.1).loop, 2)
         assert spectrum.verdict != "unstable"
 
 
 def test_springs_between_end_effectors_have_no_known_bound() -> None:
-    """Their stiffness belongs to x, y and z, and their damping to the joints."""
+    """The stiffness belongs to x, y and z, but the damping to the joints."""
     scenario = load_scenario(
         "two_sites",
         {

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.theory.loops import loop
+from tests.theory.loops import make_loop
 from trilat_net.analysis.theory import find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.analysis.theory.delay_margin import (
@@ -24,7 +24,7 @@ from trilat_net.scenario import load_scenario
 @settings(max_examples=25)
 def test_a_delayed_integrator_tolerates_a_quarter_turn(a: float) -> None:
     """x' = -a x(t - T): stable up to a T = pi/2, crossing at a."""
-    (span,) = find_delay_margin(loop(0.0, (1.0, -a))).intervals
+    (span,) = find_delay_margin(make_loop(0.0, (1.0, -a))).intervals
     assert (span.low_s, span.low) == (0.0, None)
     assert span.high is not None
     assert span.high_s == pytest.approx(math.pi / 2 / a, rel=1e-9)
@@ -33,17 +33,17 @@ def test_a_delayed_integrator_tolerates_a_quarter_turn(a: float) -> None:
 
 def test_sufficient_damping_is_stable_for_every_delay() -> None:
     """x' = -2 x + x(t - T)."""
-    margin = find_delay_margin(loop(-2.0, (1.0, 1.0)))
+    margin = find_delay_margin(make_loop(-2.0, (1.0, 1.0)))
     assert margin.description == "stable for every common delay up to 10 s"
     assert (
-        find_delay_margin(loop(1.0, (1.0, 0.5))).description
+        find_delay_margin(make_loop(1.0, (1.0, 0.5))).description
         == "unstable for every common delay up to 10 s"
     )
 
 
 def test_oscillators_have_several_stable_delay_windows() -> None:
     """x'' + 0.1 x' + x = -0.4 x(t - T) with its windows; each end is a root on the axis."""
-    system = loop([[0.0, 1.0], [-4.0, -0.1]], (1.0, [[0.0, 0.0], [-1.0, 0.0]]))
+    system = make_loop([[0.0, 1.0], [-4.0, -0.1]], (1.0, [[0.0, 0.0], [-1.0, 0.0]]))
     margin = find_delay_margin(system)
     assert len(margin.intervals) > 1
     assert margin.intervals[0].low is None
@@ -62,7 +62,7 @@ def test_oscillators_have_several_stable_delay_windows() -> None:
 def test_undamped_modes_leave_the_margin_finite() -> None:
     """x'' + 9 x = 2 x(t - T): the response is infinite at 3 rad/s, and roots cross at sqrt(11)."""
     span = find_delay_margin(
-        loop([[0.0, 1.0], [-9.0, 0.0]], (1.0, [[0.0, 0.0], [2.0, 0.0]]))
+        make_loop([[0.0, 1.0], [-9.0, 0.0]], (1.0, [[0.0, 0.0], [2.0, 0.0]]))
     ).intervals[0]
     assert span.high is not None
     assert span.high_s == pytest.approx(math.pi / math.sqrt(11.0), rel=1e-9)
@@ -73,7 +73,9 @@ def test_undamped_modes_leave_the_margin_finite() -> None:
 @settings(max_examples=15)
 def test_verdicts_over_delay_are_the_roots(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    system = loop(rng.normal(size=(3, 3)) - np.eye(3), (1.0, 0.7 * rng.normal(size=(3, 3))))
+    system = make_loop(
+        rng.normal(size=(3, 3)) - np.eye(3), (1.0, 0.7 * rng.normal(size=(3, 3)))
+    )
     margin = find_delay_margin(system)
     ends = [end for span in margin.intervals for end in (span.low_s, span.high_s)]
     for T in (0.0, 0.1, 0.4, 1.0, 2.5):

@@ -17,8 +17,8 @@ from tests.theory.symbols import (
     dot,
     gravity,
     inertia,
+    make_symbols,
     norm,
-    pair,
     zero,
 )
 
@@ -55,23 +55,22 @@ class Rates(NamedTuple):
 
 
 @cache
-def rates() -> Rates:
+def make_rates() -> Rates:
     """Returns Eq.
 
     (8), (13), (15) put into the derivative of Eq. (16), for delays T(t) that may grow.
     """
-    Lambda, Kp, Kd, Gamma = (
-        diagonal("L"),
-        diagonal("P"),
-        diagonal("D"),
-        sp.diag(*sp.symbols("gamma1:6")),
-    )
-    share, growth = (
-        sp.Symbol("alpha12", positive=True),
-        list(sp.symbols("Tdot2 Tdot3", real=True)),
-    )
+    Lambda = diagonal("L")
+    Kp = diagonal("P")
+    Kd = diagonal("D")
+    Gamma = sp.diag(*sp.symbols("gamma1:6"))
+    share = sp.Symbol("alpha12", positive=True)
+    growth = list(sp.symbols("Tdot2 Tdot3", real=True))
     alpha = [share, 1 - share]  # Eq. (7)
-    e, qd_j, seen, hand = pair("e"), [pair("u"), pair("w")], [pair("us"), pair("ws")], pair("h")
+    e = make_symbols("e")
+    qd_j = [make_symbols("u"), make_symbols("w")]
+    seen = [make_symbols("us"), make_symbols("ws")]
+    hand = make_symbols("h")
     estimate = sp.Matrix(sp.symbols("hat1:6", real=True))
     ed = QD - sum((a * x for a, x in zip(alpha, seen, strict=True)), sp.zeros(2, 1))  # Eq. (18)
     lags = zip(alpha, growth, seen, strict=True)
@@ -90,31 +89,31 @@ def rates() -> Rates:
 
 
 @cache
-def chain(constant: bool) -> Any:
+def make_chain(constant: bool) -> Any:
     """Returns V_1' by the chain rule, with constant delays or not."""
-    x = rates()
+    x = make_rates()
     still = dict.fromkeys(x.growth, 0) if constant else {}
     return sp.expand(sp.expand_trig(x.chain.subs(still)))
 
 
 def test_eq_17_has_wrong_sign_and_factor() -> None:
     """Errata 5, Eq. (17), and 9: the hands' power is r'tau_h, not qd'tau_h."""
-    x = rates()
+    x = make_rates()
     right = -norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed / 2
-    assert zero(chain(True) - right - dot(x.r, x.hand))
-    free = chain(True).subs(dict.fromkeys(x.hand, 0))
+    assert zero(make_chain(True) - right - dot(x.r, x.hand))
+    free = make_chain(True).subs(dict.fromkeys(x.hand, 0))
     printed = -norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed
     assert not zero(free - printed)
     # the sign alone
     assert not zero(free - (-norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed))
     # the factor alone
     assert not zero(free - (-norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed / 2))
-    assert not zero(chain(True) - right - dot(QD, x.hand))
+    assert not zero(make_chain(True) - right - dot(QD, x.hand))
 
 
 def test_eq_19_does_not_follow_from_eq_17() -> None:
     """Errata 5, Eq. (19): halves, and the other sign of the last two norms."""
-    x = rates()
+    x = make_rates()
     stored = norm(QD, x.Kd) - sum(
         a * norm(u, x.Kd) for a, u in zip(x.alpha, x.qd_j, strict=True)
     )
@@ -132,13 +131,13 @@ def test_eq_19_does_not_follow_from_eq_17() -> None:
 
 def test_varying_delay_adds_exactly_one_term() -> None:
     """Errata 8: sum_j alpha_ij T_ij' (1/2 |qd_jd|^2 + (Lambda Kd e + Lambda M r)'qd_jd)."""
-    x = rates()
+    x = make_rates()
     push = x.Lambda * x.Kd * x.e + x.Lambda * inertia() * x.r
     terms = zip(x.alpha, x.growth, x.seen, strict=True)
     added = sum(
         a * grows * (norm(then, x.Kd) / 2 + dot(push, then)) for a, grows, then in terms
     )
-    assert zero(chain(False) - chain(True) - added)
+    assert zero(make_chain(False) - make_chain(True) - added)
 
 
 def one_joint(grows: float, Kp: float, Kd: float, Lambda: float, M: float) -> Any:

@@ -16,13 +16,13 @@ from tests.theory.symbols import (
     forces,
     gravity,
     inertia,
-    pair,
-    plain,
+    make_symbols,
+    normalise,
 )
 from trilat_net.core.arms.two_link_arm import ArmLinks, regressor, theta_from_links
 
 
-def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
+def derive_by_lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
     """Returns Euler and Lagrange's equations of two rigid links, with nothing of the paper in them."""
     t = sp.Symbol("t")
     m1, m2, l1, c1, c2, i1, i2 = sp.symbols("m1 m2 l1 lc1 lc2 I1 I2", positive=True)
@@ -38,7 +38,7 @@ def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
     potential = G * (m1 * first[1] + m2 * second[1])
     lagrangian = kinetic - potential
     torque = [lagrangian.diff(x.diff(t)).diff(t) - lagrangian.diff(x) for x in f]
-    a = pair("a")
+    a = make_symbols("a")
     plain = [(f[n].diff(t, 2), a[n]) for n in (0, 1)] + [(f[n].diff(t), QD[n]) for n in (0, 1)]
     plain += [(f[n], Q[n]) for n in (0, 1)]
     names = {"m1": m1, "m2": m2, "l1": l1, "lc1": c1, "lc2": c2, "I1": i1, "I2": i2}
@@ -55,19 +55,19 @@ def theta_24(n: dict[str, Any], last: Any) -> list[Any]:
 
 def test_theta_5_is_m2_lc2_unlike_eq_24() -> None:
     """Errata 1, Eq. (24)."""
-    torque, n = lagrange()
-    ours = forces(QD, pair("a"))
+    torque, n = derive_by_lagrange()
+    ours = forces(QD, make_symbols("a"))
 
     def off(last: Any) -> sp.Matrix:
         return (torque - ours.subs(dict(zip(THETA, theta_24(n, last), strict=True)))).applyfunc(
-            plain
+            normalise
         )
 
     assert off(n["m2"] * n["lc2"]) == sp.zeros(2, 1)
     l2 = sp.Symbol("l2", positive=True)
     printed = off(n["m2"] * l2)
     assert printed != sp.zeros(2, 1)
-    assert printed.subs(l2, n["lc2"]).applyfunc(plain) == sp.zeros(2, 1)
+    assert printed.subs(l2, n["lc2"]).applyfunc(normalise) == sp.zeros(2, 1)
 
 
 def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
@@ -75,7 +75,8 @@ def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
 
     (12): with one velocity the regressor is right where v = qd and nowhere else.
     """
-    v, a = pair("v"), pair("a")
+    v = make_symbols("v")
+    a = make_symbols("a")
     assert sp.expand(columns(v, a) * THETA - forces(v, a)) == sp.zeros(2, 1)
     # Section IV's, at v
     printed = columns(QD, a).subs(dict(zip(QD, v, strict=True)), simultaneous=True)
@@ -86,10 +87,10 @@ def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
 
 def test_programs_regressor_equals_the_energies() -> None:
     """Errata 2: Y theta of `core.arm`, with its own theta, against Euler and Lagrange."""
-    torque, n = lagrange()
+    torque, n = derive_by_lagrange()
     links = ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07)
     values = {"m1": 1.3, "m2": 0.8, "l1": 0.7, "lc1": 0.4, "lc2": 0.35, "I1": 0.11, "I2": 0.07}
-    a = pair("a")
+    a = make_symbols("a")
     exact = sp.lambdify(
         [Q, QD, a], torque.subs({n[k]: x for k, x in values.items()} | {G: 9.81}), "numpy"
     )
@@ -104,7 +105,7 @@ def test_programs_regressor_equals_the_energies() -> None:
 
 def test_known_lengths_reduce_five_parameters_to_four() -> None:
     """Errata 3, Eq. (24): theta_2 = l1 theta_5."""
-    _, n = lagrange()
+    _, n = derive_by_lagrange()
     theta = theta_24(n, n["m2"] * n["lc2"])
     assert sp.simplify(theta[1] - n["l1"] * theta[4]) == 0
     rng = np.random.default_rng(2)
@@ -122,8 +123,6 @@ def test_zero_estimates_contradict_zero_initial_acceleration() -> None:
     """Errata 4: level and at rest, tau = G_hat, so that qdd(0) = M^-1 (G_hat - G) = (-g, g)."""
     level = dict.fromkeys([*Q, *QD], 0)
     point_masses = dict(zip(THETA, (3, 1, 1, 2, 1), strict=True))
-    M, force = (
-        inertia().subs(level).subs(point_masses),
-        gravity().subs(level).subs(point_masses),
-    )
+    M = inertia().subs(level).subs(point_masses)
+    force = gravity().subs(level).subs(point_masses)
     assert list(M.inv() * -force) == [-G, G]

@@ -9,8 +9,8 @@ import pytest
 import sympy as sp
 from scipy.optimize import linprog
 
-from tests.theory.energy import balance
-from tests.virtual_runs import run
+from tests.execution.builders import make_shipped_trajectories
+from tests.theory.energy import compute_balance
 from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     find_closed_groups,
@@ -31,13 +31,13 @@ PI = sp.Matrix([[1 - ALPHA[1, 2] * ALPHA[2, 1], 1 - ALPHA[0, 2] * ALPHA[2, 0], 1
 SQUARES = sp.Matrix(sp.symbols("Q1:4", positive=True))
 
 
-def shares(rng: np.random.Generator, size: int) -> Any:
+def draw_shares(rng: np.random.Generator, size: int) -> Any:
     """Draws a dominance matrix for a number of sites."""
     alpha = rng.uniform(0.05, 1.0, (size, size)) * (1 - np.eye(size))
     return alpha / alpha.sum(axis=1, keepdims=True)
 
 
-def perron(alpha: Any) -> Any:
+def find_perron_vector(alpha: Any) -> Any:
     """Returns the left eigenvector of eigenvalue 1, from NumPy, sum 1."""
     values, vectors = np.linalg.eig(alpha.T)
     vector = np.real(vectors[:, np.argmin(np.abs(values - 1))])
@@ -91,17 +91,17 @@ def test_with_ones_v_can_rise() -> None:
         return float(beta @ each)
 
     assert rate(np.ones(3)) == pytest.approx(0.5 * (0.9 + 0.8 - 1))
-    assert rate(perron(alpha)) == pytest.approx(0.0, abs=1e-15)
+    assert rate(find_perron_vector(alpha)) == pytest.approx(0.0, abs=1e-15)
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 6])
 def test_weights_are_left_eigenvectors_for_all_n(size: int) -> None:
     """Errata 6, N sites."""
-    alpha = shares(np.random.default_rng(size), size)
-    assert left_perron_vector(alpha) == pytest.approx(perron(alpha), rel=1e-9)
+    alpha = draw_shares(np.random.default_rng(size), size)
+    assert left_perron_vector(alpha) == pytest.approx(find_perron_vector(alpha), rel=1e-9)
     c = np.linspace(0.3, 10.0, size)
     beta = compute_lyapunov_weights(alpha, c[:, np.newaxis] * [3.0, 1.0]).beta
-    assert beta * c / (beta @ c) == pytest.approx(perron(alpha), rel=1e-9)
+    assert beta * c / (beta @ c) == pytest.approx(find_perron_vector(alpha), rel=1e-9)
 
 
 # --- 7: Kd ----------------------------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def passed_on(alpha: Any, Kd: Any) -> Any:
     return np.concatenate(rows)
 
 
-def feasible(alpha: Any, Kd: Any) -> bool:
+def is_feasible(alpha: Any, Kd: Any) -> bool:
     """True if nonnegative weights beta, not all zero, make every term of V' nonpositive."""
     rows = passed_on(alpha, Kd)
     n = len(alpha)
@@ -125,14 +125,15 @@ def feasible(alpha: Any, Kd: Any) -> bool:
 
 def test_kd_may_differ_by_scalars_only() -> None:
     """Errata 7: beta_i = pi_i / c_i; of another shape there is no beta, not even for V' <= 0."""
-    alpha, c = shares(np.random.default_rng(3), 3), np.array([10.0, 3.0, 0.3])
+    alpha = draw_shares(np.random.default_rng(3), 3)
+    c = np.array([10.0, 3.0, 0.3])
     common = c[:, np.newaxis] * [2.0, 5.0]
-    assert passed_on(alpha, common) @ (perron(alpha) / c) == pytest.approx(
+    assert passed_on(alpha, common) @ (find_perron_vector(alpha) / c) == pytest.approx(
         np.zeros(6), abs=1e-14
     )
-    assert np.abs(passed_on(alpha, common) @ perron(alpha)).max() > 0.1
-    assert feasible(alpha, common)
-    assert not feasible(alpha, np.array([[0.1, 30.0], [30.0, 0.1], [3.0, 3.0]]))
+    assert np.abs(passed_on(alpha, common) @ find_perron_vector(alpha)).max() > 0.1
+    assert is_feasible(alpha, common)
+    assert not is_feasible(alpha, np.array([[0.1, 30.0], [30.0, 0.1], [3.0, 3.0]]))
 
 
 def test_no_weights_of_the_integrals_leave_slack() -> None:
@@ -161,17 +162,16 @@ def test_a_passive_wall_gives_energy_to_v() -> None:
 
     turns = np.linspace(0.0, 2 * np.pi, 4001)
     path = np.array([-0.5, 1.85]) + 0.2 * np.stack([np.cos(turns), np.sin(2 * turns)], axis=1)
-    steps, middles = np.diff(path, axis=0), 0.5 * (path[1:] + path[:-1])
+    steps = np.diff(path, axis=0)
+    middles = 0.5 * (path[1:] + path[:-1])
     work_done = np.array([step @ push(q) for step, q in zip(steps, middles, strict=True)])
     assert np.abs(work_done).sum() > 10.0
     assert (work_done == 0.0).any()  # part of the way is free
     # once around: the wall gives back what it took
     assert work_done.sum() == pytest.approx(0.0, abs=0.01)
     # its peers are deeper in the wall
-    rests, desired = (
-        np.array([-0.5, 1.75]),
-        np.array([-0.45, 1.6]),
-    )
+    rests = np.array([-0.5, 1.75])
+    desired = np.array([-0.45, 1.6])
     assert push(rests) @ (rests - desired) > 10.0
 
 
@@ -213,8 +213,10 @@ def test_only_rest_remains() -> None:
     """Errata 10.4: the factor of w, sum pi_i / Lambda_i + sum pi_i alpha_ij T_ij, is positive."""
     rng = np.random.default_rng(4)
     for _ in range(50):
-        alpha = shares(rng, 4)
-        pi, Lambda, T = perron(alpha), rng.uniform(0.1, 5.0, 4), rng.uniform(0.0, 2.0, (4, 4))
+        alpha = draw_shares(rng, 4)
+        pi = find_perron_vector(alpha)
+        Lambda = rng.uniform(0.1, 5.0, 4)
+        T = rng.uniform(0.0, 2.0, (4, 4))
         assert (
             (pi / Lambda).sum() + (pi[:, np.newaxis] * alpha * T).sum()
             >= (pi / Lambda).sum()
@@ -240,10 +242,12 @@ def test_sites_that_nobody_follows_still_settle() -> None:
     rows = {
         f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()
     }
-    trajectory_of_run = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
-    locked = balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
+    trajectory_of_run = make_shipped_trajectories(
+        "free", {**rows, "rate_hz": 200, "duration_s": 25.0}
+    )
+    locked = compute_balance(trajectory_of_run, np.array([0.5, 0.0, 0.5])).V
     assert np.diff(locked).max() <= 1e-6 * locked.max()
-    alone = balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V
+    alone = compute_balance(trajectory_of_run, np.array([0.0, 1.0, 0.0])).V
     assert np.diff(alone).max() > 1e-6 * alone.max()
     e = np.abs(trajectory_of_run.stack("q") - trajectory_of_run.stack("q_des")).max(axis=(0, 2))
     assert e[-200:].max() < 0.02 < 0.5 < e.max()
@@ -262,7 +266,8 @@ def test_two_closed_groups_have_several_betas() -> None:
 def test_learning_gravity_is_a_spring() -> None:
     """Errata 12: theta_4_hat + Gamma g sin q1 changes by -Gamma g cos(q1) Lambda e1 alone: qd integrates."""
     t, gain, g, Lambda = sp.symbols("t Gamma g Lambda", positive=True)
-    q, e = sp.Function("q")(t), sp.Function("e")(t)
+    q = sp.Function("q")(t)
+    e = sp.Function("e")(t)
     learnt = -gain * g * sp.cos(q) * (q.diff(t) + Lambda * e)  # Eq. (15), fourth column of Y
     assert (
         sp.simplify(learnt + (gain * g * sp.sin(q)).diff(t) + gain * g * sp.cos(q) * Lambda * e)
@@ -273,7 +278,8 @@ def test_learning_gravity_is_a_spring() -> None:
 def test_dominance_decides_who_feels_whom() -> None:
     """Errata 12: at rest sum beta_i tau_h,i = 0, so that a hand at i feels tau_s beta_s / beta_i."""
     alpha = np.array([[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]])
-    beta, stiffness = perron(alpha), 40.0
+    beta = find_perron_vector(alpha)
+    stiffness = 40.0
     for holding, felt in ((0, 4.79), (1, 16.4)):
         free = np.array([i for i in range(3) if i != holding])
         load = np.array([0.0, 0.0, 5.0])

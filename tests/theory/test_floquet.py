@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from tests.execution.builders import run_fused
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import find_equilibrium, floquet
@@ -18,7 +19,6 @@ from trilat_net.analysis.theory.floquet import (
     find_samples_in_use,
 )
 from trilat_net.analysis.theory.operating_point import OperatingConditions
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.sample_uses import draw_used_samples
 
@@ -29,16 +29,16 @@ class Loop(NamedTuple):
     """A loop at rest in one pose, its roots, and that scenario."""
 
     scenario: Scenario
-    found: Spectrum
+    spectrum: Spectrum
 
     @property
     def growth_per_s(self) -> float:
         """Growth of the slowest motion, 1/s."""
-        assert self.found.rightmost is not None
-        return self.found.rightmost.s.real
+        assert self.spectrum.rightmost is not None
+        return self.spectrum.rightmost.s.real
 
 
-def at_rest(
+def make_loop_at_rest(
     name: str, changes: Mapping[str, Any], wanted: int = 4, pose: tuple[float, ...] = POSE
 ) -> Loop:
     """Returns a scenario with all sites at rest at a pose, and its roots there."""
@@ -74,13 +74,16 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
             )
         },
     )
-    step_s = (loop.found.span_s or 0.05) * math.ceil(0.2 / (loop.found.span_s or 0.05))
+    step_s = (loop.spectrum.span_s or 0.05) * math.ceil(0.2 / (loop.spectrum.span_s or 0.05))
     k = np.arange(math.ceil(from_s / step_s), math.floor((to_s - 0.1) / step_s))
     seen = []
-    for name, one, other in zip(whole.names, speeds(whole), speeds(beside), strict=True):
+    for name, speeds_first, other in zip(
+        whole.names, list_speeds(whole), list_speeds(beside), strict=True
+    ):
         ticks = np.rint(k * step_s * whole.sites[name].rate_hz).astype(int)
         seen.append(
-            (one - other)[ticks] * np.exp(-loop.growth_per_s * k * step_s)[:, np.newaxis]
+            (speeds_first - other)[ticks]
+            * np.exp(-loop.growth_per_s * k * step_s)[:, np.newaxis]
         )
     rows = np.concatenate(seen, axis=1)  # of one size, to weigh alike
     before = np.concatenate(
@@ -94,10 +97,9 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
     return loop.growth_per_s + math.log(np.abs(np.roots([1.0, *-terms[::-1]])).max()) / step_s
 
 
-def speeds(scenario: Scenario) -> list[Array]:
+def list_speeds(scenario: Scenario) -> list[Array]:
     """Returns the joint speeds of every record of each site."""
-    run = FusedRun(scenario, keep=max(map(scenario.ticks, scenario.names)))
-    run.advance_to(scenario.duration_s)
+    run = run_fused(scenario, keep=max(map(scenario.ticks, scenario.names)))
     assert run.diverged_s is None
     columns = scenario.layout(scenario.names[0]).columns()["qd"]
     return [rows[:, columns] for _, rows in run.pop_records()]
@@ -148,13 +150,15 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
     }
     for n, site in enumerate(sites):
         changes[f"sites.{site}.rate_hz"] = int(rates[n if seed % 5 < 3 else 0])
-    loop = at_rest(name, changes, 6)
-    reals = [root.s.real for root in loop.found.roots]
+    loop = make_loop_at_rest(name, changes, 6)
+    reals = [root.s.real for root in loop.spectrum.roots]
     gap_per_s = reals[0] - next(
         (real for real in reals if real < reals[0] - 1e-3), reals[0] - 1.0
     )
     from_s = max(4.0, 2.0 / max(0.1, gap_per_s))
-    to_s = from_s + max(20.0 * max(1.0, loop.found.span_s or 0.0), min(120.0, 4.0 / gap_per_s))
+    to_s = from_s + max(
+        20.0 * max(1.0, loop.spectrum.span_s or 0.0), min(120.0, 4.0 / gap_per_s)
+    )
     size = reals[0] * to_s
     if not -20.0 < size < 15.0:
         return None
@@ -190,7 +194,7 @@ def test_one_rate_gives_companion_matrix_eigenvalues(
     law: dict[str, Any], delay_ms: float
 ) -> None:
     damped = {} if law["law"] == "adaptive" else {"d": 1.3}
-    loop = at_rest(
+    loop = make_loop_at_rest(
         "two_sites", {"rate_hz": 100, "control": {**law, **damped}, "link.delay_ms": delay_ms}
     )
     recursion = build_recursion(
@@ -198,11 +202,11 @@ def test_one_rate_gives_companion_matrix_eigenvalues(
     )
     roots = recursion.roots(100)
     still = np.abs(roots) < 1e-6
-    assert loop.found.zeros == recursion.constant + np.count_nonzero(still)
+    assert loop.spectrum.zeros == recursion.constant + np.count_nonzero(still)
     moving = roots[~still & (roots.imag >= 0.0)]
-    for root, other in zip(loop.found.roots, moving, strict=False):
+    for root, other in zip(loop.spectrum.roots, moving, strict=False):
         assert abs(root.s - other) <= 1e-6 * (1.0 + abs(other))
-    assert loop.found.span_s is None
+    assert loop.spectrum.span_s is None
 
 
 @pytest.mark.parametrize(
@@ -215,7 +219,7 @@ def test_digital_pairs_may_grow_despite_continuous_damping(
     rates = {"sites.m.rate_hz": rates_hz[0], "sites.s.rate_hz": rates_hz[1]}
     control = {"law": "p_d", "K": 50.0, "d": 2.0}
     changes = {**rates, "scheme": "digital", "control": control, "link.delay_ms": 0.0}
-    roots = at_rest("two_sites", changes, pose=(0.0, math.pi)).found
+    roots = make_loop_at_rest("two_sites", changes, pose=(0.0, math.pi)).spectrum
     assert roots.rightmost is not None
     assert roots.rightmost.s.real == pytest.approx(growth_per_s, abs=5e-4)
     assert roots.rightmost.s.imag == pytest.approx(9.9, abs=0.2)
@@ -230,10 +234,14 @@ def test_sinusoidal_delays_can_pump_stable_loops() -> None:
     """P+d, d 1.1, 200 +- 195 ms: the loop swings at half the frequency of the delay, which
     excites it parametrically.
     """
-    changes, straight = {"rate_hz": 200, "control.d": 1.1}, (0.1, 0.0)
+    changes = {"rate_hz": 200, "control.d": 1.1}
+    straight = (0.1, 0.0)
     mean = {"model": "constant", "delay_ms": 202.5}
-    assert at_rest("p_d_margin", {**changes, "link": mean}, pose=straight).growth_per_s < -0.01
-    pumped = at_rest("p_d_margin", {**changes, "link": SINE}, pose=straight).found
+    assert (
+        make_loop_at_rest("p_d_margin", {**changes, "link": mean}, pose=straight).growth_per_s
+        < -0.01
+    )
+    pumped = make_loop_at_rest("p_d_margin", {**changes, "link": SINE}, pose=straight).spectrum
     assert pumped.rightmost is not None
     assert abs(pumped.rightmost.s - complex(0.0397, math.pi / SINE_S)) <= 1e-4
     assert pumped.span_s == SINE_S
@@ -260,20 +268,20 @@ def test_the_period_is_that_of_the_draws(period_s: float) -> None:
 
 
 def test_drawn_delays_grow_like_their_twins() -> None:
-    """From one window of 3 s to another; the span of the roots begins earlier in the same draws."""
+    """The growth is measured from one window of 3 s to another; the span of the roots begins earlier in the same draws."""
     link = {"model": "normal", "delay_ms": 200.0, "deviation_ms": 80.0, "loss": 0.3}
     changes = {"rate_hz": 100, "control.d": 1.0, "link": link, "duration_s": 30.0}
-    loop = at_rest("p_d_margin_two", changes, 1, (0.1, 0.0))
-    assert loop.found.span_s == 30.0
-    assert loop.found.deviation_per_s is not None
-    assert 1e-3 < loop.found.deviation_per_s < 0.02
+    loop = make_loop_at_rest("p_d_margin_two", changes, 1, (0.1, 0.0))
+    assert loop.spectrum.span_s == 30.0
+    assert loop.spectrum.deviation_per_s is not None
+    assert 1e-3 < loop.spectrum.deviation_per_s < 0.02
     beside = load_scenario(loop.scenario, {"sites.s.q0_rad": [POSE[0] + 1e-7, 0.0]})
     distances = np.hstack(
-        [a - b for a, b in zip(speeds(loop.scenario), speeds(beside), strict=True)]
+        [a - b for a, b in zip(list_speeds(loop.scenario), list_speeds(beside), strict=True)]
     )
     first, last = (np.linalg.norm(distances[from_s * 100 :][:300]) for from_s in (2, 27))
     assert math.log(last / first) / 25.0 == pytest.approx(
-        loop.growth_per_s, abs=3.0 * loop.found.deviation_per_s
+        loop.growth_per_s, abs=3.0 * loop.spectrum.deviation_per_s
     )
 
 
@@ -281,7 +289,9 @@ def test_drifting_motions_differ_from_staying_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A free mass, and one that follows it: a shared place stays, and both may go on at one speed."""
-    h, K, d = 0.01, 4.0, 3.0
+    h = 0.01
+    K = 4.0
+    d = 3.0
     S = np.eye(4)
     S[0, 1] = S[2, 3] = h
     S[3, 2:] -= h * K, h * d
@@ -291,7 +301,9 @@ def test_drifting_motions_differ_from_staying_ones(
         S, {(1, 0): effect}, ("m.q1", "m.qd1", "s.q1", "s.qd1"), np.array([0, 0, 1, 1]), 0
     )
     monkeypatch.setattr(floquet, "couple_ticks", lambda *_, **__: hand_made)
-    roots = at_rest("two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}).found
+    roots = make_loop_at_rest(
+        "two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}
+    ).spectrum
     assert (roots.zeros, roots.drifting, roots.verdict) == (2, 1, "at the edge")
     assert roots.rightmost is not None
     exact = np.log(np.roots([1.0, -(2.0 - h * d), 1.0 - h * d + h * h * K]).astype(complex)) / h
@@ -300,7 +312,7 @@ def test_drifting_motions_differ_from_staying_ones(
 
 def test_thousandfold_growth_per_tick_has_its_root() -> None:
     control = {"law": "p_d", "K": 1.0, "d": 1e5}
-    loop = at_rest(
+    loop = make_loop_at_rest(
         "two_sites",
         {"rate_hz": 1000, "scheme": "digital", "control": control, "link.delay_ms": 20.0},
         1,

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.theory.networks import Array, Network, pair
+from tests.theory.networks import Array, Network, make_pair
 from trilat_net.analysis.theory.frequency_search import (
     build_frequency_grid,
     cache_response,
@@ -94,7 +94,7 @@ def test_an_undamped_resonance_ends_the_refinement() -> None:
 
 def test_remembered_answers_are_asked_once() -> None:
     questions: list[int] = []
-    Y = build_admittance(pair().loop)
+    Y = build_admittance(make_pair().loop)
 
     def counted(w: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
         questions.append(len(w))

@@ -13,8 +13,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.transmission import PAIR, TABLE, VARIANTS, approximate_printed, balance, transmitted
-from tests.unit_arm import CLAMP, hand, two_sites, unit_scenario
+from tests.transmission import (
+    PAIR,
+    TABLE,
+    VARIANTS,
+    approximate_printed,
+    build_balance,
+    find_transmission,
+)
+from tests.unit_arm import CLAMP, make_four_channel_pair, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
@@ -27,7 +34,9 @@ from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
 
 ALONG = np.array([1.0, 0.5])
-b, K, T = 10.0, 100.0, 0.2
+b = 10.0
+K = 100.0
+T = 0.2
 HELD = {**CLAMP, "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 10.0}
 
 
@@ -75,7 +84,7 @@ def wave_pair(wall: float = 0.0, held: bool = True) -> Scenario:
     slave = {"law": "wave", "b": b, "K": K, "B": b}
     env = [{**CLAMP, "stiffness_nm_rad": wall}] if wall else []
     sites = {"m": {"hands": [HELD] if held else []}, "s": {"hands": env, "control": slave}}
-    return unit_scenario(
+    return make_unit_scenario(
         sites, {"law": "wave", "b": b}, link={"model": "constant", "delay_ms": 1e3 * T}
     )
 
@@ -96,10 +105,8 @@ def test_wave_line_roots_follow_their_delays(wall: float) -> None:
             )
             if abs(step) < 1e-7 * (1.0 + abs(root.s)):
                 ours.append(root.s)
-        low, high = (
-            complex(max(-4.0, spectrum.roots[-1].s.real + 1e-3), -1e-2),
-            complex(1.0, 30.0),
-        )
+        low = complex(max(-4.0, spectrum.roots[-1].s.real + 1e-3), -1e-2)
+        high = complex(1.0, 30.0)
         inside = [s for s in ours if s.real > low.real and s.imag < 30.0 and abs(s) > 1e-6]
         equation = partial(wave_equation, mass=mass, wall=wall)
         zeros = count_inside(equation, -1e-3 - 1e-3j, 1e-3 + 1e-3j)
@@ -118,8 +125,8 @@ def test_wave_lines_feel_like_mass_and_spring() -> None:
 
 @pytest.mark.parametrize(("variant", "delay_s"), [key for key in TABLE if key[1] > 0.0])
 def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> None:
-    """With accelerations and local force feedback, to the last digit of the impedance."""
-    scenario = two_sites(variant, delay_s)
+    """With accelerations and local force feedback, the impedance agrees to the last digit."""
+    scenario = make_four_channel_pair(variant, delay_s)
     sites = {**scenario.sites, "m": msgspec.structs.replace(scenario.sites["m"], hands=())}
     loop = loop_of(msgspec.structs.replace(scenario, sites=sites))
     ratios = [
@@ -128,7 +135,8 @@ def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> No
     ]
     assert ratios == [approximate_printed(value) for value in TABLE[variant, delay_s]]
     exact = [
-        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 5.0)
+        find_transmission(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
+        for hz in (0.1, 5.0)
     ]
     assert [ratios[0], ratios[-1]] == pytest.approx(exact, rel=1e-9)
 
@@ -137,11 +145,13 @@ def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> No
 @pytest.mark.parametrize("acceleration", [0.0, 0.5])
 def test_delayed_four_channel_roots_solve_equations(acceleration: float) -> None:
     law = {"force_own": (0.2, -0.5), "acceleration": acceleration}
-    scenario = two_sites("without qdd", 0.02, **law)
+    scenario = make_four_channel_pair("without qdd", 0.02, **law)
     loads = [(50.0, 10.0), (500.0, 5.0)]
 
     def f(s: complex) -> complex:
-        return complex(np.linalg.det(balance(s, PAIR, delay_s=0.02, loads=loads, **law)[0]))
+        return complex(
+            np.linalg.det(build_balance(s, PAIR, delay_s=0.02, loads=loads, **law)[0])
+        )
 
     roots = [root.s for root in compute_delay_spectrum(loop_of(scenario), 12).roots]
     on_line = [
@@ -151,7 +161,8 @@ def test_delayed_four_channel_roots_solve_equations(acceleration: float) -> None
     ]
     assert len(on_line) >= 3
     edge = max(s.real for s in on_line)
-    low, high = complex(edge - 1.0, -0.01), complex(edge + 50.0, 400.0)
+    low = complex(edge - 1.0, -0.01)
+    high = complex(edge + 50.0, 400.0)
     assert sum(s.real > edge - 1.0 and s.imag < 400.0 for s in on_line) == count_inside(
         f, low, high
     )
@@ -163,14 +174,19 @@ def test_delayed_four_channel_roots_solve_equations(acceleration: float) -> None
 def test_six_channels_with_accelerations_share_as_published(
     a: float, user: int, values: tuple[float, float]
 ) -> None:
-    names, alpha = ("u1", "u2", "s"), complementary_shares(a)
+    names = ("u1", "u2", "s")
+    alpha = complementary_shares(a)
     shares = {
         site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
         for i, site in enumerate(names)
     }
-    sites: dict[str, Any] = {"u1": {}, "u2": {}, "s": {"hands": [hand(0.0, 500.0, 5.0)]}}
+    sites: dict[str, Any] = {
+        "u1": {},
+        "u2": {},
+        "s": {"hands": [make_spring_hand(0.0, 500.0, 5.0)]},
+    }
     law = {"law": "six_channel", "K": 100.0, "B": 20.0, "acceleration": 1.0}
-    loop = set_common_delay(loop_of(unit_scenario(sites, law, dominance=shares)), 0.0)
+    loop = set_common_delay(loop_of(make_unit_scenario(sites, law, dominance=shares)), 0.0)
     ratios = [
         abs(find_impedance(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 1.0)
@@ -178,7 +194,7 @@ def test_six_channels_with_accelerations_share_as_published(
     assert ratios == [approximate_printed(value) for value in values]
 
 
-def solves(f: Callable[[complex], complex], s: complex) -> bool:
+def is_root(f: Callable[[complex], complex], s: complex) -> bool:
     return abs(f(s) / ((f(s + 1e-6) - f(s - 1e-6)) / 2e-6)) < 1e-6 * (1.0 + abs(s))
 
 
@@ -187,7 +203,8 @@ def test_true_models_predict_roots_without_delay() -> None:
     law = {"law": "smith", "K": 100.0, "d": 5.0, "inertia": 1.0}
     sites = {"m": {"control": {**law, "predicts": True}}, "s": {}}
     roots = [
-        root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 16).roots
+        root.s
+        for root in compute_delay_spectrum(loop_of(make_unit_scenario(sites, law)), 16).roots
     ]
     for stiffness in (100.0, 200.0):
         wanted = np.roots([1.0, 5.0, stiffness]).astype(complex)[0]
@@ -195,8 +212,11 @@ def test_true_models_predict_roots_without_delay() -> None:
 
 
 def test_shared_authority_has_its_springs_roots() -> None:
-    a, d, K_a = 0.75, 5.0, 10.0
-    names, alpha = ("u1", "u2", "s"), complementary_shares(a)
+    a = 0.75
+    d = 5.0
+    K_a = 10.0
+    names = ("u1", "u2", "s")
+    alpha = complementary_shares(a)
     shares = {
         site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
         for i, site in enumerate(names)
@@ -206,7 +226,7 @@ def test_shared_authority_has_its_springs_roots() -> None:
     roots = [
         root.s
         for root in compute_delay_spectrum(
-            loop_of(unit_scenario(sites, law, dominance=shares)), 12
+            loop_of(make_unit_scenario(sites, law, dominance=shares)), 12
         ).roots
     ]
 
@@ -218,8 +238,8 @@ def test_shared_authority_has_its_springs_roots() -> None:
             - pulls[0] * pulls[1] * np.exp(-2.0 * s * T)
         )
 
-    assert sum(solves(users, s) for s in roots) >= 3
-    assert any(solves(lambda s: s * s + d * s + K_a, s) for s in roots)
+    assert sum(is_root(users, s) for s in roots) >= 3
+    assert any(is_root(lambda s: s * s + d * s + K_a, s) for s in roots)
 
 
 @pytest.mark.long
@@ -228,7 +248,8 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
     law = {"law": "impedance", "M": 2.0, "B": 10.0, "K": 50.0}
     sites = {"m": {}, "s": {"control": {**law, "follows": True}}}
     roots = [
-        root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 4).roots
+        root.s
+        for root in compute_delay_spectrum(loop_of(make_unit_scenario(sites, law)), 4).roots
     ]
     wanted = np.roots([2.0, 10.0, 50.0])[0]
     assert roots
@@ -237,9 +258,9 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
 
 
 def test_synchronised_outputs_have_consensus_roots() -> None:
-    """Without gravity and with the true parameters: s = -Lambda, and m s = -K (1 -+ exp(-s T))."""
+    """Without gravity and with the true parameters, s = -Lambda, and m s = -K (1 -+ exp(-s T))."""
     law = {"law": "sync", "Lambda": 1.0, "K": 3.0}
-    loop = loop_of(unit_scenario({"m": {}, "s": {}}, law))
+    loop = loop_of(make_unit_scenario({"m": {}, "s": {}}, law))
     roots = [root.s for root in compute_delay_spectrum(loop, 10).roots]
     assert min(abs(root + 1.0) for root in roots) < 1e-5
 
@@ -253,13 +274,13 @@ def test_synchronised_outputs_have_consensus_roots() -> None:
 
     others = [root for root in roots if abs(root + 1.0) > 1e-5]
     assert len(others) > 5
-    assert all(solves(consensus, root) for root in others)
+    assert all(is_root(consensus, root) for root in others)
 
 
 def test_energy_switching_laws_explain_missing_roots() -> None:
     for law, why in (("tanks", "tank"), ("tdpa", "second order")):
         with pytest.raises(ScenarioError, match=why):
-            loop_of(unit_scenario({"m": {}, "s": {}}, {"law": law}))
+            loop_of(make_unit_scenario({"m": {}, "s": {}}, {"law": law}))
 
 
 def test_the_analysis_of_waves_is_whole() -> None:
@@ -283,10 +304,10 @@ def test_lines_hold_arms_at_rest_against_hands() -> None:
 
 
 def test_saturating_pulls_are_linearised_below_saturation() -> None:
-    """Its loop is that of P+d with the same K and d, and the analysis says so."""
+    """The loop is that of P+d with the same K and d, and the analysis says so."""
     loops = []
     for law in ({"law": "saturated_pd", "P": 5.0}, {"law": "p_d"}):
-        scenario = unit_scenario(
+        scenario = make_unit_scenario(
             {"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0}
         )
         analysis = analyse_linear_loop(scenario, pose=(0.0, 0.0))

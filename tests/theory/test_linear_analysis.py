@@ -151,7 +151,7 @@ def test_invalid_numbers_of_roots_are_refused(roots: int) -> None:
 
 
 def test_several_rates_have_exact_scenario_roots() -> None:
-    """Both sites end where they start, a millionth apart: folded, as they begin."""
+    """Both sites end where they start, a millionth apart and folded."""
     pair = {
         "sites.m.rate_hz": 40,
         "sites.s.rate_hz": 30,
@@ -169,14 +169,10 @@ def test_several_rates_have_exact_scenario_roots() -> None:
 
 
 def test_drawn_delays_use_their_actual_samples() -> None:
-    """Its last quarter begins 15 s later than the draws of the linear analysis, so that the
-    draws differ.
-    """
+    """The last quarter of the run begins 15 s later than the draws of the linear analysis, so that the draws differ."""
     run = {"rate_hz": 200, "duration_s": 40.0}
-    roots, whole = (
-        find_log_roots(tn.simulate("jitter", run)),
-        tn.linear("jitter", run, ports=False),
-    )
+    roots = find_log_roots(tn.simulate("jitter", run))
+    whole = tn.linear("jitter", run, ports=False)
     assert whole.sampled is not None
     assert whole.sampled.rightmost is not None
     assert (roots.verdict, roots.exact) == ("stable", False)

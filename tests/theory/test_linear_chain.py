@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
 from trilat_studies.sweep.stability_map import evaluate_criterion
 
-from tests.chains import two_arms
 from tests.core.chain_references import ARMS
-from tests.theory.loops import Array, residual, roots_within
+from tests.scenario.builders import two_arm_text
+from tests.theory.loops import Array, compute_residual, roots_within
 from trilat_net.analysis.theory import find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
@@ -52,7 +52,7 @@ from trilat_net.scenario.scenario_reader import parse_scenario
 POSE = (0.0, -1.1, 1.2, -0.4, 0.3, 0.1)
 LOADED = [2, 3, 4, 5, 6]
 """Joints of arm6 that gravity loads: not the first, whose axis is upright."""
-TEXT = two_arms("arm6.urdf", POSE, 20.0, 50.0, [0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+TEXT = two_arm_text("arm6.urdf", POSE, 20.0, 50.0, [0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
 LAWS: dict[str, dict[str, Any]] = {
     "adaptive": {
         "law": "adaptive",
@@ -81,7 +81,7 @@ class Linear(NamedTuple):
         return linearise_loop(self.conditions, self.rest, **options)
 
 
-def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
+def make_six_joint_loop(law: str, off: Array | None = None, **overrides: Any) -> Linear:
     """Returns sites that start at the pose, or off it by (2, 6) rad."""
     start = POSE + (np.zeros((2, 6)) if off is None else off)
     keys = {
@@ -98,9 +98,10 @@ def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
     )
 
 
-def follow(scenario: Scenario, ticks: int) -> Array:
+def trace_angles(scenario: Scenario, ticks: int) -> Array:
     """Returns the angles of both sites at each tick, shape (ticks, 12)."""
-    run, rate_hz = FusedRun(scenario), scenario.sites["m"].rate_hz
+    run = FusedRun(scenario)
+    rate_hz = scenario.sites["m"].rate_hz
     angles = []
     for k in range(1, ticks + 1):
         run.advance_to(k / rate_hz)
@@ -111,12 +112,20 @@ def follow(scenario: Scenario, ticks: int) -> Array:
 def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
     """Returns accelerations and rates of the estimate as a tick computes them, by the compiled leaves."""
     assert site.chain is not None
-    gains, gravity, q, qd = site.gains, np.array(site.chain.gravity_m_s2), x[at.q], x[at.qd]
+    gains = site.gains
+    gravity = np.array(site.chain.gravity_m_s2)
+    q = x[at.q]
+    qd = x[at.qd]
     rows = build_chain(site.chain.joints, MAX_JOINTS)
     place_joints(rows, q)
-    e, ed = q - x[at.q_des], qd - x[at.qd_des]
-    v, a = -np.asarray(gains.Lambda) * e, -np.asarray(gains.Lambda) * ed
-    tau, gradient, qdd, acted = np.zeros(6), np.zeros(60), np.zeros(6), np.zeros((2, 6))
+    e = q - x[at.q_des]
+    ed = qd - x[at.qd_des]
+    v = -np.asarray(gains.Lambda) * e
+    a = -np.asarray(gains.Lambda) * ed
+    tau = np.zeros(6)
+    gradient = np.zeros(60)
+    qdd = np.zeros(6)
+    acted = np.zeros((2, 6))
     propagate_motion(rows, gravity, qd, v, a)
     parameter_gradient(rows, gradient)
     inverse_dynamics(rows, x[at.estimate], v, a, tau)
@@ -132,7 +141,7 @@ def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
 
 @pytest.mark.long
 def test_rates_and_derivatives_equal_compiled_leaves() -> None:
-    """With hands on the joints and on the end effector, and walls of any direction, one of them touched."""
+    """Hands act on the joints and on the end effector, and one of the walls of any direction is touched."""
     rng = np.random.default_rng(14)
     normal = rng.normal(size=3)
     normal /= np.linalg.norm(normal)
@@ -146,17 +155,14 @@ def test_rates_and_derivatives_equal_compiled_leaves() -> None:
         TorqueSource(TorqueKind.WALL, b=tuple(normal), **wall),
         TorqueSource(TorqueKind.WALL, b=tuple(-normal), **wall, sampled=True),
     )
-    site, at = (
-        six("adaptive").scenario.setup("m")._replace(actors=actors),
-        ArgumentLayout(6, 60),
-    )
+    site = make_six_joint_loop("adaptive").scenario.setup("m")._replace(actors=actors)
+    at = ArgumentLayout(6, 60)
     for _ in range(3):
         x = rng.uniform(-1.0, 1.0, at.arguments)
-        rates, exact = evaluate_site_rates(site, x), differentiate_site_rates(site, x)
-        derivatives, wanted = (
-            np.concatenate([rates.qdd, rates.estimate]),
-            by_leaves(site, x, at),
-        )
+        rates = evaluate_site_rates(site, x)
+        exact = differentiate_site_rates(site, x)
+        derivatives = np.concatenate([rates.qdd, rates.estimate])
+        wanted = by_leaves(site, x, at)
         assert np.abs(derivatives - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
         jacobian = np.vstack([exact.qdd, exact.estimate])
         for k in range(at.arguments):
@@ -169,8 +175,9 @@ def test_rates_and_derivatives_equal_compiled_leaves() -> None:
 
 def test_learnt_gravity_stands_for_all_estimates() -> None:
     """Five combinations of sixty: SciPy finds the same roots of both loops, and ports answer alike."""
-    case = six("adaptive")
-    whole, short = case.loop(all_estimates=True), case.loop()
+    case = make_six_joint_loop("adaptive")
+    whole = case.loop(all_estimates=True)
+    short = case.loop()
     assert [name for name in short.names if "gravity" in name] == [
         f"{site}.gravity{joint}" for site in "ms" for joint in LOADED
     ]
@@ -187,12 +194,13 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
 @pytest.mark.long
 def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     """Each omitted state counts as a root at zero; the shared pose gives the others."""
-    case = six("adaptive")
+    case = make_six_joint_loop("adaptive")
     loop = case.loop()
     spectrum = compute_delay_spectrum(loop, 3)
     assert (spectrum.zeros, spectrum.drifting) == (loop.omitted_states + 6, 0)
     assert all(
-        residual(case.loop(all_estimates=True), root.s) <= 1e-12 for root in spectrum.roots
+        compute_residual(case.loop(all_estimates=True), root.s) <= 1e-12
+        for root in spectrum.roots
     )
     # no other root is to the right of the third
     edge = spectrum.roots[2].s.real - 0.05
@@ -201,8 +209,8 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     sampled = compute_sampled_spectrum(case.conditions, case.rest, 3)
     assert sampled is not None
     assert (sampled.zeros, sampled.drifting) == (spectrum.zeros, 0)
-    for one, other in zip(sampled.roots, spectrum.roots, strict=True):
-        assert abs(one.s - other.s) <= 2e-3 * abs(other.s)
+    for sampled_root, other in zip(sampled.roots, spectrum.roots, strict=True):
+        assert abs(sampled_root.s - other.s) <= 2e-3 * abs(other.s)
 
 
 OFF = np.array([[1.0, -0.7, 0.5, 0.8, -0.6, 0.9], [-0.8, 0.6, -0.9, 0.3, 0.7, -0.4]])
@@ -212,8 +220,9 @@ OFF = np.array([[1.0, -0.7, 0.5, 0.8, -0.6, 0.9], [-0.8, 0.6, -0.9, 0.3, 0.7, -0
 def test_a_run_follows_the_delay_equation(law: str) -> None:
     """SciPy's DOP853 by the method of steps, from the same deviation; a run of 1 kHz."""
     small = 1e-6
-    case = six(law, small * OFF)
-    loop, delay_s = case.loop(), 0.05
+    case = make_six_joint_loop(law, small * OFF)
+    loop = case.loop()
+    delay_s = 0.05
     ((at_s, A_d, _),) = loop.delayed
     assert at_s == delay_s
     start = np.zeros(len(loop.names))
@@ -233,7 +242,7 @@ def test_a_run_follows_the_delay_equation(law: str) -> None:
         )
         pieces.append(done.sol)
     places = [loop.names.index(f"{site}.q{joint + 1}") for site in "ms" for joint in range(6)]
-    motion_of_run = follow(case.scenario, 500) - np.tile(POSE, 2)
+    motion_of_run = trace_angles(case.scenario, 500) - np.tile(POSE, 2)
     for k in range(100, 501, 100):
         wanted = pieces[min(1 + (k - 1) // 50, 10)](1e-3 * k)[places]
         assert np.abs(motion_of_run[k - 1] - wanted).max() <= 3e-4 * np.abs(wanted).max(), k
@@ -248,12 +257,12 @@ def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
         "sites.m.qd0_rad_s": (1e-3 * OFF[0]).tolist(),
         "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist(),
     }
-    case = six(law, rate_hz=200, **pushed)
+    case = make_six_joint_loop(law, rate_hz=200, **pushed)
     spectrum = compute_sampled_spectrum(case.conditions, case.rest, 2)
     assert spectrum is not None
     root, following = (root_found.s for root_found in spectrum.roots)
     from_s = 6.0 / (root.real - following.real)  # by then the next mode has a part in 400 left
-    motion_of_run = follow(case.scenario, round(200 * (from_s + 2.0)))
+    motion_of_run = trace_angles(case.scenario, round(200 * (from_s + 2.0)))
     late = np.diff(motion_of_run[round(200 * from_s) :: 10, 1])
     (a, b), *_ = np.linalg.lstsq(np.column_stack([late[1:-1], late[:-2]]), late[2:], rcond=None)
     z = np.roots([1.0, -a, -b])
@@ -264,17 +273,22 @@ def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
 
 def test_joints_answer_sinusoids_by_their_admittance() -> None:
     """A torque on joint 3 of m in a run of P+d: the motion of all twelve joints."""
-    w_rad_s, amplitude_nm, rate_hz, settled_s = 2.0 * np.pi, 0.05, 500, 14.0
-    case = six("p_d", rate_hz=rate_hz)
+    w_rad_s = 2.0 * np.pi
+    amplitude_nm = 0.05
+    rate_hz = 500
+    settled_s = 14.0
+    case = make_six_joint_loop("p_d", rate_hz=rate_hz)
     Y = build_admittance(linearise_teleoperator(case.conditions, case.rest))(
         np.array([w_rad_s])
     )[0, :, 2]
     t_s = np.arange(0.0, 21.0, 0.002)
     points = np.zeros((len(t_s), 7))
-    points[:, 0], points[:, 3] = t_s, amplitude_nm * np.sin(w_rad_s * t_s)
+    points[:, 0] = t_s
+    points[:, 3] = amplitude_nm * np.sin(w_rad_s * t_s)
     hands = [{"kind": "recorded", "points": points.tolist()}]
-    motion_of_joints = follow(
-        six("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario, 18 * rate_hz
+    motion_of_joints = trace_angles(
+        make_six_joint_loop("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario,
+        18 * rate_hz,
     )
     late = np.arange(round(settled_s * rate_hz), len(motion_of_joints))
     turned = w_rad_s * (late + 1) / rate_hz
@@ -285,8 +299,8 @@ def test_joints_answer_sinusoids_by_their_admittance() -> None:
 
 
 def test_six_joint_laws_are_passive_in_r() -> None:
-    """Also with learnt gravity, which is not passive in qd at the joints that it loads."""
-    case = six("adaptive")
+    """This holds also with learnt gravity, which is not passive in qd at the joints that gravity loads."""
+    case = make_six_joint_loop("adaptive")
     ports = analyse_ports(case.scenario, case.rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
     assert ports.proof is not None
@@ -301,7 +315,7 @@ def test_six_joint_laws_are_passive_in_r() -> None:
 
 def test_a_pose_has_an_angle_for_each_joint() -> None:
     with pytest.raises(UsageError, match="6 angles in rad, one per joint"):
-        find_equilibrium(six("p_d").scenario, (0.1, 0.3))
+        find_equilibrium(make_six_joint_loop("p_d").scenario, (0.1, 0.3))
 
 
 @pytest.mark.long
@@ -309,7 +323,7 @@ def test_the_p_d_bound_holds_for_chains() -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2 whatever the arms weigh, if their drives weigh enough for the tick."""
 
     def damped(d: float, **overrides: Any) -> Linear:
-        return six("p_d", **{"control.K": 20.0, "control.d": d, **overrides})
+        return make_six_joint_loop("p_d", **{"control.K": 20.0, "control.d": d, **overrides})
 
     criterion = evaluate_criterion(damped(1.05).scenario)
     assert criterion is not None
@@ -328,8 +342,8 @@ def test_the_p_d_bound_holds_for_chains() -> None:
 
 @pytest.mark.long
 def test_diverging_runs_keep_their_predicted_rest() -> None:
-    """Of alike arms with alike gains the rest is near the mean of the start poses."""
-    case = six("adaptive", 0.3 * OFF)
+    """For equal arms with equal gains the rest is near the mean of the start poses."""
+    case = make_six_joint_loop("adaptive", 0.3 * OFF)
     equilibrium = predict_equilibrium(case.scenario)
     assert equilibrium.residual <= 1e-10
     assert np.ptp(equilibrium.q, axis=0).max() <= 1e-9

@@ -66,7 +66,7 @@ def test_p_d_turns_stable_with_its_mode(name: str, share: float, delay_ms: float
     assert edge.value < line  # the line leaves the inertia out: it is on the safe side
 
 
-def heavy_pair(
+def draw_heavy_pair(
     seed: int, ratio: Callable[[float, float, float, float], float]
 ) -> tuple[Scenario, Array]:
     """Draws two sites with random gains and delays whose arms are so heavy that K T^2 << M;
@@ -100,7 +100,7 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
         both = math.sqrt(K1 * K2)
         return (K2 + both * math.sqrt(d2 / d1)) / (K1 + both * math.sqrt(d1 / d2))
 
-    scenario, (*_, d2) = heavy_pair(seed, worst)
+    scenario, (*_, d2) = draw_heavy_pair(seed, worst)
     edge = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3), None
     )
@@ -113,7 +113,7 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
 )
 def test_two_like_arms_need_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
-    scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_, **__: 1.0)
+    scenario, (K1, K2, T, d1, d2) = draw_heavy_pair(seed, lambda *_, **__: 1.0)
     exact = K1 * (T - d1 / K2)
     edge = next(
         iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3),
@@ -170,16 +170,18 @@ def test_invalid_keys_are_refused_with_the_nearest() -> None:
 D = (0.8, 0.9, 1.0, 1.1)
 
 
-def damped(d: float) -> Scenario:
+def make_damped_scenario(d: float) -> Scenario:
     return load_scenario("p_d_margin", {"control.d": d})
 
 
 def test_the_real_part_is_that_of_the_analysis() -> None:
-    growth_rates, _, remarks, _ = GrowthColumn.compute([damped(d) for d in D], "control.d", D)
+    growth_rates, _, remarks, _ = GrowthColumn.compute(
+        [make_damped_scenario(d) for d in D], "control.d", D
+    )
     assert remarks == []
     for d, growth in zip(D, growth_rates, strict=True):
         root = analyse_linear_loop(
-            damped(d), pose=(1.0 / 15.0, 7.0 / 30.0)
+            make_damped_scenario(d), pose=(1.0 / 15.0, 7.0 / 30.0)
         ).continuous.rightmost
         assert root is not None
         assert growth == pytest.approx(root.s.real, abs=1e-9)
@@ -187,15 +189,15 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
 
 @pytest.mark.long
 def test_an_edge_is_where_the_sign_changes() -> None:
-    (crossing,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
+    (crossing,), remark = find_root_crossings(make_damped_scenario(3.0), "control.d", 0.3, 3.0)
     assert remark == ""
     places = (crossing - 1e-4, crossing + 1e-4)
     (below, above), edges, *_ = GrowthColumn.compute(
-        [*map(damped, places)], "control.d", places
+        [*map(make_damped_scenario, places)], "control.d", places
     )
     assert below > 0.0 > above
     assert edges == {0: pytest.approx(crossing, rel=1e-6)}
-    alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
+    alone = next(iterate_linear_edges(make_damped_scenario(3.0), "control.d", 0.3, 3.0), None)
     assert alone is not None
     assert crossing == pytest.approx(alone.value, rel=1e-6)
 
@@ -207,7 +209,7 @@ def test_the_scheme_decides_the_loop() -> None:
         load_scenario("free", {**slow, "scheme": scheme})
         for scheme in ("second_order", "digital")
     ]
-    columns = [GrowthColumn.compute([one], "link.delay_ms", (0.0,)) for one in schemes]
+    columns = [GrowthColumn.compute([scheme], "link.delay_ms", (0.0,)) for scheme in schemes]
     (continuous,), (digital,) = (column.growth_per_s for column in columns)
     assert continuous < 0.0 < digital
     assert columns[0].remarks == columns[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
@@ -216,7 +218,7 @@ def test_the_scheme_decides_the_loop() -> None:
 def test_nonlinear_loops_are_reported_as_unknown() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
     growth_rates, edges, remarks, _ = GrowthColumn.compute(
-        [unknown, damped(3.0)], "control.d", (2.9, 3.0)
+        [unknown, make_damped_scenario(3.0)], "control.d", (2.9, 3.0)
     )
     assert edges == {}
     assert np.isnan(growth_rates[0])

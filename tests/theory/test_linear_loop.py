@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from tests.execution.builders import make_trajectories, run_fused
 from tests.theory.loops import RODS
-from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory import analyse_linear_loop, find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
@@ -15,13 +15,12 @@ from trilat_net.analysis.theory.equilibrium import follow_equilibrium
 from trilat_net.analysis.theory.linear_loop import linearise_loop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.ticks import BUCKETS_PER_S
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 
 POSE = (-0.1236, 0.3373)
 
 
-def rightmost(overrides: dict[str, float]) -> complex:
+def find_rightmost(overrides: dict[str, float]) -> complex:
     """Returns the rightmost root of `free`."""
     scenario = load_scenario("free", overrides)
     root = compute_delay_spectrum(
@@ -86,14 +85,16 @@ def test_links_of_different_delays_have_an_entry_each() -> None:
 
 @pytest.mark.parametrize(("delay_ms", "re"), [(200.0, -0.196), (0.0, -0.163), (400.0, -0.237)])
 def test_the_rightmost_root_of_free_motion(delay_ms: float, re: float) -> None:
-    s = rightmost({"link.delay_ms": delay_ms})
+    s = find_rightmost({"link.delay_ms": delay_ms})
     assert s.real == pytest.approx(re, abs=2e-3)
     assert s.imag == pytest.approx(6.2, abs=0.2)
 
 
 @pytest.mark.parametrize(("delay_ms", "re"), [(200.0, -0.693), (0.0, -0.372), (400.0, -0.642)])
 def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
-    assert rightmost({"link.delay_ms": delay_ms, **RODS}).real == pytest.approx(re, abs=2e-3)
+    assert find_rightmost({"link.delay_ms": delay_ms, **RODS}).real == pytest.approx(
+        re, abs=2e-3
+    )
 
 
 def test_zero_delay_is_the_one_tick_limit() -> None:
@@ -114,13 +115,14 @@ def test_zero_delay_is_the_one_tick_limit() -> None:
 def test_a_run_decays_at_its_rightmost_root() -> None:
     """Late in a run of P+d two sites swing in one mode; its peaks go as exp(re t), its zeros as im t."""
     scenario = load_scenario("p_d_margin_two", {"duration_s": 120.0, "rate_hz": 200})
-    run = trajectories(scenario).sites["m"]
+    run = make_trajectories(scenario).sites["m"]
     late = run.t_s > 60.0
     q1_rad, q2_rad = run.q[late].mean(axis=0)
     root = analyse_linear_loop(scenario, pose=(q1_rad, q2_rad)).decisive.rightmost
     assert root is not None
     turns = np.flatnonzero(np.diff(np.sign(run.qd[late, 0])))
-    t_s, e = run.t_s[late], np.abs((run.q - run.q_des)[late, 0])
+    t_s = run.t_s[late]
+    e = np.abs((run.q - run.q_des)[late, 0])
     half_s = np.diff(t_s[turns]).mean()
     peaks = [e[a:b].max() for a, b in itertools.pairwise(turns)]
     slope, _ = np.polyfit(half_s * np.arange(len(peaks)), np.log(peaks), 1)
@@ -151,8 +153,7 @@ def test_unstable_rests_are_left_for_others() -> None:
         .roots[0]
         .s
     )
-    run = FusedRun(late)
-    run.advance_to(late.duration_s)
+    run = run_fused(late)
     speeds = np.max([site[:, 1] for site in run.maxima], axis=0)
     at = {
         t_s: speeds[(t_s - 1) * BUCKETS_PER_S : t_s * BUCKETS_PER_S].max()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.core.chain_references import ARMS
-from tests.task_arms import planar_task, posed_arms
+from tests.scenario.builders import planar_task_text, posed_task_text
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import (
@@ -81,7 +81,7 @@ HAND = {
 }
 
 
-def cartesian(law: str, space: str) -> Scenario:
+def make_cartesian_scenario(law: str, space: str) -> Scenario:
     """Returns two arms of three sliders, heavier from slider to slider, with an operator who is felt."""
     links = "\n".join(
         SLIDER.format(n=n, mass=3 - 0.5 * n, parent=f"l{n - 1}" if n else "base", axis=axis)
@@ -97,10 +97,10 @@ def cartesian(law: str, space: str) -> Scenario:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
-    """Of arms that slide along x, y and z the Jacobian is 1: loop, roots, sampled roots, and ports."""
+    """For arms that slide along x, y and z the Jacobian is 1, so that loop, roots, sampled roots and ports are equal."""
     loops = []
     for space in ("joints", "position"):
-        scenario = cartesian(law, space)
+        scenario = make_cartesian_scenario(law, space)
         rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
         conditions = OperatingConditions.derive(scenario)
         loop = linearise_loop(conditions, rest)
@@ -110,13 +110,13 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
             np.array([0.1, 3.0, 40.0])
         )
         loops.append((rest.q, loop, spectrum, sampled, Y))
-    (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = loops
+    (q, loop, in_joints, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = loops
     assert q_task == pytest.approx(q, abs=1e-12)
     assert loop_task.names == loop.names
-    assert (other.zeros, other.drifting) == (one.zeros, one.drifting)
+    assert (other.zeros, other.drifting) == (in_joints.zeros, in_joints.drifting)
     assert sampled is not None
     assert sampled_task is not None
-    for a, b in ((one, other), (sampled, sampled_task)):
+    for a, b in ((in_joints, other), (sampled, sampled_task)):
         assert len(a.roots) == len(b.roots)
         for first, second in zip(a.roots, b.roots, strict=True):
             assert abs(first.s - second.s) <= 1e-9 * (1.0 + abs(first.s))
@@ -145,9 +145,10 @@ def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> 
     return load_scenario(scenario, changes)
 
 
-def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
+def trace_deviations(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> Array:
     """Returns deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
-    run, rows = FusedRun(scenario), []
+    run = FusedRun(scenario)
+    rows = []
     for k in range(1, steps + 1):
         run.advance_to(k * step_s)
         rows.append((run.q - rest.q).ravel())
@@ -155,21 +156,23 @@ def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> 
     return motion[:, motion.any(axis=0)]
 
 
-def realise(outputs: Array, step_s: float, order: int) -> Array:
+def realise_system(outputs: Array, step_s: float, order: int) -> Array:
     """Returns the exponents in a free motion of many signals: Juang and Pappa's eigensystem
     realisation (1985).
     """
     half = len(outputs) // 2
     hankel = np.stack([np.concatenate(outputs[k : k + half]) for k in range(half)], axis=1)
     U, sizes, V = np.linalg.svd(hankel[:, :-1], full_matrices=False)
-    U, sizes, V = U[:, :order], np.sqrt(sizes[:order]), V[:order]
+    U = U[:, :order]
+    sizes = np.sqrt(sizes[:order])
+    V = V[:order]
     step = (U / sizes).T @ hankel[:, 1:] @ (V / sizes[:, np.newaxis]).T
     return np.log(np.linalg.eigvals(step).astype(complex)) / step_s
 
 
-def settled(name: str) -> tuple[Scenario, Equilibrium]:
+def make_settled_scenario(name: str) -> tuple[Scenario, Equilibrium]:
     """Returns a scenario at the mean of its start poses, with estimates that are true."""
-    texts = {"planar": planar_task(), "posed": posed_arms()}
+    texts = {"planar": planar_task_text(), "posed": posed_task_text()}
     light = {"control.Kp": 2.0, "control.Gamma": 5.0} if name == "posed" else {}
     scenario = (
         parse_scenario(texts[name], name, light, ARMS) if name in texts else load_scenario(name)
@@ -190,7 +193,9 @@ cases = pytest.mark.parametrize(
 @cases
 def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     """The companion matrix advances the deviation; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
-    (scenario, rest), rng, size = settled(name), np.random.default_rng(1), 1e-6
+    scenario, rest = make_settled_scenario(name)
+    rng = np.random.default_rng(1)
+    size = 1e-6
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
     angles = [
         f"{site}.q{n + 1}"
@@ -207,7 +212,7 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
     )
     X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
     X[torques] = (whole @ X)[torques]
-    motion_of_run = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
+    motion_of_run = trace_deviations(start_near(scenario, rest, off), rest, 1e-3, 300)
     places = [names.index(angle) for angle in angles]
     for row in motion_of_run:
         X = whole @ X
@@ -217,7 +222,7 @@ def test_small_deviations_follow_the_companion_matrix(name: str) -> None:
 @cases
 def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     """Started along the vector of each of the three rightmost roots that swing."""
-    scenario, rest = settled(name)
+    scenario, rest = make_settled_scenario(name)
     conditions = OperatingConditions.derive(scenario)
     near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
     spectrum = compute_sampled_spectrum(conditions, rest, 14)
@@ -232,16 +237,16 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
         vector *= 1e-5 / vector[np.abs(vector).argmax()]
         off = dict(zip(names, vector.real.tolist(), strict=True))
         step_s = 0.3 / abs(s)
-        measured = realise(
-            follow(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16
+        measured = realise_system(
+            trace_deviations(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16
         )
         assert np.abs(measured - s).min() <= 0.01 * abs(s), (s, measured)
 
 
 @cases
 def test_the_law_is_passive_at_end_effectors(name: str) -> None:
-    """Of places, also with axes left open and with redundant joints; of poses there is no proof."""
-    scenario, rest = settled(name)
+    """The proof holds for places, also with open axes and redundant joints; for poses there is none."""
+    scenario, rest = make_settled_scenario(name)
     ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
     assert (ports.proof is None) == (name == "posed")
@@ -258,7 +263,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     verdict changes.
     """
     law = {"law": "p_d", "K": 120.0, "d": 12.0}
-    scenario = parse_scenario(planar_task(), "planar", {"control": law})
+    scenario = parse_scenario(planar_task_text(), "planar", {"control": law})
     pose = find_mean_pose(scenario)
     analysis = analyse_linear_loop(scenario, pose=pose)
     end = analysis.margin.intervals[0].high
@@ -278,7 +283,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
 
 
 def test_poses_without_loop_are_refused_by_name() -> None:
-    scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 1e-6})
+    scenario = parse_scenario(planar_task_text(), "planar", {"task.singular_value": 1e-6})
     with pytest.raises(ScenarioError, match="rests in a singular pose") as refused:
         find_equilibrium(scenario, (2.0, 0.0, 0.0))
     assert refused.value.path == "sites.m.task.axes"
@@ -291,6 +296,6 @@ def test_poses_without_loop_are_refused_by_name() -> None:
 
 
 def test_rests_near_singular_poses_include_damping() -> None:
-    scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 0.9})
+    scenario = parse_scenario(planar_task_text(), "planar", {"task.singular_value": 0.9})
     analysis = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
     assert any("rests near a singular pose" in note for note in analysis.notes)

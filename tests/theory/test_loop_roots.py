@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net as tn
-from tests.virtual_runs import simulate_with_commands
+from tests.execution.builders import make_log_with_commands, run_fused
 from trilat_net.analysis.delay_period import find_burst_interval_s, find_final_delay_period
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import RunEnd
@@ -20,7 +20,6 @@ from trilat_net.analysis.theory.loop_roots import (
     resolve_final_scenario,
 )
 from trilat_net.analysis.timeline import list_effective_commands
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 
 PAIR = {
@@ -33,7 +32,7 @@ PAIR = {
 }
 
 
-def sine(period_s: float, **more: float) -> dict[str, Any]:
+def make_sine_overrides(period_s: float, **more: float) -> dict[str, Any]:
     return {
         "model": "sine",
         "delay_ms": 200.0,
@@ -43,7 +42,7 @@ def sine(period_s: float, **more: float) -> dict[str, Any]:
     }
 
 
-def pair(**overrides: Any) -> Scenario:
+def make_pair_scenario(**overrides: Any) -> Scenario:
     return load_scenario("two_sites", {**PAIR, **overrides})
 
 
@@ -63,8 +62,7 @@ def measure_growth(scenario: Scenario, until_s: float) -> float:
     A least-squares line through the maxima of 1 s averages over the beat between the motion and
     the period of the delays.
     """
-    run = FusedRun(scenario)
-    run.advance_to(until_s)
+    run = run_fused(scenario, until_s)
     speeds = np.max([buckets[:, 2:4].max(axis=1) for buckets in run.buckets], axis=0)
     seconds = len(speeds) // 20
     maxima = speeds[: 20 * seconds].reshape(seconds, 20).max(axis=1)
@@ -80,10 +78,10 @@ def measure_growth(scenario: Scenario, until_s: float) -> float:
 def test_common_period_is_the_least_common_multiple(periods: list[int], rate_hz: int) -> None:
     """The shortest time that is a whole number of ticks and of every period of a delay."""
     links = {
-        f"links.{link}": sine(period / 1000.0)
+        f"links.{link}": make_sine_overrides(period / 1000.0)
         for link, period in zip(("m->s", "s->m"), periods, strict=False)
     }
-    period = find_final_delay_period(pair(rate_hz=rate_hz, **links))
+    period = find_final_delay_period(make_pair_scenario(rate_hz=rate_hz, **links))
     tick = Fraction(1, rate_hz)
     cycles = [Fraction(ms, 1000) for ms in periods]
     smallest = next(
@@ -102,7 +100,7 @@ def test_common_period_is_the_least_common_multiple(periods: list[int], rate_hz:
     ],
 )
 def test_random_delays_have_no_period(link: dict[str, Any]) -> None:
-    assert find_final_delay_period(pair(link=link)).true_s is None
+    assert find_final_delay_period(make_pair_scenario(link=link)).true_s is None
 
 
 def test_bursts_are_spaced_by_their_losses() -> None:
@@ -116,7 +114,7 @@ def test_bursts_are_spaced_by_their_losses() -> None:
             "loss_burst": burst,
             "loss_bad": share,
         }
-        scenario = pair(link=link)
+        scenario = make_pair_scenario(link=link)
         leave = 1.0 - (1.0 - 1.0 / burst) / share
         enter = leave * loss / (share - loss)
         bad = False
@@ -127,13 +125,13 @@ def test_bursts_are_spaced_by_their_losses() -> None:
             bad = draw >= leave if bad else draw < enter
         expected_s = samples / starts / scenario.sites["m"].rate_hz
         assert find_burst_interval_s(scenario) == pytest.approx(expected_s, rel=0.05)
-    assert find_burst_interval_s(pair()) is None
+    assert find_burst_interval_s(make_pair_scenario()) is None
 
 
 def test_two_sinusoids_grow_over_their_common_period() -> None:
     """0.6 s and 0.7 s repeat after 4.2 s; one more second of delay makes the pair grow."""
-    links = {"links.m->s": sine(0.6), "links.s->m": sine(0.7)}
-    scenario = pair(**{"control.d": 1.2, "duration_s": 20.0, **links})
+    links = {"links.m->s": make_sine_overrides(0.6), "links.s->m": make_sine_overrides(0.7)}
+    scenario = make_pair_scenario(**{"control.d": 1.2, "duration_s": 20.0, **links})
     roots = find_log_roots(tn.simulate(scenario))
     assert roots.exact
     assert "over the period of 4.2 s" in roots.text
@@ -144,7 +142,7 @@ def test_two_sinusoids_grow_over_their_common_period() -> None:
 def test_looped_trace_is_decided_over_its_period(d: float, tmp_path: Path) -> None:
     """A run of 1.4 periods does not decide; the record of one period repeats for ever."""
     link = looped_trace(tmp_path, 10.0)
-    scenario = pair(**{"control.d": d, "duration_s": 14.0, "link": link})
+    scenario = make_pair_scenario(**{"control.d": d, "duration_s": 14.0, "link": link})
     certificate = certify_run(tn.simulate(scenario))
     roots = certificate.roots
     assert roots is not None
@@ -160,17 +158,16 @@ def test_looped_trace_is_decided_over_its_period(d: float, tmp_path: Path) -> No
 def test_trace_that_has_ended_is_its_last_delay(tmp_path: Path) -> None:
     link = {**looped_trace(tmp_path, 4.0), "at_end": "hold"}
     damped = {"control.d": 4.0, "duration_s": 8.0}
-    ended = find_log_roots(tn.simulate(pair(link=link, **damped)))
+    ended = find_log_roots(tn.simulate(make_pair_scenario(link=link, **damped)))
     constant = {"model": "constant", "delay_ms": 400.0}
-    settled = find_log_roots(tn.simulate(pair(link=constant, **damped)))
+    settled = find_log_roots(tn.simulate(make_pair_scenario(link=constant, **damped)))
     assert ended.exact
     assert ended.rate_per_s == pytest.approx(settled.rate_per_s, abs=1e-5)
 
 
 def test_log_and_fused_run_have_the_same_roots() -> None:
-    scenario = pair(duration_s=10.0)
-    run = FusedRun(scenario)
-    run.advance_to(10.0)
+    scenario = make_pair_scenario(duration_s=10.0)
+    run = run_fused(scenario, 10.0)
     assert find_run_roots(scenario, run) == find_log_roots(tn.simulate(scenario))
 
 
@@ -218,10 +215,10 @@ SAME = {"link": "m->s", "to": {"model": "constant", "delay_ms": 200.0}}
 
 
 def test_command_that_changes_nothing_changes_nothing() -> None:
-    """From 200 ms to 200 ms, and the same factors again."""
-    scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
+    """The command changes the delay from 200 ms to 200 ms, and sets the same factors again."""
+    scenario = make_pair_scenario(**{"link.delay_ms": 200.0, "duration_s": 14.0})
     same_shares = {"dominance": "s", "to": dict(scenario.dominance["s"]), "ramp_s": 0.0}
-    log = simulate_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))
+    log = make_log_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))
     plain = tn.simulate(scenario)
     assert log.changes("s")
     assert list_effective_commands(log) == []
@@ -231,14 +228,16 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
 
 
 def test_roots_follow_the_last_command() -> None:
-    scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
-    log = simulate_with_commands(scenario, "s", (3.0, SLOWER))
+    scenario = make_pair_scenario(**{"link.delay_ms": 200.0, "duration_s": 14.0})
+    log = make_log_with_commands(scenario, "s", (3.0, SLOWER))
     final = resolve_final_scenario(log)
     assert [change.link for change in final.timeline] == ["m->s"]
-    slower = pair(**{"link.delay_ms": 200.0, "links.m->s": SLOWER["to"], "duration_s": 14.0})
+    slower = make_pair_scenario(
+        **{"link.delay_ms": 200.0, "links.m->s": SLOWER["to"], "duration_s": 14.0}
+    )
     expected = find_log_roots(tn.simulate(slower)).rate_per_s
     assert find_log_roots(log).rate_per_s == pytest.approx(expected, abs=1e-5)
-    back = simulate_with_commands(scenario, "s", (3.0, SLOWER), (5.0, SAME))
+    back = make_log_with_commands(scenario, "s", (3.0, SLOWER), (5.0, SAME))
     assert len(list_effective_commands(back)) == 2
     unchanged = find_log_roots(tn.simulate(scenario)).rate_per_s
     assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)
@@ -248,7 +247,7 @@ def test_short_runs_have_the_whole_traces_roots(tmp_path: Path) -> None:
     """The delays are constant in the run, and long in the last tenth of the period."""
     link = looped_trace(tmp_path, 20.0)
     short, whole = (
-        find_log_roots(tn.simulate(pair(link=link, duration_s=seconds)))
+        find_log_roots(tn.simulate(make_pair_scenario(link=link, duration_s=seconds)))
         for seconds in (10.0, 45.0)
     )
     assert short.exact

@@ -23,24 +23,29 @@ from trilat_net.errors import ScenarioError
 POSE = (0.3, 0.2)
 
 
-def linear(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
+def analyse_law(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
     return tn.linear(
         name, {"control": {"law": law, **more.pop("gains", {})}, **more}, pose=POSE, ports=False
     )
 
 
-def roots(spectrum: Spectrum) -> Array:
+def list_roots(spectrum: Spectrum) -> Array:
     return np.array([root.s for root in spectrum.roots])
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("law", [PD, PeerPD])
 def test_own_p_d_has_p_d_roots(law: type, scheme: str) -> None:
-    ours, theirs = linear("p_d", scheme=scheme), linear(law, scheme=scheme)
+    ours = analyse_law("p_d", scheme=scheme)
+    theirs = analyse_law(law, scheme=scheme)
     assert ours.sampled is not None
     assert theirs.sampled is not None
-    assert np.allclose(roots(theirs.sampled), roots(ours.sampled), rtol=0.0, atol=1e-8)
-    assert np.allclose(roots(theirs.continuous), roots(ours.continuous), rtol=0.0, atol=1e-8)
+    assert np.allclose(
+        list_roots(theirs.sampled), list_roots(ours.sampled), rtol=0.0, atol=1e-8
+    )
+    assert np.allclose(
+        list_roots(theirs.continuous), list_roots(ours.continuous), rtol=0.0, atol=1e-8
+    )
     assert theirs.margin.intervals[0].high_s == pytest.approx(
         ours.margin.intervals[0].high_s, rel=1e-8
     )
@@ -51,23 +56,27 @@ def test_own_p_d_has_p_d_roots(law: type, scheme: str) -> None:
 
 
 def test_forces_are_those_of_the_four_channel_law() -> None:
-    """Of the peers, as a sum and separately, and of its own arm: with an operator at a master."""
+    """The forces are those of the peers, as a sum and separately, and that of the own arm, with an operator at a master."""
     hand = [{**CLAMP, "to_rad": list(POSE), "stiffness_nm_rad": 40.0, "damping_nm_s_rad": 5.0}]
     held: dict[str, Any] = {"sites.m1.hands": hand, "link.delay_ms": 30.0}
-    ours = linear("four_channel", gains={"K": 100.0, "B": 20.0, "force_own": 0.5}, **held)
+    ours = analyse_law("four_channel", gains={"K": 100.0, "B": 20.0, "force_own": 0.5}, **held)
     for alone in (False, True):
-        theirs = linear(Forces, gains={"alone": alone}, **held)
+        theirs = analyse_law(Forces, gains={"alone": alone}, **held)
         assert np.allclose(
-            roots(theirs.continuous), roots(ours.continuous), rtol=1e-7, atol=1e-7
+            list_roots(theirs.continuous), list_roots(ours.continuous), rtol=1e-7, atol=1e-7
         )
 
 
 def test_the_last_tick_is_memory() -> None:
-    analysis, remembered = linear(Backward), linear(Remembering)
+    analysis = analyse_law(Backward)
+    remembered = analyse_law(Remembering)
     assert analysis.sampled is not None
     assert remembered.sampled is not None
-    assert np.allclose(roots(analysis.sampled), roots(remembered.sampled), rtol=0.0, atol=1e-6)
-    late, exact = roots(analysis.sampled)[0], roots(linear("p_d").decisive)[0]
+    assert np.allclose(
+        list_roots(analysis.sampled), list_roots(remembered.sampled), rtol=0.0, atol=1e-6
+    )
+    late = list_roots(analysis.sampled)[0]
+    exact = list_roots(analyse_law("p_d").decisive)[0]
     assert 1e-4 < abs(late - exact) < 1e-2, "half a tick of delay in the damping"
 
 
@@ -81,8 +90,10 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     rest = find_equilibrium(ours, POSE)
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
-    roots_of_memory = roots(compute_sampled_spectrum(OperatingConditions.derive(theirs), same))
-    known = roots(compute_sampled_spectrum(OperatingConditions.derive(ours), rest))
+    roots_of_memory = list_roots(
+        compute_sampled_spectrum(OperatingConditions.derive(theirs), same)
+    )
+    known = list_roots(compute_sampled_spectrum(OperatingConditions.derive(ours), rest))
     same_bits = scheme == "second_order"
     assert np.allclose(
         roots_of_memory[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2
@@ -91,7 +102,7 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
 
 def test_unlinearised_features_are_refused() -> None:
     with pytest.raises(ScenarioError, match="sends vectors that the law defines"):
-        linear(Line)
+        analyse_law(Line)
 
 
 def test_a_certificate_runs_no_code_from_outside() -> None:
@@ -103,7 +114,7 @@ def test_a_certificate_runs_no_code_from_outside() -> None:
 
 @pytest.mark.long
 def test_a_run_decays_at_its_roots() -> None:
-    """From the poses of its sites to rest, and its edge lies at that of p_d."""
+    """The run goes from the poses of its sites to rest, and its edge lies at that of p_d."""
     analysis = tn.linear(
         "p_d_margin",
         {"control.law": CompiledPD, "control.d": 1.5},

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.virtual_runs import trajectories
+from tests.execution.builders import make_trajectories
 from trilat_net.analysis.theory.equilibrium import extend_scenario
 from trilat_net.analysis.theory.operating_point import (
     OperatingConditions,
@@ -95,7 +95,7 @@ def test_continuing_runs_change_nothing() -> None:
     )
 
 
-def scenario(**link: object) -> Scenario:
+def make_link_scenario(**link: object) -> Scenario:
     return load_scenario(
         "two_sites",
         {"duration_s": 3.0, **{f"link.{key}": value for key, value in link.items()}},
@@ -131,7 +131,7 @@ def test_constant_delay_is_used_from_next_tick(delay_ms: float, rate_hz: int) ->
 def test_the_mean_is_that_of_a_run(overrides: dict[str, object]) -> None:
     chosen = load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 500, **overrides})
     age = compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])
-    run = trajectories(chosen).sites["s"]
+    run = make_trajectories(chosen).sites["s"]
     used = run.used[:, 0]
     ages_s = (run.t_s - used / chosen.sites["m"].rate_hz)[used >= 0]
     assert age.mean_s == pytest.approx(ages_s.mean(), abs=1e-5)
@@ -139,13 +139,15 @@ def test_the_mean_is_that_of_a_run(overrides: dict[str, object]) -> None:
 
 
 def test_play_out_makes_jitter_a_constant_delay() -> None:
-    chosen = scenario(model="uniform", delay_ms=60.0, half_width_ms=50.0, playout_ms=110.0)
+    chosen = make_link_scenario(
+        model="uniform", delay_ms=60.0, half_width_ms=50.0, playout_ms=110.0
+    )
     age = compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])
     assert np.allclose(age, 0.110)
 
 
 def test_a_link_that_delivers_nothing_is_refused() -> None:
-    chosen = scenario(loss=1.0)
+    chosen = make_link_scenario(loss=1.0)
     with pytest.raises(
         ScenarioError, match=r"links\.m->s: no sample sent over this link ever arrives"
     ):

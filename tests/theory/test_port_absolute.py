@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from tests.theory.analysed_ports import criterion
-from tests.theory.networks import Complex, Network, Wire, pair
+from tests.theory.analysed_ports import find_failing_frequencies
+from tests.theory.networks import Complex, Network, Wire, make_pair
 from trilat_net.analysis.theory.frequency_search import build_frequency_grid
 from trilat_net.analysis.theory.port_passivity import (
     MAX_LLEWELLYN,
@@ -39,17 +39,17 @@ def draw_networks(seed: int, ports: int, count: int = 40) -> Complex:
 def test_undelayed_springs_and_dampers_are_absolutely_stable(
     K: float, B: float, d: float
 ) -> None:
-    assert not criterion(pair((K, K), (d, d), (0.0, 0.0), B)).below
+    assert not find_failing_frequencies(make_pair((K, K), (d, d), (0.0, 0.0), B)).below
 
 
 @pytest.mark.parametrize("d", [0.4, 1.0, 1.6])
 def test_delayed_p_d_fails_below_its_sine(d: float) -> None:
     """2 d^2 >= abs(z12 z21) + Re(z12 z21) = 2 K^2 sin^2(w T) / w^2."""
     edge_rad_s = brentq(lambda w: 10.0 * np.sin(0.2 * w) / w - d, 1e-6, np.pi / 0.2)
-    (span,) = criterion(pair(d=(d, d))).below[:1]
+    (span,) = find_failing_frequencies(make_pair(d=(d, d))).below[:1]
     assert span.from_hz == pytest.approx(1e-3)
     assert span.to_hz == pytest.approx(edge_rad_s / (2.0 * np.pi), rel=1e-5)
-    assert not criterion(pair(d=(2.02, 2.02))).below
+    assert not find_failing_frequencies(make_pair(d=(2.02, 2.02))).below
 
 
 @given(seed=SEEDS)
@@ -57,11 +57,9 @@ def test_the_criterion_equals_its_three_inequalities(seed: int) -> None:
     Y = draw_networks(seed, 2)
     Y[::3, 0, 0] -= 0.4
     for parameters in (Y, np.linalg.inv(Y)):
-        a, b, through = (
-            parameters[:, 0, 0].real,
-            parameters[:, 1, 1].real,
-            parameters[:, 0, 1] * parameters[:, 1, 0],
-        )
+        a = parameters[:, 0, 0].real
+        b = parameters[:, 1, 1].real
+        through = parameters[:, 0, 1] * parameters[:, 1, 0]
         excess = 2.0 * a * b - np.abs(through) - through.real
         holds = (a >= 0.0) & (b >= 0.0) & (excess >= 0.0)
         clear = (np.abs(a) > 1e-6) & (np.abs(b) > 1e-6) & (np.abs(excess) > 1e-6)
@@ -89,7 +87,7 @@ def test_for_two_ports_weights_match_llewellyn(seed: int) -> None:
     assert np.isfinite(ratio).all()
 
 
-def destabilised(Y: Complex) -> NDArray[np.bool_]:
+def find_destabilised(Y: Complex) -> NDArray[np.bool_]:
     """True if passive impedances at the ports make det(1 + Y diag(z)) zero: two lossless, one
     solved for.
     """
@@ -98,7 +96,8 @@ def destabilised(Y: Complex) -> NDArray[np.bool_]:
     is_destabilised = np.zeros(len(Y), dtype=bool)
     for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         for n, y in enumerate(Y[:, order][:, :, order]):
-            a, b = 1.0 + y[0, 0] * z1, 1.0 + y[1, 1] * z2
+            a = 1.0 + y[0, 0] * z1
+            b = 1.0 + y[1, 1] * z2
             without = a * b - y[0, 1] * y[1, 0] * z1 * z2
             with_third = (
                 y[2, 2] * without
@@ -118,7 +117,7 @@ def test_for_three_ports_weights_are_exact(seed: int) -> None:
     Y = draw_networks(seed, 3)
     margin = find_best_weights(Y, np.array([0, 1, 2])).margin
     clear = np.abs(margin) > 0.05
-    np.testing.assert_array_equal(destabilised(Y[clear]), margin[clear] < 0.0)
+    np.testing.assert_array_equal(find_destabilised(Y[clear]), margin[clear] < 0.0)
 
 
 @settings(max_examples=10, deadline=None)

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.theory.networks import Network, Wire, hold_by_spring, pair
+from tests.theory.networks import Network, Wire, hold_by_spring, make_pair
 from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_frequencies
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.port_passivity import (
@@ -58,7 +58,7 @@ def test_masses_springs_and_dampers_are_passive(
 @settings(max_examples=20, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 1.0))
 def test_a_delay_without_damping_is_not_passive(K: float, delay_s: float) -> None:
-    assert not judge_passivity(pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
+    assert not judge_passivity(make_pair((K, K), (0.0, 0.0), (delay_s, delay_s))).passive
 
 
 @pytest.mark.parametrize("T", [(0.2, 0.2), (0.1, 0.5), (0.0, 0.3)])
@@ -71,7 +71,7 @@ def test_p_d_is_passive_from_the_published_damping(
     product = 0.25 * sum(T) ** 2 * K[0] * K[1]
     for factor, holds in ((0.98, False), (1.02, True)):
         first = np.sqrt(product * factor) * share
-        network = pair(K, (first, product * factor / first), T)
+        network = make_pair(K, (first, product * factor / first), T)
         # dampers of different size pass the damping on: their share of the weight cancels
         assert judge_passivity(network, (1.0 / K[0], 1.0 / K[1])).passive is holds
 
@@ -79,22 +79,26 @@ def test_p_d_is_passive_from_the_published_damping(
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.5, 1.9])
 def test_p_d_lacks_k_t_less_its_damping(d: float) -> None:
     """-1/2 lambda_min(Z + Z^H) = K abs(sin(w T)) / w - d, most at w = 0: K T - d."""
-    assert judge_passivity(pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(2.0 - d, rel=1e-4)
+    assert judge_passivity(make_pair(d=(d, d))).lacking_nm_s_rad == pytest.approx(
+        2.0 - d, rel=1e-4
+    )
 
 
 @settings(max_examples=15, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 0.5))
 def test_the_lacking_damping_is_just_enough_for_passivity(K: float, delay_s: float) -> None:
-    lacking = judge_passivity(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
+    lacking = judge_passivity(
+        make_pair((K, K), (0.1, 0.2), (delay_s, delay_s))
+    ).lacking_nm_s_rad
     for factor, holds in ((0.98, False), (1.02, True)):
         d = (0.1 + factor * lacking, 0.2 + factor * lacking)
         if lacking > 0.0:
-            assert judge_passivity(pair((K, K), d, (delay_s, delay_s))).passive is holds
+            assert judge_passivity(make_pair((K, K), d, (delay_s, delay_s))).passive is holds
 
 
 def test_the_active_range_follows_its_sine() -> None:
     """d = K abs(sin(w T)) / w."""
-    (span,) = judge_passivity(pair(d=(1.0, 1.0))).minima.below
+    (span,) = judge_passivity(make_pair(d=(1.0, 1.0))).minima.below
     w = 2.0 * np.pi * span.to_hz
     assert np.sin(0.2 * w) / w == pytest.approx(0.1, rel=1e-6)
     assert span.from_hz == pytest.approx(1e-3)
@@ -159,15 +163,15 @@ REFLECTING = Network(
 )
 
 
-def same(a: LinearLoop, b: LinearLoop) -> None:
+def assert_same(a: LinearLoop, b: LinearLoop) -> None:
     np.testing.assert_allclose(build_admittance(a)(W), build_admittance(b)(W), rtol=1e-9)
 
 
 @given(K=POSITIVE, B=POSITIVE)
 def test_a_load_is_spring_and_damper(K: float, B: float) -> None:
-    network = pair()
+    network = make_pair()
     tied = network._replace(k=(0.0, K), d=(network.d[0], network.d[1] + B))
-    same(hold_by_spring(network.loop, "b", K, B), tied.loop)
+    assert_same(hold_by_spring(network.loop, "b", K, B), tied.loop)
 
 
 @given(K=POSITIVE, B=POSITIVE)
@@ -182,7 +186,7 @@ def test_a_loads_impedance_adds_at_its_port(K: float, B: float) -> None:
 
 @pytest.mark.parametrize("site", ["a", "b", "c"])
 def test_a_clamp_leaves_the_rest_of_the_impedance(site: str) -> None:
-    """Also if the clamp's own torque is reflected, and comes back by two delays."""
+    """This holds also if the clamp's own torque is reflected, and comes back after two delays."""
     index = "abc".index(site)
     keep = [n for n in range(3) if n != index]
     clamped = clamp_site(REFLECTING.loop, site)
@@ -219,7 +223,7 @@ def test_clamps_that_reflect_onto_each_other_are_refused() -> None:
 
 def test_a_clamp_at_no_site_is_refused() -> None:
     with pytest.raises(UsageError, match="no site 'z' among the ports; the sites are a, b"):
-        clamp_site(pair().loop, "z")
+        clamp_site(make_pair().loop, "z")
 
 
 HELD = (np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]))
@@ -236,7 +240,7 @@ def test_hands_with_the_lacking_damping_are_stable(damping: float, shown: bool) 
 
     2009).
     """
-    Y = build_admittance(pair(d=(1.96, 1.96)).loop)
+    Y = build_admittance(make_pair(d=(1.96, 1.96)).loop)
     w = refine_frequencies(Y, build_frequency_grid(1e-3, 10.0, 0.2))
     hands = [[scalar_hand(damping), scalar_hand(2.0)]] * 2
     assert (not check_against_hands(Y, w, hands, HELD).below) is shown

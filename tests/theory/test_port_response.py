@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.theory.networks import Network, Wire, hold_by_spring, pair
+from tests.theory.networks import Network, Wire, hold_by_spring, make_pair
 from trilat_net.analysis.theory.port_response import (
     LoopOutput,
     Transparency,
@@ -61,9 +61,9 @@ def test_answers_invert_the_impedance_on_paper(
 
 @given(K=POSITIVE, B=POSITIVE)
 def test_undelayed_springs_and_dampers_are_reciprocal(K: float, B: float) -> None:
-    at_once = build_admittance(pair((K, K), B=B, T=(0.0, 0.0)).loop)(W)
+    at_once = build_admittance(make_pair((K, K), B=B, T=(0.0, 0.0)).loop)(W)
     np.testing.assert_allclose(at_once[:, 0, 1], at_once[:, 1, 0], rtol=1e-9)
-    late = build_admittance(pair((K, K), B=B, T=(0.1, 0.3)).loop)(W)
+    late = build_admittance(make_pair((K, K), B=B, T=(0.1, 0.3)).loop)(W)
     ratio = late[:, 0, 1] / late[:, 1, 0]
     np.testing.assert_allclose(ratio, np.exp(1j * W * 0.2), rtol=1e-9)
 
@@ -78,7 +78,7 @@ def test_outputs_may_be_delayed() -> None:
 
 
 def test_no_frequencies_no_answers() -> None:
-    assert build_admittance(pair().loop)(np.zeros(0)).shape == (0, 2, 2)
+    assert build_admittance(make_pair().loop)(np.zeros(0)).shape == (0, 2, 2)
 
 
 def test_floating_networks_have_passive_poles_at_zero() -> None:
@@ -87,7 +87,7 @@ def test_floating_networks_have_passive_poles_at_zero() -> None:
     assert pole.order == 1
     assert pole.passive
     np.testing.assert_allclose(pole.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
-    for tied in (floating._replace(k=(1.0, 0.0)), floating._replace(d=(1.0, 0.0)), pair()):
+    for tied in (floating._replace(k=(1.0, 0.0)), floating._replace(d=(1.0, 0.0)), make_pair()):
         none = find_pole_at_zero(tied.loop)
         assert none.order == 0
         assert none.passive
@@ -117,19 +117,19 @@ def test_following_floating_angles_gives_third_order_poles() -> None:
 
 
 def test_ports_by_site_and_by_joint() -> None:
-    loop = pair().loop._replace(inputs=("a.tau1", "a.tau2"), outputs=("a.qd1", "a.qd2"))
+    loop = make_pair().loop._replace(inputs=("a.tau1", "a.tau2"), outputs=("a.qd1", "a.qd2"))
     assert list_port_sites(loop) == ("a",)
     assert find_site_ports(loop, "a") == [0, 1]
     assert group_ports_by_joint(loop) == {1: [0], 2: [1]}
-    assert group_ports_by_joint(pair().loop) == {1: [0, 1]}
-    assert find_longest_delay_s(pair(T=(0.1, 0.4)).loop) == 0.4
+    assert group_ports_by_joint(make_pair().loop) == {1: [0, 1]}
+    assert find_longest_delay_s(make_pair(T=(0.1, 0.4)).loop) == 0.4
     assert find_longest_delay_s(Network((1.0,), (0.0,), (0.0,)).loop) == 0.0
     Y = build_admittance(loop)
     np.testing.assert_array_equal(select_ports(Y, [1])(W), Y(W)[:, 1:, 1:])
 
 
 def test_ports_need_a_velocity_for_each_torque() -> None:
-    loop = pair().loop
+    loop = make_pair().loop
     with pytest.raises(RuntimeFault, match=r"as many velocities as torques.* 1 and 2"):
         build_admittance(loop._replace(C=loop.C[:1]))
 
@@ -146,7 +146,7 @@ def test_felt_p_d_impedance_is_as_on_paper(
 
     Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance.
     """
-    network = pair((K, K), d, T)
+    network = make_pair((K, K), d, T)
     (transparency,) = measure_transparency(network.loop, "a", "b")
     S = 1j * transparency.w_rad_s
     own_impedance, other = (
@@ -196,7 +196,9 @@ def test_the_width_is_a_ratio_in_db(
 
 def test_the_width_grows_with_coupling_stiffness() -> None:
     widths = [
-        measure_transparency(pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[0].ratio_db
+        measure_transparency(make_pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[
+            0
+        ].ratio_db
         for K in (1.0, 10.0, 100.0)
     ]
     assert widths == sorted(widths)
@@ -220,4 +222,4 @@ def test_two_sites_that_do_not_couple_feel_nothing() -> None:
 )
 def test_unfelt_pairs_are_refused(at: str, of: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        measure_transparency(pair().loop, at, of)
+        measure_transparency(make_pair().loop, at, of)

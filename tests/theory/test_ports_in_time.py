@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.execution.builders import make_trajectories
 from tests.theory.networks import Array, Complex, hold_by_spring
-from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.analysis.theory.port_analysis import linearise_teleoperator
@@ -20,7 +20,7 @@ THETA = [5 / 3, 0.5, 1 / 3, 1.5, 0.5]
 ROD = {"lc1_m": 0.5, "I1_kg_m2": 1 / 12, "lc2_m": 0.5, "I2_kg_m2": 1 / 12}
 
 
-def fitted(t_s: Array, values: Array, w_rad_s: float) -> Complex:
+def fit_sine(t_s: Array, values: Array, w_rad_s: float) -> Complex:
     """Returns the complex amplitude of sin(w t) in columns, beside a straight line."""
     columns = np.column_stack(
         [np.sin(w_rad_s * t_s), np.cos(w_rad_s * t_s), np.ones_like(t_s), t_s]
@@ -40,15 +40,16 @@ def measure_admittance(
     """Returns velocities of all joints per torque on one joint of m, by a run."""
     t_s = np.arange(0.0, duration_s + 1.0, 1e-3)
     push = np.zeros((len(t_s), 3))
-    push[:, 0], push[:, joint] = t_s, AMPLITUDE_NM * np.sin(2.0 * np.pi * hz * t_s)
+    push[:, 0] = t_s
+    push[:, joint] = AMPLITUDE_NM * np.sin(2.0 * np.pi * hz * t_s)
     torque = {"kind": "recorded", "points": push.tolist()}
     hands = [*overrides.get("sites.m.hands", []), torque]
-    run = trajectories(
+    run = make_trajectories(
         load_scenario(name, {**overrides, "sites.m.hands": hands, "duration_s": duration_s})
     )
     late = run.sites["m"].t_s >= settled_s
     velocities = np.hstack([site.qd[late] for site in run.sites.values()])
-    return fitted(run.sites["m"].t_s[late], velocities, 2.0 * np.pi * hz) / AMPLITUDE_NM
+    return fit_sine(run.sites["m"].t_s[late], velocities, 2.0 * np.pi * hz) / AMPLITUDE_NM
 
 
 @pytest.mark.parametrize("joint", [1, pytest.param(2, marks=pytest.mark.long)])

@@ -14,11 +14,16 @@ A figure "at t" is the largest |e| of the two seconds from t on.
 import numpy as np
 import pytest
 
-from tests.theory.figures_of_runs import Overrides, approximate_figure, measured, peak, value
-from tests.virtual_runs import sampled
+from tests.execution.builders import run_fused, sample_records
+from tests.theory.figures_of_runs import (
+    Overrides,
+    approximate_figure,
+    find_peak,
+    find_value,
+    measure_run,
+)
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
-from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 
 NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
@@ -43,13 +48,12 @@ SETTLED_S = {
 @pytest.mark.parametrize(
     ("delay_ms", "settled_s"),
     [
-        pytest.param(*one, marks=pytest.mark.long if n % 3 else ())
-        for n, one in enumerate(SETTLED_S.items())
+        pytest.param(*case, marks=pytest.mark.long if n % 3 else ())
+        for n, case in enumerate(SETTLED_S.items())
     ],
 )
 def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
-    fused_run = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
-    fused_run.advance_to(30.0)
+    fused_run = run_fused(load_scenario("free", {"link.delay_ms": delay_ms}), 30.0)
     assert fused_run.settled_s == approximate_figure(settled_s, 0.1)
 
 
@@ -57,7 +61,7 @@ def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: f
 def test_free_motions_error_grows_with_delay() -> None:
     times_s = np.arange(0.02, 20.01, 0.02)
     runs = [
-        sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
+        sample_records(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
         for delay_ms in SETTLED_S
     ]
     rms = [float(np.sqrt(((run[..., :2] - run[..., 4:6]) ** 2).mean())) for run in runs]
@@ -86,7 +90,7 @@ def test_about_one_rest_some_delay_damps_common_motion(
     ("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)]
 )
 def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: float) -> None:
-    last = sampled(load_scenario(name), (20.0,))[:, -1]
+    last = sample_records(load_scenario(name), (20.0,))[:, -1]
     assert np.abs(last[:, :2] - last[:, 4:6]).max() == pytest.approx(error, rel=0.15)
     assert np.abs(last[:, 2:4]).max() == pytest.approx(speed, rel=0.15)
 
@@ -94,7 +98,7 @@ def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: 
 def test_the_papers_hands_hardly_move_joint_1() -> None:
     paper = load_scenario("paper")
     pushed, alone = (
-        sampled(scenario_run, np.arange(0.01, 20.01, 0.01))[..., :2]
+        sample_records(scenario_run, np.arange(0.01, 20.01, 0.01))[..., :2]
         for scenario_run in (paper, paper.without_hands())
     )
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
@@ -105,7 +109,7 @@ def test_the_papers_hands_hardly_move_joint_1() -> None:
 
 @pytest.mark.long
 def test_without_a_box_the_slave_returns() -> None:
-    windows = measured("box", NO_BOX)
+    windows = measure_run("box", NO_BOX)
     assert windows.end_pose_rad["s"] == (
         approximate_figure(-0.011, 1e-3),
         approximate_figure(0.005, 1e-3),
@@ -114,7 +118,7 @@ def test_without_a_box_the_slave_returns() -> None:
 
 @pytest.mark.long
 def test_truth_on_edge_of_box_lets_them_sag() -> None:
-    windows = measured("box", {**EDGE, "duration_s": 20.0})
+    windows = measure_run("box", {**EDGE, "duration_s": 20.0})
     assert windows.end_pose_rad["s"][0] < -0.4
     assert windows.end_pose_rad["s"][1] < -0.7
 
@@ -124,8 +128,8 @@ def test_truth_on_edge_of_box_lets_them_sag() -> None:
 def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) -> None:
     row = {"m1": share, "m2": 1.0 - share}
     overrides: Overrides = {"timeline": [], "dominance.s": row, "duration_s": 10.0}
-    windows = measured("training", overrides, (9.9, 10.0, "s"))
-    assert value(windows, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
+    windows = measure_run("training", overrides, (9.9, 10.0, "s"))
+    assert find_value(windows, "q1_rad") + 0.6 == approximate_figure(offset_rad, 1e-3)
 
 
 HEALED = (6.0, 15.0, "s")
@@ -133,49 +137,51 @@ HEALED = (6.0, 15.0, "s")
 
 @pytest.mark.long
 def test_healing_links_kick_slaves_that_continued() -> None:
-    windows = measured("outage", {}, HEALED)
-    assert value(windows, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
-    assert value(windows, "torque_peak_nm") == approximate_figure(35.0, 1.0)
+    windows = measure_run("outage", {}, HEALED)
+    assert find_value(windows, "speed_peak_rad_s") == approximate_figure(0.41, 0.01)
+    assert find_value(windows, "torque_peak_nm") == approximate_figure(35.0, 1.0)
     assert windows.synchronised_at_s == approximate_figure(12.4, 0.1)
-    uncut = measured("outage", {"link.outages_s": []}, HEALED)
-    assert value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
+    uncut = measure_run("outage", {"link.outages_s": []}, HEALED)
+    assert find_value(uncut, "torque_peak_nm") == approximate_figure(18.8, 0.1)
 
 
 @pytest.mark.long
 def test_ramped_returns_need_no_further_torque() -> None:
-    held = measured("outage", {"on_stale.action": "hold"}, HEALED)
-    uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
-    assert value(held, "torque_peak_nm") <= value(uncut, "torque_peak_nm")
-    assert value(held, "speed_peak_rad_s") <= value(uncut, "speed_peak_rad_s")
+    held = measure_run("outage", {"on_stale.action": "hold"}, HEALED)
+    uncut = measure_run("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
+    assert find_value(held, "torque_peak_nm") <= find_value(uncut, "torque_peak_nm")
+    assert find_value(held, "speed_peak_rad_s") <= find_value(uncut, "speed_peak_rad_s")
 
 
 LATE = (9.0, 15.0, "s")
 
 
 def test_direct_force_reflection_hammers_at_200_ms() -> None:
-    windows = measured("contact", {}, LATE)
-    assert value(windows, "wall_mean_n") == approximate_figure(8.0, 1.0)
-    assert value(windows, "wall_deviation_n") == approximate_figure(14.0, 1.0)
-    assert value(windows, "wall_peak_n") == approximate_figure(52.0, 1.0)
-    assert value(windows, "wall_hits") == 3
+    windows = measure_run("contact", {}, LATE)
+    assert find_value(windows, "wall_mean_n") == approximate_figure(8.0, 1.0)
+    assert find_value(windows, "wall_deviation_n") == approximate_figure(14.0, 1.0)
+    assert find_value(windows, "wall_peak_n") == approximate_figure(52.0, 1.0)
+    assert find_value(windows, "wall_hits") == 3
 
 
 def test_at_20_ms_there_is_one_hit() -> None:
-    windows = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
-    assert value(windows, "wall_hits") == 1
-    assert value(windows, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
-    assert value(windows, "wall_deviation_n", 1) < 0.01
+    windows = measure_run(
+        "contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s")
+    )
+    assert find_value(windows, "wall_hits") == 1
+    assert find_value(windows, "wall_mean_n", 1) == approximate_figure(3.3, 0.1)
+    assert find_value(windows, "wall_deviation_n", 1) < 0.01
 
 
 def test_a_fifth_of_the_force_settles() -> None:
-    windows = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
-    assert value(windows, "wall_mean_n") == approximate_figure(8.5, 0.1)
-    assert value(windows, "wall_deviation_n") < 0.05
+    windows = measure_run("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
+    assert find_value(windows, "wall_mean_n") == approximate_figure(8.5, 0.1)
+    assert find_value(windows, "wall_deviation_n") < 0.05
 
 
 def test_free_motion_is_calm_at_200_ms() -> None:
-    windows = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
-    assert value(windows, "speed_peak_rad_s") < 1e-6
+    windows = measure_run("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
+    assert find_value(windows, "speed_peak_rad_s") < 1e-6
     assert windows.end_error_rad is not None
     assert windows.end_error_rad < 1e-6
 
@@ -189,26 +195,26 @@ def test_free_motion_is_calm_at_200_ms() -> None:
     ids=str,
 )
 def test_position_laws_pass_the_same_wall(law: dict[str, object]) -> None:
-    """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
-    windows = measured(
+    """With one law of positions at both sites in place of force reflection, the contact comes to rest."""
+    windows = measure_run(
         "contact",
         {"control": law, "sites.m.control": {}, "sites.s.control": {}, "duration_s": 25.0},
         (24.0, 25.0, "s"),
     )
-    assert value(windows, "wall_mean_n") > 1.0
-    assert value(windows, "wall_deviation_n") < 0.05
+    assert find_value(windows, "wall_mean_n") > 1.0
+    assert find_value(windows, "wall_deviation_n") < 0.05
 
 
 @pytest.mark.long
 def test_without_learning_gravity_nothing_winds_up() -> None:
-    windows = measured(
+    windows = measure_run(
         "windup",
         {"control.Gamma": [1.0, 1.0, 1.0, 0.0, 0.0], "duration_s": 20.0},
         (10.0, 10.2, "s"),
         (19.8, 20.0, "s"),
     )
-    assert value(windows, "wall_mean_n", 1) == pytest.approx(
-        value(windows, "wall_mean_n", 0), abs=0.02
+    assert find_value(windows, "wall_mean_n", 1) == pytest.approx(
+        find_value(windows, "wall_mean_n", 0), abs=0.02
     )
 
 
@@ -287,7 +293,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     shipped = load_scenario(name)
     assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
     assert (
-        measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend
+        measure_run(name, {"control.d": d, "duration_s": 40.0}).end.error.trend
         is EnvelopeTrend.GROWS
     )
 
@@ -304,11 +310,11 @@ def test_unequal_shares_have_their_own_margin() -> None:
     assert np.linalg.eigvals(alpha).real.min() == pytest.approx(-0.8)
     changes = {"dominance": row, "duration_s": 40.0}
     assert (
-        measured("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend
+        measure_run("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend
         is EnvelopeTrend.GROWS
     )
     assert (
-        measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend
+        measure_run("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend
         is EnvelopeTrend.DECAYS
     )
 
@@ -317,8 +323,8 @@ def test_unequal_shares_have_their_own_margin() -> None:
 def test_half_of_the_margin_grows_to_10_rad() -> None:
     faster_arms = {"limits.qd_limit_rad_s": 100.0}
     changes = {"control.d": 0.5, "duration_s": 40.0, **faster_arms}
-    windows = measured("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
-    assert [peak(windows, 0), peak(windows, 1)] == [
+    windows = measure_run("p_d_margin", changes, (10.0, 12.0, ""), (38.0, 40.0, ""))
+    assert [find_peak(windows, 0), find_peak(windows, 1)] == [
         approximate_figure(1.6, 0.1),
         approximate_figure(10.0, 1.0),
     ]
@@ -326,20 +332,22 @@ def test_half_of_the_margin_grows_to_10_rad() -> None:
 
 @pytest.mark.long
 def test_two_and_half_margins_decay_to_milliradians() -> None:
-    windows = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
-    assert peak(windows) == approximate_figure(3e-3, 1e-3)
+    windows = measure_run(
+        "p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, "")
+    )
+    assert find_peak(windows) == approximate_figure(3e-3, 1e-3)
 
 
 @pytest.mark.long
 def test_jitter_of_equal_mean_turns_the_verdict() -> None:
-    jitter = measured("jitter", {}, (38.0, 40.0, ""))
-    constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
+    jitter = measure_run("jitter", {}, (38.0, 40.0, ""))
+    constant = measure_run("jitter", CONSTANT, (38.0, 40.0, ""))
     assert (jitter.end.error.trend, constant.end.error.trend) == (
         EnvelopeTrend.DECAYS,
         EnvelopeTrend.GROWS,
     )
-    assert peak(jitter) == approximate_figure(0.022, 0.001)
-    assert peak(constant) == approximate_figure(5.3, 0.1)
+    assert find_peak(jitter) == approximate_figure(0.022, 0.001)
+    assert find_peak(constant) == approximate_figure(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]
     assert ages == [approximate_figure(25.0, 1.0)] * len(ages)
     assert {age.mean_ms for age in constant.ages.values()} == {200.0}
@@ -348,8 +356,8 @@ def test_jitter_of_equal_mean_turns_the_verdict() -> None:
 @pytest.mark.long
 def test_play_out_makes_the_jittered_run_diverge() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
-    free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
-    assert peak(free) == approximate_figure(339.0, 1.0)
+    free = measure_run("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
+    assert find_peak(free) == approximate_figure(339.0, 1.0)
     assert {age.max_ms for age in free.ages.values()} == {400.0}
     assert free.peak_speed_rad_s is not None
     assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s
@@ -363,6 +371,5 @@ def test_play_out_makes_the_jittered_run_diverge() -> None:
 def test_order_makes_jitter_exceed_its_limits(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
-    fused_run = FusedRun(load_scenario("jitter", changes))
-    fused_run.advance_to(40.0)
+    fused_run = run_fused(load_scenario("jitter", changes), 40.0)
     assert (fused_run.diverged_s is not None) is leaves

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.theory.loops import Array, actors, site
+from tests.theory.loops import Array, draw_actors, draw_site
 from trilat_net.analysis.theory.site_dynamics import (
     ArgumentLayout,
     describe_switching_points,
@@ -33,7 +33,8 @@ def by_leaves(site_setup: SiteSetup, x: Array) -> dict[str, Array]:
     forward dynamics.
     """
     gains = site_setup.gains
-    q, qd = x[AT.q], x[AT.qd]
+    q = x[AT.q]
+    qd = x[AT.qd]
     Lambda = np.broadcast_to(gains.Lambda, 2)
     e, ed, r = control.control_errors(q, qd, x[AT.q_des], x[AT.qd_des], Lambda)
     Y = regressor(site_setup.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
@@ -73,9 +74,10 @@ def by_leaves(site_setup: SiteSetup, x: Array) -> dict[str, Array]:
 @given(seed=seeds, law=laws)
 def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
-    random_site = site(rng, law, actors(rng))
+    random_site = draw_site(rng, law, draw_actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
-    site_rates, wanted = evaluate_site_rates(random_site, x), by_leaves(random_site, x)
+    site_rates = evaluate_site_rates(random_site, x)
+    wanted = by_leaves(random_site, x)
     for name, value in wanted.items():
         scale = 1.0 + max(
             np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()
@@ -95,8 +97,8 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
 def test_the_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     """Away from the surfaces of walls, where no derivative exists."""
     rng = np.random.default_rng(seed)
-    random_site = site(
-        rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL]
+    random_site = draw_site(
+        rng, law, [actor for actor in draw_actors(rng) if actor.kind is not TorqueKind.WALL]
     )
     x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
@@ -119,7 +121,7 @@ def test_walls_push_on_one_side_only() -> None:
     wall = TorqueSource(
         TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0)
     )
-    wall_site = site(rng, "known", [wall])
+    wall_site = draw_site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
     assert not evaluate_site_rates(
         wall_site, x
@@ -143,7 +145,7 @@ def test_walls_push_on_one_side_only() -> None:
 
 def test_estimates_never_leave_their_box_and_return() -> None:
     rng = np.random.default_rng(2)
-    adaptive_site = site(rng, "adaptive")
+    adaptive_site = draw_site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)
     free = evaluate_site_rates(adaptive_site, x).estimate
     ends = (
@@ -166,14 +168,14 @@ def test_estimates_never_leave_their_box_and_return() -> None:
 def test_states_exactly_on_edges_are_reported() -> None:
     rng = np.random.default_rng(3)
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0))
-    wall_site = site(rng, "known", [wall])
+    wall_site = draw_site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
     assert not list(describe_switching_points(wall_site, x))
     on = wall_site._replace(actors=(wall._replace(a=(sum(wall_site.lengths_m), 0.0)),))
     assert list(describe_switching_points(on, x)) == [
         "x rests exactly on the surface of its wall 1: it counts as not touching"
     ]
-    boxed = site(rng, "adaptive")
+    boxed = draw_site(rng, "adaptive")
     boxed = boxed._replace(gains=boxed.gains._replace(high=(9.0, 9.0, 9.0, 1.0, 9.0)))
     x[AT.estimate] = 0.0, 0.0, 0.0, 1.0, 0.0
     assert list(describe_switching_points(boxed, x)) == [

@@ -14,19 +14,24 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from tests.theory.energy import booked
+from tests.theory.energy import compute_shipped_balance
 
 Vector = NDArray[np.float64]
-T, G = 0.3, 9.81
-LAMBDA, KP, KD, GAMMA = np.array([1.5, 0.7]), np.array([3.0, 2.0]), np.array([8.0, 5.0]), 0.4
+T = 0.3
+G = 9.81
+LAMBDA = np.array([1.5, 0.7])
+KP = np.array([3.0, 2.0])
+KD = np.array([8.0, 5.0])
+GAMMA = 0.4
 THETA = np.array([3.0, 1.0, 1.0, 2.0, 1.0])
 STEP = 1e-30
 
 
-def peer(t: float) -> tuple[Vector, Vector, Vector]:
+def move_peer(t: float) -> tuple[Vector, Vector, Vector]:
     """Returns place, velocity and acceleration of the peer."""
     turn = np.array([1.3, 0.9]) * t + np.array([0.2, 1.0])
-    rate, size = np.array([1.3, 0.9]), np.array([0.15, 0.2])
+    rate = np.array([1.3, 0.9])
+    size = np.array([0.15, 0.2])
     middle = np.array([0.9, 0.8])
     return (
         middle + size * np.sin(turn),
@@ -52,7 +57,10 @@ def jacobian(q: Vector) -> Vector:
 
 def regressor(q: Vector, qd: Vector, v: Vector, a: Vector) -> Vector:
     """Returns M a + C v + G of the textbook, C of Christoffel's symbols, as a matrix of its parameters."""
-    c, s, single, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
+    c = np.cos(q[1])
+    s = np.sin(q[1])
+    single = G * np.cos(q[0])
+    both = G * np.cos(q[0] + q[1])
     first = 2 * c * a[0] + c * a[1] - s * (qd[1] * v[0] + (qd[0] + qd[1]) * v[1])
     return np.array(
         [
@@ -71,28 +79,34 @@ def reference(q: Vector, x_des: Vector) -> Vector:
     return np.linalg.solve(jacobian(q), -LAMBDA * (tip_place(q) - x_des))
 
 
-def loop(
+def evaluate_loop(
     t: float, q: Vector, qd: Vector, theta_hat: Vector
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Returns the sliding variable, the error's derivative, qdd and the estimate's derivative."""
-    x_des, xd_des, _ = peer(t - T)
-    J, v = jacobian(q), reference(q, x_des)
+    x_des, xd_des, _ = move_peer(t - T)
+    J = jacobian(q)
+    v = reference(q, x_des)
     a = np.imag(reference(q + 1j * STEP * qd, x_des + 1j * STEP * xd_des)) / STEP
-    r, ed = qd - v, J @ qd - xd_des
+    r = qd - v
+    ed = J @ qd - xd_des
     Y = regressor(q, qd, v, a)
     tau = Y @ theta_hat - KP * r - J.T @ (KD * ed)
     bias = regressor(q, qd, qd, np.zeros(2)) @ THETA
     return r, ed, np.linalg.solve(inertia(q), tau - bias), -GAMMA * Y.T @ r
 
 
-def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
+def differentiate_v(moves: Callable[[float], Vector], t: float, h: float) -> float:
     """Returns the derivative of V at a time by a difference of fourth order."""
 
     def V(t: float) -> float:
         state = moves(t)
-        q, qd, theta_hat, stored = state[:2], state[2:4], state[4:9], state[9]
-        x_des = peer(t - T)[0]
-        r, e = qd - reference(q, x_des), tip_place(q) - x_des
+        q = state[:2]
+        qd = state[2:4]
+        theta_hat = state[4:9]
+        stored = state[9]
+        x_des = move_peer(t - T)[0]
+        r = qd - reference(q, x_des)
+        e = tip_place(q) - x_des
         off = theta_hat - THETA
         return float(
             0.5 * r @ inertia(q) @ r
@@ -106,9 +120,11 @@ def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
 
 def test_vs_derivative_is_dissipation_and_passed_energy() -> None:
     def field(t: float, state: Vector) -> Vector:
-        q, qd = state[:2], state[2:4]
-        _, _, qdd, rate = loop(t, q, qd, state[4:9])
-        now, then = peer(t)[1], peer(t - T)[1]
+        q = state[:2]
+        qd = state[2:4]
+        _, _, qdd, rate = evaluate_loop(t, q, qd, state[4:9])
+        now = move_peer(t)[1]
+        then = move_peer(t - T)[1]
         return np.concatenate([qd, qdd, rate, [now @ (KD * now) - then @ (KD * then)]])
 
     begin = np.array([0.1, 1.3, 0.0, 0.0, *(0.5 * THETA), 0.0])
@@ -117,18 +133,20 @@ def test_vs_derivative_is_dissipation_and_passed_energy() -> None:
     )
     for t in np.linspace(0.2, 3.8, 25):
         state = run.sol(t)
-        q, qd = state[:2], state[2:4]
-        r, ed, _, _ = loop(t, q, qd, state[4:9])
-        xd, now = jacobian(q) @ qd, peer(t)[1]
+        q = state[:2]
+        qd = state[2:4]
+        r, ed, _, _ = evaluate_loop(t, q, qd, state[4:9])
+        xd = jacobian(q) @ qd
+        now = move_peer(t)[1]
         passed_on = 0.5 * xd @ (KD * xd) - 0.5 * now @ (KD * now)
         wanted = -r @ (KP * r) - 0.5 * ed @ (KD * ed) - passed_on
-        assert abs(follow(run.sol, t, 1e-3) - wanted) <= 1e-7 * (1.0 + abs(wanted)), t
+        assert abs(differentiate_v(run.sol, t, 1e-3) - wanted) <= 1e-7 * (1.0 + abs(wanted)), t
 
 
 @pytest.mark.parametrize("name", ["free", "paper"])
 def test_v_never_rises_while_nobody_pushes(name: str) -> None:
     """The theorem, in free motion; `paper` is free before its first pulse and after its last one."""
-    b = booked(name)
+    b = compute_shipped_balance(name)
     free = np.diff(b.given) == 0.0
     assert free.sum() > 8000
     rise = np.diff(b.V)[free]
@@ -137,5 +155,5 @@ def test_v_never_rises_while_nobody_pushes(name: str) -> None:
 
 @pytest.mark.long
 def test_v_rises_while_a_hand_pushes() -> None:
-    b = booked("paper_rods")
+    b = compute_shipped_balance("paper_rods")
     assert np.diff(b.V).max() > 1e-5

@@ -38,15 +38,16 @@ POSE = (-0.6, 1.8)
 ALONE: dict[str, dict[str, Any]] = {"free": {}, "two_sites": {"sites.m.hands": []}}
 
 
-def at_pose(
+def linearise_at_pose(
     name: str, overrides: Mapping[str, Any] | None = None
 ) -> tuple[Scenario, OperatingConditions, Equilibrium, LinearLoop]:
     scenario = load_scenario(name, dict(overrides or {}))
-    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
+    now = OperatingConditions.derive(scenario)
+    rest = find_equilibrium(scenario, POSE)
     return scenario, now, rest, linearise_teleoperator(now, rest)
 
 
-def grid(loop: LinearLoop) -> np.ndarray:
+def build_grid(loop: LinearLoop) -> np.ndarray:
     delay_s = find_longest_delay_s(loop)
     return refine_frequencies(
         build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s)
@@ -60,7 +61,9 @@ def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> P
         np.ones(len(list_port_sites(loop))) if ones else compute_proof_weights(now), 2
     )
     return check_passivity(
-        lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output), grid(loop), beta
+        lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output),
+        build_grid(loop),
+        beta,
     )
 
 
@@ -78,10 +81,8 @@ def test_hands_at_ports_restore_their_loop() -> None:
     )
     rest = find_equilibrium(scenario)
     bare = linearise_teleoperator(OperatingConditions.derive(scenario), rest)
-    again, whole = (
-        hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7),
-        linearise_loop(OperatingConditions.derive(scenario), rest),
-    )
+    again = hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7)
+    whole = linearise_loop(OperatingConditions.derive(scenario), rest)
     np.testing.assert_allclose(again.A, whole.A, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(again.B, whole.B)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
@@ -110,7 +111,7 @@ def test_torques_at_rest_continue_to_act() -> None:
     pushes = [site.actors[0].a for site in off.sites if site.actors]
     assert len(pushes) == 2
     assert np.abs(np.array(pushes)).max() > 1.0
-    _, now, rest, _ = at_pose("training", BARE)
+    _, now, rest, _ = linearise_at_pose("training", BARE)
     assert not any(site.actors for site in freeze_external_torques(now, rest).sites)
 
 
@@ -118,35 +119,35 @@ def test_torques_at_rest_continue_to_act() -> None:
 @pytest.mark.parametrize("name", ["free", "two_sites"])
 def test_the_papers_law_is_passive_in_r(name: str, delay_ms: float) -> None:
     """The theorem of the nonlinear loop with hands, docs/theory/errata-proof.md."""
-    _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
+    _, now, _, loop = linearise_at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     assert in_r(now, loop).passive
-    assert not check_passivity(build_admittance(loop), grid(loop)).passive
+    assert not check_passivity(build_admittance(loop), build_grid(loop)).passive
 
 
 def test_circle_free_dominance_needs_the_proofs_weights() -> None:
     """beta = (0.444, 0.130, 0.426) / mean: passive; the paper's ones: not, where little damping
     hides it.
     """
-    _, now, _, loop = at_pose("force_sharing", {**BARE, "control.Kp": 0.1})
+    _, now, _, loop = linearise_at_pose("force_sharing", {**BARE, "control.Kp": 0.1})
     assert in_r(now, loop).passive
     assert not in_r(now, loop, ones=True).passive
 
 
 def test_scalar_differences_of_kd_are_weighted_out() -> None:
-    _, now, _, loop = at_pose("lyapunov")
+    _, now, _, loop = linearise_at_pose("lyapunov")
     np.testing.assert_allclose(compute_proof_weights(now).sum(), 3.0)
     assert in_r(now, loop).passive
     assert not in_r(now, loop, ones=True).passive
 
 
 def test_laws_without_r_lack_the_proofs_output() -> None:
-    _, now, _, loop = at_pose("p_d_margin")
+    _, now, _, loop = linearise_at_pose("p_d_margin")
     assert build_proof_output(now, loop) is None
 
 
 def test_r_is_read_as_qd_plus_lambda_e() -> None:
-    """At a frequency where the delay turns by a half: r = qd + Lambda (q + mean of the peers' q)."""
-    _, now, _, loop = at_pose("free")
+    """At a frequency where the delay turns by a half, r = qd + Lambda (q + mean of the peers' q)."""
+    _, now, _, loop = linearise_at_pose("free")
     s = to_imaginary_axis(np.array([np.pi / 0.2]))
     output = build_proof_output(now, loop)
     assert output is not None
@@ -159,7 +160,7 @@ def test_r_is_read_as_qd_plus_lambda_e() -> None:
 
 def test_statics_share_the_force_by_dominance() -> None:
     """Gravity known, equal Kp Lambda: a hand that holds site i feels beta_s / beta_i of a torque at s."""
-    scenario, _, _, loop = at_pose("force_sharing", BARE)
+    scenario, _, _, loop = linearise_at_pose("force_sharing", BARE)
     beta = scenario.beta
     assert beta is not None
     Y = build_admittance(loop)(np.array([1e-5]))[0]
@@ -175,7 +176,7 @@ def test_statics_share_the_force_by_dominance() -> None:
 @pytest.mark.parametrize("name", ["free", "two_sites"])
 def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: float) -> None:
     """A push moves N sites together, each a spring Gamma g^2 cos^2 q (1 + Lambda T) of its channel."""
-    _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
+    _, now, _, loop = linearise_at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     w = 1e-4
     # stiffness of all ports
     Z = 1j * w * np.linalg.inv(build_admittance(loop)(np.array([w]))[0])
@@ -190,7 +191,7 @@ def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: floa
 
 def test_clamped_sites_make_learnt_gravity_wind_up() -> None:
     """Impedance as 1 / w^2 towards zero, its phase that of a negative damper."""
-    _, _, _, loop = at_pose("two_sites", ALONE["two_sites"])
+    _, _, _, loop = linearise_at_pose("two_sites", ALONE["two_sites"])
     held = clamp_site(loop, "s")
     assert {parse_port_site(name) for name in held.inputs} == {"m"}
     Z = 1.0 / build_admittance(held)(np.array([1e-3, 2e-3]))[:, 0, 0]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.core.chain_references import ARMS
-from tests.task_arms import planar_task, posed_arms
+from tests.scenario.builders import planar_task_text, posed_task_text
 from trilat_net.analysis.theory.site_dynamics import (
     COMPLEX_STEP,
     SiteRates,
@@ -63,26 +63,25 @@ SITES = [
 ]
 
 
-def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
+def make_task_setup(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
     """Returns a site whose torques have no limit, under a plain digital scheme."""
     control = LAWS.get(law, {"law": "p_f", "K": 30.0, "d": 4.0, "k_f": 0.4})
     given_changes = {"control": control, "scheme": "digital", **overrides}
-    written = planar_task() if text == "planar" else posed_arms()
+    written = planar_task_text() if text == "planar" else posed_task_text()
     scenario = parse_scenario(written, text, given_changes, ARMS)
     return scenario.setup(site)._replace(tau_limit_nm=(1e9,), qd_limit_rad_s=(1e9,))
 
 
-def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array]]:
+def draw_state(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array]]:
     """Draws the state of a site, and of each peer its pose, velocity and torque, with poses
     about `apart` away.
     """
-    rng, at = np.random.default_rng(seed), lay_out_arguments(site)
+    rng = np.random.default_rng(seed)
+    at = lay_out_arguments(site)
     state = np.zeros(at.states)
     state[at.q] = np.array(site.q0) + rng.normal(0.0, 0.1, at.joints)
-    state[at.qd], state[at.estimate] = (
-        rng.normal(0.0, 0.3, at.joints),
-        rng.normal(0.0, 1.0, at.parameters),
-    )
+    state[at.qd] = rng.normal(0.0, 0.3, at.joints)
+    state[at.estimate] = rng.normal(0.0, 1.0, at.parameters)
     own_rates = evaluate_site_rates(
         site, np.concatenate([state, np.zeros(at.arguments - at.states)])
     ).x
@@ -109,8 +108,10 @@ def draw(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list[Array
 
 
 def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
-    at, alpha = lay_out_arguments(site), np.array([0.0, *(link.alpha for link in site.links)])
-    m, x = at.coordinates, np.concatenate([state, np.zeros(at.arguments - at.states)])
+    at = lay_out_arguments(site)
+    alpha = np.array([0.0, *(link.alpha for link in site.links)])
+    m = at.coordinates
+    x = np.concatenate([state, np.zeros(at.arguments - at.states)])
     derivative = evaluate_site_rates(site, x).x
     x[at.q_des] = evaluate_reference(
         alpha, derivative, [derivative, *(peer[:m] for peer in peers)]
@@ -126,15 +127,17 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
     """Returns torque, estimates and accelerations of one compiled tick, the accelerations as h
     goes to 0.
     """
-    at, accelerations, records = lay_out_arguments(site), [], []
+    at = lay_out_arguments(site)
+    accelerations = []
+    records = []
     for rate_hz in (10_000, 20_000):
         faster_site = site._replace(rate_hz=rate_hz)
-        arrays, buffers = (
-            SiteArrays.build(faster_site, pages=8),
-            build_tick_buffers(faster_site),
-        )
+        arrays = SiteArrays.build(faster_site, pages=8)
+        buffers = build_tick_buffers(faster_site)
         s = arrays.site[0]
-        s.q, s.qd, s.theta_hat = state[at.q], state[at.qd], state[at.estimate]
+        s.q = state[at.q]
+        s.qd = state[at.qd]
+        s.theta_hat = state[at.estimate]
         for link, peer in zip(arrays.links, peers, strict=True):
             link.q, link.qd, link.tau_x = np.split(peer, 3)
         site_tick(0, 0, 0, *arrays, *buffers)
@@ -151,13 +154,12 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
 @pytest.mark.parametrize("distance", [0.3, 0.0])
 def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance: float) -> None:
-    """Its torque, its messages, its motion and its learning, for peers that are apart and for
-    peers that agree.
-    """
-    site = build(text, name, law)
+    """Torque, messages, motion and learning are equal, for peers that are apart and for peers that agree."""
+    site = make_task_setup(text, name, law)
     for seed in range(3):
-        state, peers = draw(site, seed, distance)
-        rates, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
+        state, peers = draw_state(site, seed, distance)
+        rates = by_theory(site, state, peers)
+        wanted = by_tick(site, state, peers)
         names = {"tau": rates.tau, "x": rates.x, "xd": rates.xd, "wrench": -rates.reflected}
         for key, value in names.items():
             assert np.abs(value - wanted[key]).max() <= 1e-9 * (
@@ -172,12 +174,15 @@ def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance:
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
 def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str) -> None:
-    site, step = build(text, name, law), 1e-6
+    site = make_task_setup(text, name, law)
+    step = 1e-6
     at = lay_out_arguments(site)
-    state, peers = draw(site, 4, 0.0)
+    state, peers = draw_state(site, 4, 0.0)
     x = np.concatenate([state, np.zeros(at.arguments - at.states)])
     derivative = evaluate_site_rates(site, x).x
-    x[at.q_des], x[at.qd_des], x[at.peer_torque] = derivative + 0.05, 0.1, 0.3
+    x[at.q_des] = derivative + 0.05
+    x[at.qd_des] = 0.1
+    x[at.peer_torque] = 0.3
     exact = differentiate_site_rates(site, x)
     places = [*range(2 * at.joints), *range(at.states, at.inputs.stop)]
 
@@ -198,20 +203,19 @@ def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str
 
 @pytest.mark.parametrize("seed", range(3))
 def test_rate_of_jacobian_is_its_derivative_along_motion(seed: int) -> None:
-    site = build("posed", "s", "pd_d")
+    site = make_task_setup("posed", "s", "pd_d")
     rng = np.random.default_rng(seed)
     q, qd = rng.normal(0.0, 1.0, (2, len(site.q0)))
-    moved, placed_arm = place_arm(site, q + 1j * COMPLEX_STEP * qd), place_arm(site, q)
+    moved = place_arm(site, q + 1j * COMPLEX_STEP * qd)
+    placed_arm = place_arm(site, q)
     assert isinstance(moved, PlacedChain)
     assert isinstance(placed_arm, PlacedChain)
     wanted = moved.pose_jacobian().imag / COMPLEX_STEP
     assert np.abs(placed_arm.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (
         1.0 + np.abs(wanted).max()
     )
-    R, turned = (
-        placed_arm.end_effector_orientation(),
-        moved.end_effector_orientation().imag / COMPLEX_STEP,
-    )
+    R = placed_arm.end_effector_orientation()
+    turned = moved.end_effector_orientation().imag / COMPLEX_STEP
     across = turned @ R.T
     w = placed_arm.pose_jacobian()[3:] @ qd
     assert np.array([across[2, 1], across[0, 2], across[1, 0]]) == pytest.approx(w, abs=1e-12)

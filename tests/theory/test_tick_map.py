@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.execution.builders import make_trajectories
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
-from tests.virtual_runs import trajectories
 from trilat_net.analysis.theory import find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum, compute_delay_spectrum
 from trilat_net.analysis.theory.floquet import (
@@ -23,9 +23,10 @@ from trilat_net.scenario import Scenario, load_scenario
 POSE = (-0.1729, 0.0874)
 
 
-def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
+def compute_spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
     """Returns the continuous and the sampled spectrum, about one pose."""
-    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
+    now = OperatingConditions.derive(scenario)
+    rest = find_equilibrium(scenario, POSE)
     continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
     spectrum = compute_sampled_spectrum(now, rest, wanted)
     assert spectrum is not None
@@ -104,7 +105,7 @@ def test_small_deviations_follow_runs_tick_by_tick(
         np.array([start.get(name, 0.0) for name in names]),
         uses_trapezoid=law == "sync" or scheme == "second_order",
     )
-    run = trajectories(scenario)
+    run = make_trajectories(scenario)
     q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(
         pose, 2
     )
@@ -143,13 +144,13 @@ def start_state(
 def test_sampled_loops_converge_with_their_schemes_order(
     scheme: str, order: int, delay_ms: float
 ) -> None:
-    """Both with the same delay in use; the rightmost root, at rates that halve the period."""
+    """Both loops have the same delay in use, and the rightmost root is compared at rates that halve the period."""
     distances = []
     for rate_hz in (100, 200, 400):
         scenario = load_scenario(
             "paper", {"scheme": scheme, "link.delay_ms": delay_ms, "rate_hz": rate_hz}
         )
-        continuous, computed = spectra(scenario, 2)
+        continuous, computed = compute_spectra(scenario, 2)
         distances.append(abs(continuous.roots[0].s - computed.roots[0].s))
     for coarse, fine in itertools.pairwise(distances):
         assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
@@ -161,9 +162,9 @@ def test_sampled_loops_converge_with_their_schemes_order(
 def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable: bool) -> None:
     """About Gamma g^2 h > Kp it oscillates by itself; the extrapolated torque does not."""
     changes = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
-    _, digital = spectra(load_scenario("paper", {"scheme": "digital", **changes}))
+    _, digital = compute_spectra(load_scenario("paper", {"scheme": "digital", **changes}))
     assert (digital.verdict == "stable") == stable
-    _, second = spectra(load_scenario("paper", changes))
+    _, second = compute_spectra(load_scenario("paper", changes))
     assert second.verdict == "stable"
 
 
@@ -180,11 +181,12 @@ def test_a_growing_swing_matches_a_run() -> None:
             "sites.s.q0_rad": [0.3, 0.0],
         },
     )
-    now, rest = OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.3005, 0.0))
+    now = OperatingConditions.derive(scenario)
+    rest = find_equilibrium(scenario, (0.3005, 0.0))
     spectrum = compute_sampled_spectrum(now, rest, 2)
     assert spectrum is not None
     root = spectrum.roots[0].s
-    run = trajectories(scenario).sites["m"]
+    run = make_trajectories(scenario).sites["m"]
     late = run.t_s > 8.0
     distance = np.abs(run.q - run.q_des)[late, 0]
     half = round(np.pi / root.imag * 50)

@@ -34,9 +34,11 @@ def build_recursion(conditions: OperatingConditions, rest: Equilibrium) -> TickR
     """
     (rate_hz,) = {site.rate_hz for site in conditions.sites}
     loop = couple_ticks(conditions, rest)
-    n, late = len(loop.S), np.flatnonzero(np.abs(list(loop.effects.values())).sum(axis=(0, 1)))
+    n = len(loop.S)
+    late = np.flatnonzero(np.abs(list(loop.effects.values())).sum(axis=(0, 1)))
     ages = {at: max(1, round(float(conditions.age_s[at]) * rate_hz)) for at in loop.effects}
-    depth, c = max(ages.values()), len(late)
+    depth = max(ages.values())
+    c = len(late)
     whole = np.zeros((n + depth * c, n + depth * c))
     whole[:n, :n] = loop.S
     for at, effect in loop.effects.items():

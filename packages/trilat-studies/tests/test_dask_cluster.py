@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT, plan_quick_sweep
-from trial_tests.results import quick
+from study_builders import SHORT, make_quick_scenario, plan_quick_sweep, run_plan
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 
@@ -85,16 +84,17 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     started_cluster.close()
 
 
-def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
-    """Checks that losing one of two workers half way changes no byte of a sweep's results."""
+def assert_losing_a_worker_changes_nothing(cluster: Cluster, folder: Path, count: int) -> None:
+    """Asserts that losing one of two workers half way changes no byte of a sweep's results."""
     (folder / "trio.toml").write_text(SHORT.replace("duration_s = 0.5", "duration_s = 4.0"))
     sweep = plan_quick_sweep(
         folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0
     )
     assert sweep.cells == count
-    alone = run_sweep(prepare_sweep_folder(sweep, folder / "alone"), 1)
+    single = run_plan(sweep, folder / "single")
 
-    killed, *_ = [cluster.add_worker() for _ in range(2)]
+    killed = cluster.add_worker()
+    cluster.add_worker()
     done_at_kill: list[int] = []
 
     def kill_half_way(done: int, total: int) -> None:
@@ -102,7 +102,7 @@ def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
             os.kill(killed.pid, signal.SIGKILL)
             done_at_kill.append(done)
 
-    until(lambda: workers_of(cluster) == 2, 60)
+    until(lambda: count_workers(cluster) == 2, 60)
     shared = run_sweep(
         prepare_sweep_folder(sweep, folder / "shared"),
         progress=kill_half_way,
@@ -111,13 +111,11 @@ def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
     assert killed.wait(10) == -signal.SIGKILL
     assert done_at_kill[0] < count
     assert (shared.runs, shared.jobs) == (count, 2)
-    results, expected = (
-        (sweep_run.folder.path / RESULTS_FILE).read_bytes() for sweep_run in (shared, alone)
-    )
-    assert results == expected
+    table = (single.folder.path / RESULTS_FILE).read_bytes()
+    assert (shared.folder.path / RESULTS_FILE).read_bytes() == table
 
 
-def workers_of(cluster: Cluster) -> int:
+def count_workers(cluster: Cluster) -> int:
     """Returns how many workers a cluster has."""
     with dask_cluster.DaskCluster(cluster.address) as opened:
         return opened.workers
@@ -126,7 +124,7 @@ def workers_of(cluster: Cluster) -> int:
 @pytest.mark.long
 @pytest.mark.timeout(120)
 def test_losing_a_worker_changes_no_byte(cluster: Cluster, tmp_path: Path) -> None:
-    run_on_cluster(cluster, tmp_path, 300)
+    assert_losing_a_worker_changes_nothing(cluster, tmp_path, 300)
 
 
 @pytest.mark.long
@@ -134,7 +132,7 @@ def test_losing_a_worker_changes_no_byte(cluster: Cluster, tmp_path: Path) -> No
 def test_losing_a_worker_of_2000_cells_changes_nothing(
     cluster: Cluster, tmp_path: Path
 ) -> None:
-    run_on_cluster(cluster, tmp_path, 2000)
+    assert_losing_a_worker_changes_nothing(cluster, tmp_path, 2000)
 
 
 @pytest.mark.long
@@ -149,18 +147,20 @@ def test_trials_margins_and_tuning_run_on_a_cluster(cluster: Cluster, tmp_path: 
         (("compare", *tuning, "--out"), "front.json"),
     ]
     for command, file in studies:
-        here, there = (f"{place}-{command[0]}" for place in ("here", "there"))
-        trilat(*command, here, "--jobs", "1", cwd=tmp_path).succeeds()
-        trilat(*command, there, "--on", cluster.address, cwd=tmp_path).succeeds()
-        assert (tmp_path / here / file).read_bytes() == (tmp_path / there / file).read_bytes()
+        local = f"local-{command[0]}"
+        shared = f"shared-{command[0]}"
+        trilat(*command, local, "--jobs", "1", cwd=tmp_path).succeeds()
+        trilat(*command, shared, "--on", cluster.address, cwd=tmp_path).succeeds()
+        local_bytes = (tmp_path / local / file).read_bytes()
+        assert (tmp_path / shared / file).read_bytes() == local_bytes
 
     seeds = [5, 2, 9]
-    here_report = trilat_net.check(quick(), seeds, jobs=1)
-    cluster_report = trilat_net.check(quick(), seeds, on=cluster.address)
-    assert [result.outcomes for result in here_report.results] == [
-        result.outcomes for result in cluster_report.results
+    local_report = trilat_net.check(make_quick_scenario(), seeds, jobs=1)
+    shared_report = trilat_net.check(make_quick_scenario(), seeds, on=cluster.address)
+    assert len(shared_report.results) == len(seeds)
+    assert [result.outcomes for result in shared_report.results] == [
+        result.outcomes for result in local_report.results
     ]
-    assert len(trilat_net.trials(quick(), seeds)) == len(cluster_report.results)
 
 
 @pytest.mark.long
@@ -181,7 +181,7 @@ def test_workers_with_another_program_are_refused_even_later(
     with open_worker_pool(None, cluster.address) as pool:
         assert pool.map(abs, [-1, -2]) == [1, 2]
         cluster.add_worker(tmp_path)
-        until(lambda: workers_of(cluster) == 2, 60)
+        until(lambda: count_workers(cluster) == 2, 60)
         first.kill()
         with pytest.raises(
             UsageError,
@@ -203,7 +203,7 @@ def test_a_worker_without_the_laws_file_is_refused(
     shutil.copy(ROOT / "tests" / "golden" / "spring_law.py", tmp_path / "lonely_law.py")
     monkeypatch.chdir(tmp_path)
     cluster.add_worker()
-    scenario = quick(**{"control.law": "lonely_law:Spring"})
+    scenario = make_quick_scenario(**{"control.law": "lonely_law:Spring"})
     with pytest.raises(
         UsageError, match=r"the worker tcp://\S+ lacks the control law lonely_law:Spring"
     ):
@@ -211,16 +211,15 @@ def test_a_worker_without_the_laws_file_is_refused(
 
 
 def test_differences_are_named_on_both_sides() -> None:
+    """A worker with another version or without a law is described; another commit fits."""
     worker = describe_worker()
-    assert explain_unfit_worker(WorkerRequirements(worker), worker, []) == ""
+    requirements = WorkerRequirements(worker)
+    assert explain_unfit_worker(requirements, worker, []) == ""
+    assert explain_unfit_worker(requirements, {**worker, "commit": "other"}, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
-        text = explain_unfit_worker(WorkerRequirements(worker), {**worker, name: "other"}, [])
+        text = explain_unfit_worker(requirements, {**worker, name: "other"}, [])
         assert f"has {name} other, but the study needs {name} {worker[name]}" in text
-    assert (
-        explain_unfit_worker(WorkerRequirements(worker), {**worker, "commit": "other"}, [])
-        == ""
-    )
-    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(worker), worker, ["a.b:Law"])
+    assert "a.b:Law" in explain_unfit_worker(requirements, worker, ["a.b:Law"])
 
 
 @pytest.mark.long

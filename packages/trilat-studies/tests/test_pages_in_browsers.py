@@ -2,22 +2,19 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from playwright.sync_api import Browser
-from sweep_tests.maps import (
-    DAMPINGS,
-    DELAYS_MS,
-    KEYS,
-    P_D,
+from study_builders import (
+    SPARE_DAMPING,
     judge_by_condition,
-    make_plane,
-    rows,
+    make_exponent_plane,
+    make_gapped_plane,
+    make_map_plane,
 )
 from trilat_studies.bench import plan_bench, prepare_bench_folder, run_bench
 from trilat_studies.bench.bench_figures import FIGURES_OF_BENCH, write_bench
 from trilat_studies.sweep.map_page import write_map
-from trilat_studies.sweep.stability_map import MapLine, MapPlane, StabilityMap, build_plane
+from trilat_studies.sweep.stability_map import MapLine, MapPlane, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass
 
 from tests.live.browsers import needs_browser
@@ -25,21 +22,18 @@ from tests.page.study_pages import assert_markdown_is_whole
 
 pytestmark = needs_browser
 
-SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
-LINE = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
-UNEVEN = make_plane()
+LINE = MapLine("$d$", "d = 5 T", "the condition", SPARE_DAMPING, 0)
+UNEVEN = make_map_plane()
 PLANES: dict[str, MapPlane] = {
-    "verdicts": make_plane(),
-    "panels": make_plane(link__playout_ms=(0.0, 400.0)),
-    "six panels": make_plane(rate_hz=tuple(float(n) for n in range(1, 7))),
-    "seeds": make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4),
-    "no edge": make_plane(lambda *_, **__: CellClass.CONVERGED),
-    "all diverged": make_plane(lambda *_, **__: CellClass.DIVERGED),
+    "verdicts": make_map_plane(),
+    "panels": make_map_plane(link__playout_ms=(0.0, 400.0)),
+    "six panels": make_map_plane(rate_hz=tuple(float(n) for n in range(1, 7))),
+    "seeds": make_map_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4),
+    "no edge": make_map_plane(lambda *_, **__: CellClass.CONVERGED),
+    "all diverged": make_map_plane(lambda *_, **__: CellClass.DIVERGED),
     "uneven axis": UNEVEN._replace(x=UNEVEN.x._replace(values=(8, 68, 136, 272, 1088))),
-    "missing cell": build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D),
-    "exponents": build_plane(
-        [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()], KEYS, P_D
-    ),
+    "missing cell": make_gapped_plane(),
+    "exponents": make_exponent_plane(),
 }
 
 

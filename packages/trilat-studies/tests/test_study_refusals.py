@@ -14,7 +14,7 @@ from trilat_studies.tuning import plan_tuning
 
 import trilat_net as tn
 from tests.cli.running import trilat
-from tests.log_editing import recorded
+from tests.log.builders import make_log_bytes
 from tests.refusals.command_cases import CommandCase
 from tests.refusals.corpus import INPUTS, Case, parametrize_cases
 from trilat_net.errors import ScenarioError, UsageError
@@ -47,8 +47,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     short = {"rate_hz": 100, "duration_s": 0.5}
     expectations = (INPUTS / "expectations.toml").read_text(encoding="utf-8")
     contents = {
-        "log": recorded("free", short),
-        "another log": recorded("free", {**short, "link.delay_ms": 50.0}),
+        "log": make_log_bytes("free", short),
+        "another log": make_log_bytes("free", {**short, "link.delay_ms": 50.0}),
         "trio.toml": (INPUTS / "trio.toml").read_bytes(),
         "scenario without expectations": expectations.partition("[expect]")[0].encode(),
     }

@@ -9,6 +9,7 @@ import pytest
 from gymnasium.spaces.utils import is_space_dtype_shape_equiv
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
+from study_builders import assert_same_bits
 from trilat_studies.gym_environment import (
     EpisodeError,
     Judgement,
@@ -84,28 +85,8 @@ LONG_CASES: dict[str, dict[str, Any]] = {
 }
 
 
-def assert_same(one: Any, other: Any, path: str = "") -> None:
-    """Asserts that two results have the same types and bits, also inside of containers."""
-    assert type(one) is type(other), path
-    if isinstance(one, dict):
-        assert one.keys() == other.keys(), path
-        for key, value in one.items():
-            assert_same(value, other[key], f"{path} {key}")
-    elif isinstance(one, tuple):
-        for n, pair in enumerate(zip(one, other, strict=True)):
-            assert_same(*pair, f"{path} {n}")
-    elif isinstance(one, np.ndarray):
-        assert (one.dtype, one.shape) == (other.dtype, other.shape), path
-        if one.dtype == object:
-            assert_same(tuple(one), tuple(other), path)
-        else:
-            assert one.tobytes() == other.tobytes(), path
-    else:
-        assert one == other, path
-
-
 def make_both(settings: dict[str, Any], count: int, mode: str) -> tuple[Any, SyncVectorEnv]:
-    """Environments side by side, and the same environments one by one."""
+    """Returns environments side by side, and the same environments one by one."""
     settings = {**BASE, **settings}
     fast = tn.make_env(**copy.deepcopy(settings), num_envs=count, autoreset_mode=mode)
     single = [TeleoperationEnv(**copy.deepcopy(settings)) for _ in range(count)]
@@ -114,20 +95,20 @@ def make_both(settings: dict[str, Any], count: int, mode: str) -> tuple[Any, Syn
 
 
 def draw_actions(env: VectorEnv, random: np.random.Generator) -> Any:
-    """Actions of which some exceed the bounds."""
+    """Returns actions of which some exceed the bounds."""
     largest = np.minimum(env.action_space.high, 2.1)
     actions = random.uniform(-1.05, 1.05, largest.shape) * largest
     return actions.astype(env.action_space.dtype)
 
 
-def compare(fast: Any, slow: Any, steps: int) -> int:
-    """Compares all results of both, and returns the number of ended episodes."""
+def assert_same_steps(fast: Any, slow: Any, steps: int) -> int:
+    """Asserts that all results of both are equal, and returns the number of ended episodes."""
     random = np.random.default_rng(0)
     ends = 0
     for n in range(steps):
         actions = draw_actions(fast, random)
         results = fast.step(actions)
-        assert_same(results, slow.step(actions), f"step {n}")
+        assert_same_bits(results, slow.step(actions), f"step {n}")
         ends += int((results[2] | results[3]).sum())
     return ends
 
@@ -140,16 +121,16 @@ def test_every_environment_has_its_own_bits(case: str, mode: str) -> None:
     """Random actions, ends and resets give the same results as one by one."""
     fast, slow = make_both({**CASES, **LONG_CASES}[case], 5, mode)
     assert fast.obstacle == ""
-    assert_same(fast.reset(seed=3), slow.reset(seed=3))
-    assert compare(fast, slow, 45) > 0
+    assert_same_bits(fast.reset(seed=3), slow.reset(seed=3))
+    assert assert_same_steps(fast, slow, 45) > 0
 
 
 def test_more_environments_than_lanes_agree() -> None:
     """Environments beyond the number of lanes form further groups."""
     fast, slow = make_both({"task": ReachTask("s", within_m=0.28, stay_s=0.1)}, 70, "NextStep")
     seeds = list(range(70, 0, -1))
-    assert_same(fast.reset(seed=seeds), slow.reset(seed=seeds))
-    assert compare(fast, slow, 12) > 0
+    assert_same_bits(fast.reset(seed=seeds), slow.reset(seed=seeds))
+    assert assert_same_steps(fast, slow, 12) > 0
 
 
 def test_structures_may_differ_between_episodes() -> None:
@@ -157,8 +138,8 @@ def test_structures_may_differ_between_episodes() -> None:
     vary = {**VARY, "control.law": ["adaptive", "p_d"]}
     fast, slow = make_both({"vary": vary}, 6, "NextStep")
     assert fast.obstacle == ""
-    assert_same(fast.reset(seed=1), slow.reset(seed=1))
-    assert compare(fast, slow, 60) > 6
+    assert_same_bits(fast.reset(seed=1), slow.reset(seed=1))
+    assert assert_same_steps(fast, slow, 60) > 6
 
 
 @pytest.mark.filterwarnings("ignore:the environments are stepped")
@@ -178,8 +159,8 @@ def test_unsupported_environments_are_stepped_alone(
     fast, slow = make_both({**settings, "vary": {}}, count, "NextStep")
     assert word in fast.obstacle
     assert fast.num_envs == count
-    assert_same(fast.reset(seed=3), slow.reset(seed=3))
-    compare(fast, slow, 6)
+    assert_same_bits(fast.reset(seed=3), slow.reset(seed=3))
+    assert_same_steps(fast, slow, 6)
 
 
 def test_the_interface_is_that_of_gymnasium() -> None:
@@ -213,25 +194,25 @@ def test_results_are_not_changed_later() -> None:
     kept = copy.deepcopy(results)
     for _ in range(30):
         env.step(actions)
-    assert_same(results, kept)
+    assert_same_bits(results, kept)
 
 
 def test_masked_resets_begin_chosen_episodes() -> None:
     """With automatic resets disabled, a mask chooses the episodes that begin."""
     fast, slow = make_both({}, 4, "Disabled")
-    assert_same(fast.reset(seed=3), slow.reset(seed=3))
+    assert_same_bits(fast.reset(seed=3), slow.reset(seed=3))
     random = np.random.default_rng(0)
     for n in range(1, 20):
         actions = draw_actions(fast, random)
-        assert_same(fast.step(actions), slow.step(actions))
+        assert_same_bits(fast.step(actions), slow.step(actions))
         if n % 6 == 0:
             mask = np.array([True, n == 6, False, n == 12])
-            pair = [env.reset(options={"reset_mask": mask.copy()}) for env in (fast, slow)]
-            assert_same(pair[0], pair[1])
+            result = fast.reset(options={"reset_mask": mask.copy()})
+            assert_same_bits(result, slow.reset(options={"reset_mask": mask.copy()}))
 
 
 def make_six_steps() -> tuple[Any, SyncVectorEnv]:
-    """Environments after six steps, side by side and one by one."""
+    """Returns environments after six steps, side by side and one by one."""
     fast, slow = make_both({"render_mode": "rgb_array"}, 4, "NextStep")
     for env in (fast, slow):
         env.reset(seed=2)
@@ -273,7 +254,7 @@ def test_refused_actions_advance_no_environment() -> None:
     for wrong, word in ((bad, "action 3"), (actions[:3], "shape"), ("no", "array")):
         with pytest.raises(UsageError, match=word):
             env.step(wrong)
-    assert_same(env.step(actions), other.step(actions))
+    assert_same_bits(env.step(actions), other.step(actions))
 
 
 @pytest.mark.parametrize(
@@ -291,7 +272,7 @@ def test_long_delays_make_room_for_states() -> None:
     fast, slow = make_both(
         {"vary": {"link.delay_ms": (0.0, 900.0)}, "duration_s": 1.5}, 4, "NextStep"
     )
-    assert_same(fast.reset(seed=3), slow.reset(seed=3))
+    assert_same_bits(fast.reset(seed=3), slow.reset(seed=3))
     actions = np.full((4, 2), 0.5)
     for _ in range(75):
-        assert_same(fast.step(actions), slow.step(actions))
+        assert_same_bits(fast.step(actions), slow.step(actions))

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.analysis.builders import make_run
 from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
 from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.certificate.energy_terms import (
@@ -17,8 +18,6 @@ from trilat_net.analysis.certificate.energy_terms import (
 )
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.analysis.torque_sources import TorqueSplit
-
-from . import runs
 
 ROWS = 40
 NOW = 30
@@ -35,7 +34,7 @@ EQ = SiteConstants(
 )
 
 
-def moving(
+def draw_records(
     random: np.random.Generator, site: str, used: dict[str, np.ndarray], rows: int, first: int
 ) -> AlignedRecords:
     vectors = [random.normal(size=(rows, 2)) for _ in range(6)]
@@ -50,13 +49,13 @@ class Situation:
 
     def __init__(self, seed: int, before: tuple[int, int], after: tuple[int, int]) -> None:
         random = np.random.default_rng(seed)
-        self.peers = [moving(random, name, {}, ROWS, 0) for name in ("a", "b")]
+        self.peers = [draw_records(random, name, {}, ROWS, 0) for name in ("a", "b")]
         self.alpha = random.dirichlet([1.0, 1.0])
         used = {
             name: np.array(pair)
             for name, pair in zip(("a", "b"), zip(before, after, strict=True), strict=True)
         }
-        self.track = moving(random, "s", used, 2, NOW)
+        self.track = draw_records(random, "s", used, 2, NOW)
         self.views = [
             view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers
         ]
@@ -110,8 +109,10 @@ def test_sample_ages_are_kept_within_a_period(
     site = Situation(seed, before, after)
     ends = site.motion.ends
     kept = sum(a * p.q[m + 1] for a, p, m in zip(site.alpha, site.peers, before, strict=True))
-    q, qd = site.track.q[1], site.track.qd[1]
-    right, jumped = qd + EQ.Lambda * (q - kept), qd + EQ.Lambda * (q - site.track.q_des[1])
+    q = site.track.q[1]
+    qd = site.track.qd[1]
+    right = qd + EQ.Lambda * (q - kept)
+    jumped = qd + EQ.Lambda * (q - site.track.q_des[1])
     assert ends.r_right[0] == pytest.approx(right)
     assert ends.r_middle[0] == pytest.approx(0.5 * (right + jumped))
     assert ends.qd_des_right[0] == pytest.approx(
@@ -126,7 +127,8 @@ def test_a_held_torque_works_with_its_initial_value(seed: int) -> None:
     ends = site.motion.ends
     now, held = np.random.default_rng(seed).normal(size=(2, 2, 2))
     booked = torque_work(site.motion, now, held)
-    left, right = ends.r_left[0] @ (now[0] + held[0]), ends.r_right[0] @ (now[1] + held[0])
+    left = ends.r_left[0] @ (now[0] + held[0])
+    right = ends.r_right[0] @ (now[1] + held[0])
     assert float(booked.total[0]) == pytest.approx(0.5 / RATE_HZ * (left + right))
 
 
@@ -151,8 +153,10 @@ def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
     """
     site = Situation(seed, (5, 9), (6, 10))
     peer = site.peers[0]
-    t_s, speed = np.arange(ROWS) / RATE_HZ, np.array([0.3, -0.2])
-    peer.qd[:], peer.q[:] = speed, speed * t_s[:, np.newaxis]
+    t_s = np.arange(ROWS) / RATE_HZ
+    speed = np.array([0.3, -0.2])
+    peer.qd[:] = speed
+    peer.q[:] = speed * t_s[:, np.newaxis]
     peer = peer._replace(rate_hz=RATE_HZ)
     grown_s = 1e-6
     peer_view = view_delayed_peer(site.track, PeerTrajectory(peer))
@@ -162,7 +166,9 @@ def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
         a * v.delayed.q[1] for a, v in zip(site.alpha, site.views, strict=True)
     )
     booked = float(link_work(site.motion, 0).total[0])
-    e, qd, q = site.track.e[1], site.track.qd[1], site.track.q[1]
+    e = site.track.e[1]
+    qd = site.track.qd[1]
+    q = site.track.q[1]
     r = qd + EQ.Lambda * e
     c2 = np.cos(q[1])
     M = np.array([[3 + 2 * c2, 1 + c2], [1 + c2, 1.0]])
@@ -173,13 +179,13 @@ def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
 
 
 def test_a_box_around_the_truth_only_dissipates() -> None:
-    given_by_box = runs.run("rich").balance.work["estimates"]
+    given_by_box = make_run("rich").balance.work["estimates"]
     assert given_by_box[-1] < -0.1
     assert np.diff(given_by_box).max() <= 1e-12
 
 
 def test_the_torque_limit_counts_when_active() -> None:
-    book = runs.run("rich").energies["s"]
+    book = make_run("rich").energies["s"]
     cut = (np.abs(book.motion.records.tau) >= book.motion.constants.tau_limit).any(axis=1)
     booked = book.work["torque limit"]
     assert cut.any()

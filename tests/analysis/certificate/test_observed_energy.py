@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from trilat_studies.tuning.tuning_report import list_energy_notes
 
-from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
-from tests.log_editing import edited, opened, recorded
-from tests.unit_arm import hand, unit_scenario
+from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, make_energy_pair
+from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
+from tests.scenario.builders import make_scenario
+from tests.unit_arm import make_spring_hand, make_unit_scenario
 from trilat_net.analysis.certificate.observed_energy import (
     NEGATIVE_ENERGY_MEANING,
     ObservedEnergy,
@@ -30,7 +31,11 @@ from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.figures.registry import figure
 from trilat_net.scenario import load_scenario
 
-B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0
+B = 10.0
+DELAY_S = 0.05
+TO = 0.3
+HAND = 50.0
+WALL = 1000.0
 PAIR = f"""
 name = "line"
 scheme = "digital"
@@ -60,17 +65,16 @@ damping_nm_s_rad = 10.0
 
 
 @cache
-def clamped(**changes: Any) -> Log:
-    """A run of a master that a hand moves, a line, and a clamped slave."""
-    overrides = {key.replace("__", "."): value for key, value in changes.items()}
-    return simulate_scenario(load_scenario(load_scenario(PAIR), overrides))
+def simulate_clamped_pair(**changes: Any) -> Log:
+    """Returns the log of a master that a hand moves, a line, and a clamped slave."""
+    return simulate_scenario(make_scenario(load_scenario(PAIR), **changes))
 
 
 def test_a_line_at_rest_is_a_spring() -> None:
     """The spring b / T lies between the hand and the clamp of the slave: its energy is half its
     force squared times T / b.
     """
-    log = clamped()
+    log = simulate_clamped_pair()
     energies = ObservedEnergy.of_log(log, own_laws=True)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
@@ -91,10 +95,10 @@ def test_waves_held_over_an_outage_add_energy() -> None:
     The hand lets go in the outage, so that the master sends less than the slave goes on using.
     """
     outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
-    log = clamped.__wrapped__(**outage, duration_s=3.2)
+    log = simulate_clamped_pair.__wrapped__(**outage, duration_s=3.2)
     certificate = certify(log, own_laws=True)
     assert certificate.observed.finding is ObservedFinding.NEGATIVE
-    lowest = min(certificate.observed.least, key=lambda one: one.amount_j)
+    lowest = min(certificate.observed.least, key=lambda energy: energy.amount_j)
     assert lowest.name == "line m->s"
     last = round(1000 * lowest.at_s) + 1
     used = log["s"].used["m"][:last]
@@ -108,14 +112,14 @@ def test_waves_held_over_an_outage_add_energy() -> None:
 
 def test_books_detect_a_law_sending_too_much() -> None:
     energies = ObservedEnergy.of_log(
-        clamped(control__boost=1.01, duration_s=2.0), own_laws=True
+        simulate_clamped_pair(control__boost=1.01, duration_s=2.0), own_laws=True
     )
     assert energies.finding is ObservedFinding.BROKEN
     assert energies.residual_j > 1e-4
 
 
 def test_code_from_outside_runs_only_on_request() -> None:
-    log = clamped()
+    log = simulate_clamped_pair()
     assert ObservedEnergy.of_log(log) is None
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
     mixed = simulate_scenario(load_scenario(log.scenario, silent))
@@ -125,7 +129,7 @@ def test_code_from_outside_runs_only_on_request() -> None:
 
 
 def test_the_certificate_reports_it_in_text_and_json() -> None:
-    certificate = certify(clamped(), own_laws=True)
+    certificate = certify(simulate_clamped_pair(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(certificate)}
     assert lines[certificate.observed.text] == "ok"
     observed = certificate.to_dict()["observed"]
@@ -139,15 +143,15 @@ def test_the_certificate_reports_it_in_text_and_json() -> None:
 
 
 @cache
-def run(law: str) -> Log:
-    """A run with a clamped slave, 200 ms each way."""
-    return simulate_scenario(pair(LAWS[law], clamped=True, duration_s=3.0))
+def simulate_law(law: str) -> Log:
+    """Returns the log of a law with a clamped slave and delays of 200 ms each way."""
+    return simulate_scenario(make_energy_pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> None:
-    log = run(law)
+    log = simulate_law(law)
     energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
@@ -166,7 +170,7 @@ def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> Non
 
 @pytest.mark.long
 def test_a_figure_shows_energies_over_time() -> None:
-    drawn = figure(run("wave"), "observed_energy")
+    drawn = figure(simulate_law("wave"), "observed_energy")
     lines, known, stored, given_curve = drawn.axes
     assert len(lines.lines) == len(known.lines) == len(stored.lines) == 2
     assert len(given_curve.lines) == 4
@@ -198,9 +202,9 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
 
 @pytest.mark.long
 def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
-    """As published: the follower's damper uses a velocity with which the follower is not moved."""
+    """As published, the follower's damper uses a velocity that is not the follower's own."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
-    log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
+    log = simulate_scenario(make_energy_pair(law, clamped=False, duration_s=4.0))
     energies = ObservedEnergy.of_log(log)
     taken = next(energy for energy in energies.least if energy.name == "taken by s")
     assert energies.finding is ObservedFinding.NEGATIVE
@@ -212,7 +216,9 @@ def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
 def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
-    log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
+    log = simulate_scenario(
+        make_energy_pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits)
+    )
     energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert next(
@@ -237,10 +243,14 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
         "s": {"m1": 0.8, "m2": 0.2},
     }
     control = {**LAWS[law], **FOLLOWER}
-    sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
+    sites = {
+        "m1": {"hands": [make_spring_hand(0.3)]},
+        "m2": {"hands": [make_spring_hand(-0.3)]},
+        "s": {},
+    }
     for name, beta in (("m2", 0.5), ("s", 1.5)):
         sites[name]["control"] = {**control, "beta": beta}
-    scenario = unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
+    scenario = make_unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
     energies = ObservedEnergy.of_log(simulate_scenario(scenario))
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
@@ -248,15 +258,15 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 4])
 def test_missing_law_memory_in_records_is_reported(mem: list[float]) -> None:
-    data = recorded(
+    data = make_log_bytes(
         "two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"}
     )
-    broken = edited(
+    broken = edit_log_bytes(
         data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
     )
-    assert ObservedEnergy.of_log(opened(data)).curves
+    assert ObservedEnergy.of_log(open_bytes(data)).curves
     with pytest.raises(LogError, match="a record of s does not have"):
-        ObservedEnergy.of_log(opened(broken))
+        ObservedEnergy.of_log(open_bytes(broken))
 
 
 def test_three_texts_explain_negative_energy_alike() -> None:

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import trilat_net
+from tests.analysis.builders import EXPERT, make_run
+from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate import (
     premise_quantities,
     stability_certificate,
@@ -37,20 +39,19 @@ from trilat_net.presentation import premise_text, verdict_text
 from trilat_net.presentation.verdict_text import REQUIREMENTS
 from trilat_net.scenario import load_scenario
 
-from . import runs
-
 SHORT = {"duration_s": 1.5, "rate_hz": 200, "link.delay_ms": 100.0}
 CUT = {"links.m2->s.outages_s": [[0.45, 1.0]], "links.m2->s.delay_ms": 100.0}
 LATE = {"links.m1->s.outages_s": [[0.0, 0.5]], "links.m1->s.delay_ms": 100.0}
 
 
-def premises(name: str = "free", **overrides: object) -> dict[str, Premise]:
-    changes = {**SHORT, **{key.replace("__", "."): value for key, value in overrides.items()}}
-    return {p.name: p for p in runs.run(name, changes).certificate.premises}
+def check_shipped(name: str = "free", **overrides: object) -> dict[str, Premise]:
+    """Returns the premises of a shipped scenario, by name."""
+    run = make_run(name, {**SHORT, **make_overrides(**overrides)})
+    return {premise.name: premise for premise in run.certificate.premises}
 
 
 def test_free_motion_satisfies_all_premises() -> None:
-    checked = premises()
+    checked = check_shipped()
     assert [p.name for p in checked.values() if p.holds is not True] == []
     assert checked["delays"].text == "constant on every link: 100 ms"
     assert checked["hands"].text == "nobody pushes"
@@ -80,7 +81,7 @@ def test_free_motion_satisfies_all_premises() -> None:
             "no beta exists: m1 (3, 3), m2 (3, 3), s (1, 3)",
         ),
         ("Kd", {"control__Kd": 0.0}, "some Kd is zero"),
-        ("shares", runs.EXPERT, "none of m1, s follows m2, whose beta is 0"),
+        ("shares", EXPERT, "none of m1, s follows m2, whose beta is 0"),
         (
             "delays",
             {"link__model": "uniform", "link__half_width_ms": 30.0},
@@ -103,7 +104,7 @@ def test_free_motion_satisfies_all_premises() -> None:
 def test_a_failed_premise_gives_its_reason(
     name: str, overrides: dict[str, object], says: str
 ) -> None:
-    failed = premises(**overrides)[name]
+    failed = check_shipped(**overrides)[name]
     assert failed.holds is False
     assert says in failed.text
     assert [text for text in strings_in(failed.quantities) if " " in text] == []
@@ -173,23 +174,24 @@ def test_each_kind_of_facts_has_its_sentence() -> None:
 
 
 def test_unequal_scalars_of_kd_pass() -> None:
-    checked = premises(sites__m2__control__Kd=6.0)["Kd"]
+    checked = check_shipped(sites__m2__control__Kd=6.0)["Kd"]
     assert checked.holds
     assert checked.text == "one Kd up to a scalar: m1 1, m2 2, s 1"
 
 
 def test_a_hand_that_holds_on_fails_a_premise() -> None:
-    assert premises("paper", duration_s=3.0, rate_hz=100)["hands"].holds is False  # until 11 s
-    lets_go = premises("paper", duration_s=12.5, rate_hz=100)["hands"]
+    still_holding = check_shipped("paper", duration_s=3.0, rate_hz=100)["hands"]
+    assert still_holding.holds is False  # until 11 s
+    lets_go = check_shipped("paper", duration_s=12.5, rate_hz=100)["hands"]
     assert lets_go.holds
     assert "nobody pushes after 10.99" in lets_go.text
-    briefly = premises("paper", duration_s=11.5, rate_hz=100)["hands"]
+    briefly = check_shipped("paper", duration_s=11.5, rate_hz=100)["hands"]
     assert briefly.holds is False
     assert "0.5 s of free motion at the end are less than 1 s" in briefly.text
 
 
 def test_a_damper_of_qd_may_feed_r() -> None:
-    hands = next(p for p in runs.run("wall").certificate.premises if p.name == "hands")
+    hands = next(p for p in make_run("wall").certificate.premises if p.name == "hands")
     assert hands.holds is False
     assert hands.text.startswith("the hands and walls supplied up to")
 
@@ -203,9 +205,9 @@ def test_rounding_counts_as_no_energy(apart_rad: float, says: str) -> None:
     known = {"control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "control__Gamma": 0.0}
     starts = {f"sites__{name}__q0_rad": [0.3, 0.4] for name in ("m2", "s")}
     damper = {"sites__m1__environment": [{"kind": "viscous", "damping_nm_s_rad": [3.0, 3.0]}]}
-    checked = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)[
-        "hands"
-    ]
+    checked = check_shipped(
+        sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper
+    )["hands"]
     assert checked.text.startswith(says)
     assert checked.holds is (apart_rad < 1e-3)
 
@@ -214,24 +216,18 @@ SITE = "sites.s.environment"
 SAMPLED = {f"{SITE}.0.sampled": True, "rate_hz": 200, "duration_s": 8.0}
 
 
-def run(**changes: object) -> Log:
-    return trilat_net.simulate(
-        "windup", {**SAMPLED, **{k.replace("__", "."): v for k, v in changes.items()}}
-    )
+def simulate_windup(**changes: object) -> Log:
+    """Returns the log of `windup` at a sampled wall."""
+    return trilat_net.simulate("windup", {**SAMPLED, **make_overrides(**changes)})
 
 
-def premise(log: Log) -> Premise | None:
-    return next(
-        (
-            premise_checked
-            for premise_checked in check_premises(gather_facts(log))
-            if premise_checked.name == "walls"
-        ),
-        None,
-    )
+def find_wall_premise(log: Log) -> Premise | None:
+    """Returns the premise about sampled walls, or None if a log has no such wall."""
+    premises = check_premises(gather_facts(log))
+    return next((premise for premise in premises if premise.name == "walls"), None)
 
 
-def damper(b: float, **more: object) -> list[dict[str, object]]:
+def make_damped_wall(b: float, **more: object) -> list[dict[str, object]]:
     """Returns the wall of `windup` with a damper of the arm."""
     wall = load_scenario("windup").sites["s"].environment[0]
     damper_keys = {
@@ -246,8 +242,9 @@ def damper(b: float, **more: object) -> list[dict[str, object]]:
 
 
 def test_sampled_walls_give_half_k_dx_squared() -> None:
-    log = run()
-    wall, s = log.scenario.sites["s"].environment[0], log["s"]
+    log = simulate_windup()
+    wall = log.scenario.sites["s"].environment[0]
+    s = log["s"]
     x = np.cos(s.q[:, 0]) + np.cos(s.q.sum(axis=1))
     depth = np.maximum(x - wall.point_m[0], 0.0)
     inside = (depth[:-1] > 0.0) & (depth[1:] > 0.0)
@@ -267,30 +264,34 @@ def test_sampled_walls_give_half_k_dx_squared() -> None:
 
 
 def test_the_sampled_wall_fails_its_premise_by_name() -> None:
-    wall = premise(run())
+    wall = find_wall_premise(simulate_windup())
     assert wall is not None
     assert (wall.name, wall.holds) == ("walls", False)
 
 
 @pytest.mark.parametrize(("b", "holds"), [(1.0, False), (40.0, True)])
 def test_a_damper_of_the_arm_dissipates_wall_energy(b: float, *, holds: bool) -> None:
-    wall = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
+    wall = find_wall_premise(
+        simulate_windup(**{SITE: make_damped_wall(b), f"{SITE}.0.sampled": True})
+    )
     assert wall is not None
     assert wall.holds is holds
 
 
 def test_sampled_or_missing_dampers_dissipate_nothing() -> None:
     for more in ({"sampled": True}, {"end_s": 1.0}):
-        wall = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
+        wall = find_wall_premise(
+            simulate_windup(**{SITE: make_damped_wall(40.0, **more), f"{SITE}.0.sampled": True})
+        )
         assert wall is not None
         assert wall.holds is False
 
 
 def test_unreachable_or_continuous_walls_give_no_energy() -> None:
-    far_wall = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
+    far_wall = find_wall_premise(simulate_windup(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
     assert far_wall is not None
     assert far_wall.holds
-    assert premise(run(**{f"{SITE}.0.sampled": False})) is None
+    assert find_wall_premise(simulate_windup(**{f"{SITE}.0.sampled": False})) is None
 
 
 def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = False) -> float:
@@ -316,12 +317,14 @@ def test_damping_by_the_sampled_speed_gives_energy() -> None:
 
     For motions faster than half the tick rate there is no bound.
     """
-    ticks, rng = 200, np.random.default_rng(5)
+    ticks = 200
+    rng = np.random.default_rng(5)
     t = np.arange(ticks * 400) / 400.0
     square = np.where(t % 2.0 < 1.0, 1.0, -1.0)  # its speed changes sides at each tick
     assert most_given(square, ticks, 2.0, 1.0, differenced=True) == pytest.approx(2.0, rel=0.02)
     harmonics = np.pi * (2.0 * np.arange(20) + 1.0)
-    c, s = np.ones(20) / np.sqrt(20.0), 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
+    c = np.ones(20) / np.sqrt(20.0)
+    s = 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
     many = (
         c[:, None] * np.cos(harmonics[:, None] * t)
         - s[:, None] * np.sin(harmonics[:, None] * t)

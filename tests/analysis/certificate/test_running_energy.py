@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.analysis.certificate import runs
+from tests.analysis.builders import make_run
 from trilat_net.analysis.certificate.running_energy import (
     EnergyCourse,
     RecordWindow,
@@ -14,7 +14,7 @@ from trilat_net.log.log_reader import Log
 BLOCK = 60
 
 
-def courses(
+def compute_courses(
     log: Log, *, late: int = 0, without: frozenset[int] = frozenset()
 ) -> list[EnergyCourse]:
     """Returns V of a log whose records arrive block by block, those of its last site later;
@@ -39,15 +39,15 @@ def courses(
     return courses_found
 
 
-def joined(found: list[EnergyCourse]) -> EnergyCourse:
-    return EnergyCourse(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+def join_courses(courses: list[EnergyCourse]) -> EnergyCourse:
+    return EnergyCourse(*(np.concatenate(columns) for columns in zip(*courses, strict=True)))
 
 
 @pytest.mark.parametrize("late", [0, 7])
 def test_v_while_running_equals_that_of_log(late: int) -> None:
-    """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
-    whole = runs.run("rich").balance
-    course = joined(courses(runs.run("rich").log, late=late))
+    """The run has changes of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
+    whole = make_run("rich").balance
+    course = join_courses(compute_courses(make_run("rich").log, late=late))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert len(set(rows.tolist())) > 0.95 * len(whole.t_s)
     most = np.abs(whole.V).max()
@@ -57,10 +57,10 @@ def test_v_while_running_equals_that_of_log(late: int) -> None:
 
 def test_v_without_some_records_is_the_incomplete_logs() -> None:
     """Unavailable records are passed over as `certify` passes over them."""
-    log = runs.run("rich").log
+    log = make_run("rich").log
     gap = frozenset(range(700, 760))
-    whole = runs.run("rich").balance
-    course = joined(courses(log, without=gap))
+    whole = make_run("rich").balance
+    course = join_courses(compute_courses(log, without=gap))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     # the gap and the samples of it that are in use
     far = (course.t_s < 1.3) | (course.t_s > 2.2)
@@ -69,23 +69,25 @@ def test_v_without_some_records_is_the_incomplete_logs() -> None:
 
 
 def test_v_begins_late_in_a_session_joined_late() -> None:
-    log, whole = runs.run("rich").log, runs.run("rich").balance
+    log = make_run("rich").log
+    whole = make_run("rich").balance
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
-    running, blocks = RunningEnergy(log.scenario, windows), []
+    running = RunningEnergy(log.scenario, windows)
+    blocks = []
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
             for record in log[site].states[first : first + BLOCK]:
                 windows[site].receive(record)
         blocks.append(running.compute_next({site: windows[site].newest for site in log.sites}))
     assert blocks[0] is None
-    course = joined([block for block in blocks if block is not None])
+    course = join_courses([block for block in blocks if block is not None])
     assert 2.4 < course.t_s[0] < 3.2
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
     assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * np.abs(whole.V).max()
 
 
 def test_a_law_without_v_is_reported() -> None:
-    log = runs.run("jitter", {"duration_s": 0.3}).log
+    log = make_run("jitter", {"duration_s": 0.3}).log
     windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
     assert "p_d" in running.reason or "law" in running.reason

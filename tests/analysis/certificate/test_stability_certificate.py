@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.analysis import logs
+from tests.analysis.builders import (
+    find_relative_residual,
+    make_busy_run,
+    make_run,
+    make_short_log,
+)
+from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.certificate.premises import find_unjudged_spans
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import RecordGap, StabilityFinding
@@ -16,8 +22,6 @@ from trilat_net.errors import LogError
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.verdict_text import RECORD_GAPS
 from trilat_net.scenario import load_scenario
-
-from . import runs
 
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
@@ -57,7 +61,7 @@ def test_growth_alone_judges_laws_without_functional(
     assert certificate.stability is stability
 
 
-def outside(log: Log, *, known: bool) -> Log:
+def make_arm_external(log: Log, *, known: bool) -> Log:
     """Returns the same records, of a slave with an external arm."""
     spec = log.scenario.sites["s"]
     arm = msgspec.structs.replace(spec.arm, known=known)
@@ -69,14 +73,14 @@ def outside(log: Log, *, known: bool) -> Log:
     return log
 
 
-def still_free() -> Log:
-    return logs.rewritten(
-        runs.run("free", {"duration_s": 2.0, "rate_hz": 200}).log, lambda _: True
+def make_free_log() -> Log:
+    return rewrite_log(
+        make_run("free", {"duration_s": 2.0, "rate_hz": 200}).log, lambda _: True
     )
 
 
 def test_an_arm_with_unknown_theta_has_no_v() -> None:
-    certificate = certify(outside(still_free(), known=False))
+    certificate = certify(make_arm_external(make_free_log(), known=False))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         certificate.verdict.text
@@ -85,17 +89,19 @@ def test_an_arm_with_unknown_theta_has_no_v() -> None:
 
 
 def test_external_arms_are_judged_with_identified_theta() -> None:
-    as_told = certify(outside(still_free(), known=True))
+    as_told = certify(make_arm_external(make_free_log(), known=True))
     assert as_told.verdict.finding is StabilityFinding.COVERED
     assert "no record says who pushes the arm of s" in as_told.verdict.text
-    change = lambda s: logs.replaced(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
-    certificate = certify(outside(logs.rewritten(still_free(), change=change), known=True))
+    change = lambda s: replace_fields(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
+    certificate = certify(
+        make_arm_external(rewrite_log(make_free_log(), change=change), known=True)
+    )
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert "the external arm of s does not move as its theta says" in certificate.verdict.text
 
 
 def test_a_record_without_neighbours_is_no_period() -> None:
-    certificate = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
+    certificate = certify(rewrite_log(make_free_log(), lambda state: state.tick % 2 == 0))
     assert certificate.verdict.text == f"V cannot be judged: {RECORD_GAPS[RecordGap.NO_PERIOD]}"
 
 
@@ -113,10 +119,8 @@ def test_a_period_too_long_is_not_judged() -> None:
 
 
 def test_gaps_are_left_out_and_reported() -> None:
-    whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
-    log = logs.rewritten(
-        whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240)
-    )
+    whole = make_run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
+    log = rewrite_log(whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240))
     certificate = certify(log)
     assert certificate.balance is not None
     assert certificate.verdict.finding is StabilityFinding.COVERED
@@ -126,39 +130,37 @@ def test_gaps_are_left_out_and_reported() -> None:
     assert "not judged: 0.995 to 1.35 s" in certificate.verdict.text
     work = sum(np.abs(x).max() for x in certificate.balance.work.values())
     assert work <= 1e-6  # nobody is said to have given what changed in the gap
-    assert runs.relative(certificate.balance) <= 1e-3
+    assert find_relative_residual(certificate.balance) <= 1e-3
     # s looks back by 150 ms
     assert find_unjudged_spans(certificate.balance) == [pytest.approx((0.995, 1.35))]
 
 
 def test_a_gap_does_not_break_the_balance() -> None:
     """Events within a gap are nobody's fault."""
-    whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 100}).log
+    whole = make_run("free", {"duration_s": 4.0, "rate_hz": 100}).log
     for site in whole.sites:
         certificate = certify(
-            logs.rewritten(
-                whole, lambda s, site=site: not (s.site == site and 25 <= s.tick < 225)
-            )
+            rewrite_log(whole, lambda s, site=site: not (s.site == site and 25 <= s.tick < 225))
         )
         assert certificate.verdict.finding is not StabilityFinding.BROKEN
 
 
 def test_an_unfinished_log_is_judged_to_its_end() -> None:
-    whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log
+    whole = make_run("free", {"duration_s": 4.0, "rate_hz": 200}).log
     certificate = certify(
-        logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False)
+        rewrite_log(whole, lambda state: 200 < state.tick < 700, finished=False)
     )
     assert certificate.balance is not None
     assert certificate.verdict.finding is StabilityFinding.COVERED
     # what is under way then was sent since the first record
     assert certificate.balance.t_s[0] == pytest.approx(1.205)
-    assert runs.relative(certificate.balance) <= 1e-3
+    assert find_relative_residual(certificate.balance) <= 1e-3
 
 
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_nearly_empty_logs_are_reported(ticks: int) -> None:
     certificate = certify(
-        logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks)
+        rewrite_log(make_short_log("paper"), lambda state: state.tick < ticks)
     )
     assert (
         certificate.verdict.text
@@ -169,7 +171,7 @@ def test_nearly_empty_logs_are_reported(ticks: int) -> None:
 
 
 def test_two_records_are_a_period() -> None:
-    certificate = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < 2))
+    certificate = certify(rewrite_log(make_short_log("paper"), lambda state: state.tick < 2))
     assert certificate.balance is not None
     assert len(certificate.balance.t_s) == 2
 
@@ -177,30 +179,30 @@ def test_two_records_are_a_period() -> None:
 def test_arms_at_rest_have_no_energy() -> None:
     """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by V(0)."""
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 1.0, "rate_hz": 200}
-    certificate = runs.run("paper", rest).certificate
+    certificate = make_run("paper", rest).certificate
     assert certificate.balance is not None
     assert certificate.balance.V[0] == 0.0
-    assert runs.relative(certificate.balance) <= 1e-3
+    assert find_relative_residual(certificate.balance) <= 1e-3
     assert certificate.verdict.finding is StabilityFinding.COVERED
 
 
 def test_sites_of_different_rates_are_booked_together() -> None:
     rates = {"sites.m2.rate_hz": 250, "sites.s.rate_hz": 350, "rate_hz": 500, "duration_s": 4.0}
-    certificate = runs.run("asymmetric", rates).certificate
+    certificate = make_run("asymmetric", rates).certificate
     assert certificate.balance is not None
     assert len(certificate.balance.t_s) == pytest.approx(2000, abs=5)
-    assert runs.relative(certificate.balance) <= 2e-4
+    assert find_relative_residual(certificate.balance) <= 2e-4
     assert certificate.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE)
 
 
 def test_a_command_is_booked_like_scripted_changes() -> None:
-    certificate = certify(logs.busy().log)
+    certificate = certify(make_busy_run().log)
     assert certificate.balance is not None
-    assert runs.relative(certificate.balance) <= 5e-3
+    assert find_relative_residual(certificate.balance) <= 5e-3
     assert certificate.verdict.finding is not StabilityFinding.BROKEN
 
 
 def test_an_unreadable_change_is_a_log_error() -> None:
-    change = lambda s: logs.replaced(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
+    change = lambda s: replace_fields(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
     with pytest.raises(LogError, match="a command that cannot be read"):
-        certify(logs.rewritten(logs.simulated("paper"), change=change))
+        certify(rewrite_log(make_short_log("paper"), change=change))

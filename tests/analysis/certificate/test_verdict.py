@@ -12,9 +12,17 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.analysis import logs
-from tests.log_editing import edited, opened, recorded, without
-from tests.log_surgery import taken_apart
+from tests.analysis.builders import EXPERT, JITTER, make_run
+from tests.log.builders import (
+    drop_records,
+    edit_log_bytes,
+    make_log_bytes,
+    open_bytes,
+    replace_fields,
+    rewrite_log,
+)
+from tests.log.surgery import take_apart
+from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
     certify,
@@ -28,14 +36,12 @@ from trilat_net.net.messages import State
 from trilat_net.presentation.verdict_text import describe_growth
 from trilat_net.scenario import parse_scenario
 
-from . import runs
-
 SHORT = {"duration_s": 4.0, "rate_hz": 200}
 
 
 def simulate_free(**overrides: object) -> Log:
-    dotted = {key.replace("__", "."): value for key, value in overrides.items()}
-    return runs.run("free", {**SHORT, **dotted}).log
+    """Returns the log of a short run of `free`."""
+    return make_run("free", {**SHORT, **make_overrides(**overrides)}).log
 
 
 def test_free_motion_is_covered() -> None:
@@ -50,7 +56,7 @@ def test_free_motion_is_covered() -> None:
 
 
 def test_hands_are_named_and_excused() -> None:
-    certificate = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
+    certificate = make_run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
     assert certificate.verdict.finding is StabilityFinding.COVERED
     assert (
         "covered by the theorem: V rose by no more than the hands gave: 24 J"
@@ -59,7 +65,7 @@ def test_hands_are_named_and_excused() -> None:
 
 
 def test_outside_the_theorem_without_a_rise() -> None:
-    certificate = runs.run("wall").certificate
+    certificate = make_run("wall").certificate
     assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert certificate.verdict.text.startswith(
         "the theorem does not apply (premises that fail: hands must add no energy); V rose by "
@@ -69,7 +75,7 @@ def test_outside_the_theorem_without_a_rise() -> None:
 
 
 def test_a_rise_names_time_amount_and_cause() -> None:
-    certificate = runs.run("free", runs.JITTER).certificate
+    certificate = make_run("free", JITTER).certificate
     rise = certificate.verdict.rise
     assert certificate.verdict.finding is StabilityFinding.ROSE
     assert rise is not None
@@ -104,8 +110,8 @@ def test_sampling_feeds_a_slow_digital_loop() -> None:
     assert certificate.end.behaviour is not EndBehaviour.CONVERGED
 
 
-def tampered(change: Callable[[State], State]) -> Certificate:
-    return certify(logs.rewritten(simulate_free(rate_hz=500, duration_s=2.0), change=change))
+def certify_changed(change: Callable[[State], State]) -> Certificate:
+    return certify(rewrite_log(simulate_free(rate_hz=500, duration_s=2.0), change=change))
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
@@ -115,27 +121,27 @@ def test_a_changed_record_breaks_its_sites_balance(field: str) -> None:
         values = [1.05 * x for x in getattr(state, field)]
         return msgspec.structs.replace(state, **{field: values}) if late else state
 
-    certificate = tampered(change)
+    certificate = certify_changed(change)
     assert certificate.verdict.finding is StabilityFinding.BROKEN
     assert not certificate.passed
     assert "were not made by the equations that the log claims" in certificate.verdict.text
 
 
 def test_changed_records_break_balances_under_varying_delay() -> None:
-    log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
+    log = make_run("free", {**JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
     certificate = certify(
-        logs.rewritten(
-            log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s
+        rewrite_log(
+            log, change=lambda s: replace_fields(s, q=[x + 0.01 for x in s.q]) if late(s) else s
         )
     )
     assert certificate.verdict.finding is StabilityFinding.BROKEN
 
 
 def test_erased_hands_break_the_balance() -> None:
-    log = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
+    log = make_run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
     certificate = certify(
-        logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
+        rewrite_log(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
     )
     assert certificate.verdict.finding is StabilityFinding.BROKEN
     assert "the energy of m1 does not add up" in certificate.verdict.text
@@ -186,7 +192,7 @@ def test_groups_made_by_a_change_are_refused() -> None:
 
 def test_a_site_without_weight_converges_after_peers() -> None:
     """V does not contain m2; if only the shares fail, the motion of its peers bounds m2."""
-    certificate = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
+    certificate = make_run("free", {**SHORT, **EXPERT, "duration_s": 1.0}).certificate
     assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert certificate.end.stability is Stability.OPEN
     assert certificate.bounded_by_v
@@ -198,27 +204,27 @@ def test_weightless_sites_with_other_failures_need_growth() -> None:
             {"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}
         ]
     }
-    certificate = runs.run(
-        "free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}
-    ).certificate
+    certificate = make_run("free", {**SHORT, **EXPERT, **hand, "duration_s": 1.0}).certificate
     assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert not certificate.bounded_by_v
     assert not certificate.passed
 
 
-def still() -> Certificate:
+def certify_rest() -> Certificate:
     """Returns a certificate of the paper's law at rest, which nothing leaves open."""
-    return runs.run("free", {"duration_s": 30.0, "rate_hz": 100}).certificate
+    return make_run("free", {"duration_s": 30.0, "rate_hz": 100}).certificate
 
 
 def test_rest_with_falling_v_is_stable() -> None:
-    assert still().stability is Stability.STABLE
-    assert still().passed
-    assert still().reasons == ()
+    assert certify_rest().stability is Stability.STABLE
+    assert certify_rest().passed
+    assert certify_rest().reasons == ()
 
 
 def test_growth_fails_a_run_despite_v() -> None:
-    grown = replace(still(), end=still().end._replace(behaviour=EndBehaviour.GROWS))
+    grown = replace(
+        certify_rest(), end=certify_rest().end._replace(behaviour=EndBehaviour.GROWS)
+    )
     assert grown.stability is Stability.NOT_STABLE
     assert not grown.accepts(("bounded", "open"))
 
@@ -236,13 +242,13 @@ def test_growth_fails_a_run_despite_v() -> None:
 def test_only_accepted_outcomes_pass_besides_stable(
     behaviour: EndBehaviour, accepted: tuple[str, ...], passes: bool
 ) -> None:
-    certificate = replace(still(), end=still().end._replace(behaviour=behaviour))
+    certificate = replace(certify_rest(), end=certify_rest().end._replace(behaviour=behaviour))
     assert not certificate.passed
     assert certificate.accepts(accepted) is passes
 
 
 def test_a_broken_balance_is_never_accepted() -> None:
-    certificate = tampered(
+    certificate = certify_changed(
         lambda s: msgspec.structs.replace(s, q=[1.05 * x for x in s.q]) if s.tick > 375 else s
     )
     assert certificate.verdict.finding is StabilityFinding.BROKEN
@@ -251,25 +257,26 @@ def test_a_broken_balance_is_never_accepted() -> None:
 
 def test_an_unstable_rest_never_passes_a_run() -> None:
     roots = LoopRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
-    refuted = replace(still(), roots=roots)
+    refuted = replace(certify_rest(), roots=roots)
     assert refuted.stability is Stability.NOT_STABLE
     assert refuted.headline().endswith("rests on: exact roots, fastest growing +0.012 /s")
-    doubtful = replace(still(), roots=roots._replace(exact=False))
+    doubtful = replace(certify_rest(), roots=roots._replace(exact=False))
     assert doubtful.stability is Stability.OPEN
     assert roots.text in doubtful.reasons
-    assert replace(still(), roots=roots._replace(verdict="stable")).passed
+    assert replace(certify_rest(), roots=roots._replace(verdict="stable")).passed
 
 
 def test_v_that_rises_at_the_end_is_named() -> None:
-    balance = still().balance
+    balance = certify_rest().balance
     assert balance is not None
-    t_s, V = balance.t_s, balance.unsupplied
+    t_s = balance.t_s
+    V = balance.unsupplied
 
     def growth(added: np.ndarray) -> list[str]:
         changed = replace(
             balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
         )
-        return [describe_growth(one) for one in find_unsupplied_growth(changed, 1e-3)]
+        return [describe_growth(growth) for growth in find_unsupplied_growth(changed, 1e-3)]
 
     assert growth(np.zeros(len(V))) == []
     assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []
@@ -281,11 +288,11 @@ RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 
 
 def certify_bytes(data: bytes, **options: float) -> Certificate:
-    return certify(opened(data), **options)
+    return certify(open_bytes(data), **options)
 
 
 def test_a_whole_log_is_stable_with_reasons() -> None:
-    certificate = certify_bytes(recorded("free", RUN))
+    certificate = certify_bytes(make_log_bytes("free", RUN))
     assert certificate.stability is Stability.STABLE
     facts = certificate.to_dict()["evidence"]
     assert facts == {
@@ -300,9 +307,10 @@ def test_a_whole_log_is_stable_with_reasons() -> None:
 
 @pytest.mark.parametrize("cut", [range(1490, 1525), range(2965, 3000), range(35)])
 def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
-    """At the end, the beginning or in between, of one site."""
-    taken = taken_apart(recorded("free", RUN)).without_chain()
-    topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
+    """The records of one site are missing at the end, at the beginning or in between."""
+    taken = take_apart(make_log_bytes("free", RUN)).without_chain()
+    topics = taken.topics()
+    accounts = taken.metadata("trilat.accounts")
     topic = "/trilat/free/s/state"
     taken.messages = [
         m for m in taken.messages if topics[m.channel] != topic or m.sequence not in cut
@@ -327,7 +335,9 @@ def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
 
 def test_only_recorded_periods_count_for_v() -> None:
     """Single records of one site: few are missing, and each leaves several periods of V unjudged."""
-    data = edited(recorded("free", RUN), record=without("s", set(range(100, 3000, 1000))))
+    data = edit_log_bytes(
+        make_log_bytes("free", RUN), record=drop_records("s", set(range(100, 3000, 1000)))
+    )
     certificate = certify_bytes(data)
     assert certificate.evidence.coverage.share == 0.999
     assert certificate.evidence.functional_share is not None
@@ -336,7 +346,7 @@ def test_only_recorded_periods_count_for_v() -> None:
 
 
 def test_no_option_accepts_a_changed_log() -> None:
-    pieces = taken_apart(recorded("free", RUN))
+    pieces = take_apart(make_log_bytes("free", RUN))
     pieces.metadata("trilat.session")["seed"] += "0"
     certificate = certify_bytes(pieces.bytes())
     assert any("changed since it was made" in why for why in certificate.reasons)
@@ -349,10 +359,10 @@ def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
         is_own = r["site"] == "m1" and r["tick"] >= 40
         return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if is_own else r
 
-    data = recorded("free", {"duration_s": 2.0, "rate_hz": 100, "control.law": law})
+    data = make_log_bytes("free", {"duration_s": 2.0, "rate_hz": 100, "control.law": law})
     assert certify_bytes(data).verdict.finding is not StabilityFinding.BROKEN
     for change in (scaled, lambda r: r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}):
-        certificate = certify_bytes(edited(data, record=change))
+        certificate = certify_bytes(edit_log_bytes(data, record=change))
         assert certificate.verdict.finding is StabilityFinding.BROKEN
         assert "the torque of m1 is not that of Eq. (13)" in certificate.verdict.text
         assert not certificate.accepts(("open",))
@@ -360,6 +370,6 @@ def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
 
 def test_sites_that_did_not_react_stay_open() -> None:
     claims = {"driver": "rerun", "rerun_executed": "s"}
-    certificate = certify_bytes(edited(recorded("free", RUN), session=claims))
+    certificate = certify_bytes(edit_log_bytes(make_log_bytes("free", RUN), session=claims))
     assert any("m1 and m2, as recorded, did not react" in why for why in certificate.reasons)
     assert certificate.stability is Stability.OPEN

@@ -6,22 +6,21 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from tests.analysis.builders import make_run
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse, estimate_responses
-
-from .written import simulated
 
 RATE_HZ = 200
 EVERYTHING = np.ones(60 * RATE_HZ, dtype=np.bool_)
 
 
-def noise(seed: int) -> np.ndarray:
+def draw_noise(seed: int) -> np.ndarray:
     white = np.random.default_rng(seed).normal(size=len(EVERYTHING))
     b, a = signal.butter(2, 4.0, fs=RATE_HZ)
     return signal.lfilter(b, a, white)
 
 
-def strongest(
+def estimate_strongest(
     drive: np.ndarray,
     x: np.ndarray,
     y: np.ndarray,
@@ -35,8 +34,8 @@ def strongest(
 def test_a_known_filter_is_identified() -> None:
     """Gain and phase of a known system, by SciPy's freqz."""
     b, a = signal.butter(1, 3.0, fs=RATE_HZ)
-    x = noise(1)
-    response = strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
+    x = draw_noise(1)
+    response = estimate_strongest(x, x, signal.lfilter(b, a, x), EVERYTHING, RATE_HZ, 1e-3)
     _, H = signal.freqz(b, a, worN=[response.frequency_hz], fs=RATE_HZ)
     assert response.gain == pytest.approx(abs(H[0]), rel=max(0.02, 3.0 * response.error))
     assert response.phase_rad == pytest.approx(float(np.angle(H[0])), abs=0.05)
@@ -44,8 +43,8 @@ def test_a_known_filter_is_identified() -> None:
 
 
 def test_unrelated_signals_are_undecided() -> None:
-    x = noise(1)
-    response = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
+    x = draw_noise(1)
+    response = estimate_strongest(x, x, draw_noise(2), EVERYTHING, RATE_HZ, 1e-3)
     assert response.gain is None
     assert "the coherence" in response.why
 
@@ -53,20 +52,20 @@ def test_unrelated_signals_are_undecided() -> None:
 def test_one_push_is_not_enough() -> None:
     """A single event is coherent with anything."""
     x = np.where(np.abs(np.arange(len(EVERYTHING)) - 2000) < 100, 1.0, 0.0)
-    response = strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
+    response = estimate_strongest(x, x, 3.0 * x, EVERYTHING, RATE_HZ, 1e-3)
     assert response.gain is None
     assert "stretches of 4 s" in response.why
 
 
 def test_weak_drives_and_missing_records_are_named() -> None:
-    x = noise(1)
+    x = draw_noise(1)
     assert (
-        strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why
+        estimate_strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why
         == "the drive is too weak at every frequency"
     )
     gaps = EVERYTHING.copy()
     gaps[::700] = False
-    assert "no stretch of 4 s" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
+    assert "no stretch of 4 s" in estimate_strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
 def test_closed_loop_impedance_depends_on_the_driver() -> None:
@@ -76,8 +75,12 @@ def test_closed_loop_impedance_depends_on_the_driver() -> None:
     The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x
     the ratio is b; the plain ratio of the two, without the drive, is far off.
     """
-    k, b, h = 5.0, 2.0, 1.0 / RATE_HZ
-    x, torque, speed = noise(3), np.zeros(len(EVERYTHING)), np.zeros(len(EVERYTHING))
+    k = 5.0
+    b = 2.0
+    h = 1.0 / RATE_HZ
+    x = draw_noise(3)
+    torque = np.zeros(len(EVERYTHING))
+    speed = np.zeros(len(EVERYTHING))
 
     def shake(push: np.ndarray) -> None:
         q = 0.0
@@ -86,17 +89,17 @@ def test_closed_loop_impedance_depends_on_the_driver() -> None:
             speed[n] = (torque[n] + push[n]) / b
             q += h * speed[n]
 
-    shake(2.0 * noise(4))
-    plain = strongest(speed, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    shake(2.0 * draw_noise(4))
+    plain = estimate_strongest(speed, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert plain.gain is None or abs(plain.gain - b) > 0.2 * b
-    driven = strongest(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    driven = estimate_strongest(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert driven.gain is None  # half of what moves is not the hand's
     shake(0.0 * x)
-    alone = strongest(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
+    alone = estimate_strongest(x, speed, torque, EVERYTHING, RATE_HZ, 1e-6)
     assert alone.gain == pytest.approx(b, rel=1e-6)
 
 
-def shaken() -> dict[str, object]:
+def make_shaken_overrides() -> dict[str, object]:
     points = [[0.02 * n, 0.4 * math.sin(2.0 * math.pi * 0.02 * n), 0.0] for n in range(1501)]
     return {
         "control.law": "p_d",
@@ -114,7 +117,7 @@ def shaken() -> dict[str, object]:
 
 def test_linear_pair_has_its_closed_form_impedance() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
-    log = simulated("two_sites", shaken())
+    log = make_run("two_sites", make_shaken_overrides()).log
     (measured_response,) = (
         response
         for response in compute_log_metrics(log).responses
@@ -136,7 +139,7 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
 
 def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
-    responses = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
+    responses = compute_log_metrics(make_run("contact", {"rate_hz": 200}).log).responses
     for response in responses:
         if response.kind == "impedance":
             assert response.ratio.gain is None
@@ -166,8 +169,8 @@ MULTISINE = {
 
 @pytest.mark.parametrize(("hand", "lines"), [(CHIRP, 15), (MULTISINE, 5)])
 def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
-    """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
-    log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
+    """At every line the error is below 2 % and two random errors of the closed form, which are larger for a chirp."""
+    log = make_run("two_sites", {**make_shaken_overrides(), "sites.m.hands": [hand]}).log
     measured_response = next(
         response
         for response in compute_log_metrics(log).responses

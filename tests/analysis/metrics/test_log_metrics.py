@@ -14,18 +14,22 @@ import pytest
 from trilat_studies.log_comparison import compare_metrics, comparison_to_json
 
 import trilat_net
-from tests.analysis import logs
-from tests.analysis.logs import rewritten
+from tests.analysis.builders import (
+    make_busy_run,
+    make_diverged_log,
+    make_pair_log,
+    make_run,
+    make_short_log,
+)
+from tests.log.builders import add_clock_readings, replace_fields, replace_scenario, rewrite_log
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
 
-from .written import pair, replace_scenario, simulated
-
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 
-def told(log: Log) -> dict[str, Any]:
+def check_facts(log: Log) -> dict[str, Any]:
     """Returns the facts of a log after checking the rules that all facts obey."""
     measured = compute_log_metrics(log)
     facts: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
@@ -48,36 +52,36 @@ def told(log: Log) -> dict[str, Any]:
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_every_released_version_is_measured(path: Path) -> None:
-    facts = told(trilat_net.open_log(path))
+    facts = check_facts(trilat_net.open_log(path))
     assert facts["sites"]["s"]["rms_error_rad"] > 0.0
     assert facts["sites"]["s"]["unaccounted_j"] < 1e-3
     assert facts["links"]["m2->s"]["age_mean_ms"] > 0.0
 
 
 def test_busy_and_uneven_sites_are_measured() -> None:
-    facts = told(logs.busy().log)
+    facts = check_facts(make_busy_run().log)
     assert facts["links"]["b->a"]["burst"] > 1.0
     assert facts["links"]["b->a"]["loss"] == pytest.approx(0.2, abs=0.1)
-    told(logs.simulated("four"))
+    check_facts(make_short_log("four"))
 
 
 def test_gaps_and_late_starts_are_counted() -> None:
-    log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
-    torn = logs.rewritten(
+    log = make_run("free", {"duration_s": 3.0, "rate_hz": 200}).log
+    torn = rewrite_log(
         log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False
     )
-    facts = told(torn)
+    facts = check_facts(torn)
     assert facts["sites"]["m1"]["missing"] == 40.0
     assert facts["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert not facts["complete"]
-    late = told(logs.rewritten(log, lambda state: 150 < state.tick < 400))
+    late = check_facts(rewrite_log(log, lambda state: 150 < state.tick < 400))
     assert late["sites"]["m1"]["unaccounted_j"] < 1e-3
     assert late["run"]["spread_max_rad"] > 0.0
 
 
 def test_a_missing_site_lacks_only_its_figures() -> None:
-    log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    facts = told(logs.rewritten(log, lambda state: state.site != "m1"))
+    log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
+    facts = check_facts(rewrite_log(log, lambda state: state.site != "m1"))
     assert facts["sites"]["m2"]["controller_j"] is not None
     assert facts["links"]["m2->s"]["delay_j"] is not None
     assert facts["unknown"]["sites.m1.controller_j"] == "no records of m1"
@@ -89,23 +93,23 @@ def test_a_missing_site_lacks_only_its_figures() -> None:
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 3])
 def test_nearly_empty_logs_are_no_error(ticks: int) -> None:
-    log = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
-    facts = told(logs.rewritten(log, lambda state: state.tick < ticks))
+    log = make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log
+    facts = check_facts(rewrite_log(log, lambda state: state.tick < ticks))
     assert (facts["sites"]["m"]["controller_j"] is None) == (ticks < 2)
     assert (facts["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
 
 
 def test_a_diverged_run_is_measured_until_divergence() -> None:
-    facts = told(logs.diverged())
+    facts = check_facts(make_diverged_log())
     assert facts["sites"]["m1"]["unaccounted_j"] < 1e-2
 
 
 @pytest.mark.parametrize("size", [1e200, 1e308])
 def test_unphysical_numbers_are_missing_without_error(size: float) -> None:
-    log = simulated("contact", {"duration_s": 5.0, "rate_hz": 100})
-    grown = logs.rewritten(
+    log = make_run("contact", {"duration_s": 5.0, "rate_hz": 100}).log
+    grown = rewrite_log(
         log,
-        change=lambda s: logs.replaced(
+        change=lambda s: replace_fields(
             s,
             **{
                 name: [size if s.tick % 3 else -size] * 2
@@ -113,18 +117,18 @@ def test_unphysical_numbers_are_missing_without_error(size: float) -> None:
             },
         ),
     )
-    assert told(grown)["sites"]["m"]["mechanical_j"] is None
+    assert check_facts(grown)["sites"]["m"]["mechanical_j"] is None
 
 
 def test_loops_are_reported_if_clocks_were_read() -> None:
     """Every loop late by its tick in us, every tick 7 us of work."""
-    log = logs.timed(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))
-    facts = told(log)["sites"]["m1"]
+    log = add_clock_readings(make_run("free", {"duration_s": 1.0, "rate_hz": 200}).log)
+    facts = check_facts(log)["sites"]["m1"]
     assert facts["late_max_us"] == 199.0
     assert facts["busy_p99_us"] == 7.0
     assert facts["overruns"] == 0.0
     assert (
-        told(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))["sites"]["m1"][
+        check_facts(make_run("free", {"duration_s": 1.0, "rate_hz": 200}).log)["sites"]["m1"][
             "late_max_us"
         ]
         is None
@@ -139,7 +143,7 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
 
 
 def test_a_row_is_the_largest_or_the_sum() -> None:
-    log = pair(
+    log = make_pair_log(
         lambda site, _: {
             "tau": [3.0 if site == "m" else 4.0, 0.0],
             "q": [0.1, 0.0],
@@ -155,8 +159,8 @@ def test_a_row_is_the_largest_or_the_sum() -> None:
 
 def test_runs_lack_figures_missing_at_a_site() -> None:
     """A largest value of some sites is none of the run; sites that cannot have the figure do not count."""
-    log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    torn = rewritten(log, lambda state: state.site != "m2")
+    log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
+    torn = rewrite_log(log, lambda state: state.site != "m2")
     row = compare_metrics([log, torn]).row("max_error_rad")
     assert row.values[0] is not None
     assert row.values[1] is None
@@ -164,8 +168,8 @@ def test_runs_lack_figures_missing_at_a_site() -> None:
 
 
 def test_rows_without_any_value_are_left_out() -> None:
-    free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    wall = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
+    free = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
+    wall = make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log
     keys = [row.quantity.key for row in compare_metrics([free]).rows]
     assert "force_peak_n" not in keys
     assert "late_p99_us" not in keys
@@ -176,7 +180,7 @@ def test_rows_without_any_value_are_left_out() -> None:
 
 
 def test_json_has_value_and_reason_per_column() -> None:
-    free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    free = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
     facts = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
     assert facts["columns"] == ["log"]
     for row in facts["rows"]:
@@ -185,8 +189,9 @@ def test_json_has_value_and_reason_per_column() -> None:
 
 def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
     """int (a^2 + b^2 sin^2) dt over whole periods is (a^2 + b^2 / 2) times the time."""
-    a, b = 3.0, 8.0
-    log = pair(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
+    a = 3.0
+    b = 8.0
+    log = make_pair_log(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
     figures = compute_log_metrics(log).sites["m"]
     assert figures["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
     assert figures["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
@@ -196,17 +201,17 @@ def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
 
 def test_saturation_is_the_share_of_limited_ticks() -> None:
     """200 N m is the limit of a scenario that names none; -200 counts as well."""
-    log = pair(lambda _, t_s: {"tau": [0.0, -200.0 if t_s < 1.0 else 199.9]})
+    log = make_pair_log(lambda _, t_s: {"tau": [0.0, -200.0 if t_s < 1.0 else 199.9]})
     assert compute_log_metrics(log).sites["s"]["saturated_share"].value == pytest.approx(0.25)
 
 
 def test_chatter_is_the_mean_step_of_the_torque() -> None:
     """A torque that changes sides every tick, and one that never does."""
-    log = pair(lambda _, t_s: {"tau": [0.5 * (-1.0) ** round(1000.0 * t_s), 3.0]})
+    log = make_pair_log(lambda _, t_s: {"tau": [0.5 * (-1.0) ** round(1000.0 * t_s), 3.0]})
     assert compute_log_metrics(log).sites["m"]["chatter_nm"].value == pytest.approx(
         1.0, rel=1e-12
     )
-    still = pair(lambda _, __: {"tau": [7.0, 3.0]})
+    still = make_pair_log(lambda _, __: {"tau": [7.0, 3.0]})
     assert compute_log_metrics(still).sites["m"]["chatter_nm"].value == 0.0
 
 
@@ -223,7 +228,7 @@ ANCHORED = {
 
 def test_learnt_gravity_is_a_spring_to_pose() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
-    metrics = compute_log_metrics(simulated("paper", ANCHORED))
+    metrics = compute_log_metrics(make_run("paper", ANCHORED).log)
     assert [stiffness.site for stiffness in metrics.stiffness] == ["m1", "m1"]
     second = metrics.stiffness[1]
     assert second.joint == 2
@@ -238,7 +243,7 @@ def test_no_stiffness_is_given_under_changing_shares() -> None:
     """In `training` the shares change and the hands do not: no stiffness is stated, in
     particular not their 200 N m/rad.
     """
-    metrics = compute_log_metrics(simulated("training", {"rate_hz": 50}))
+    metrics = compute_log_metrics(make_run("training", {"rate_hz": 50}).log)
     assert metrics.static_windows.value == 2.0
     assert metrics.stiffness == []
 
@@ -248,7 +253,7 @@ SLOW = {"rate_hz": 50}
 
 def test_the_felt_stiffness_follows_the_shares() -> None:
     """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
-    metrics = compute_log_metrics(simulated("force_sharing", SLOW))
+    metrics = compute_log_metrics(make_run("force_sharing", SLOW).log)
     assert [pair.pushed + pair.holds for pair in metrics.sharing_ratios] == [
         "sm1",
         "sm2",
@@ -271,14 +276,14 @@ def test_the_felt_stiffness_follows_the_shares() -> None:
 def test_three_loaded_sites_balance() -> None:
     """Stiffer sites count less: K_i enters, not the shares alone."""
     settings = {"sites.m1.control.Kp": 60.0, "duration_s": 15.0, **SLOW}
-    metrics = compute_log_metrics(simulated("force_sharing", settings))
+    metrics = compute_log_metrics(make_run("force_sharing", settings).log)
     assert metrics.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
     assert metrics.sharing_ratios[0].off <= 0.01
     assert metrics.joint_loads[0].imbalance.value <= 0.01
 
 
 def test_with_learnt_gravity_no_sharing_is_expected() -> None:
-    metrics = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
+    metrics = compute_log_metrics(make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log)
     assert metrics.sharing_ratios
     for ratio in metrics.sharing_ratios:
         assert ratio.pushed == "s"
@@ -290,7 +295,7 @@ def test_with_learnt_gravity_no_sharing_is_expected() -> None:
 
 
 def test_moving_arms_have_no_force_sharing() -> None:
-    metrics = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
+    metrics = compute_log_metrics(make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log)
     assert metrics.static_windows.value is None
     assert (
         metrics.run["sharing_off"].why
@@ -311,8 +316,9 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
         learnt = [THETA[n] + off[n] + rate[n] * t_s for n in range(3)]
         return {"theta_hat": [*learnt, 7.0, 8.0]}
 
-    measured = compute_log_metrics(pair(motion, seconds=6.0, more=LEARNS))
-    figures_of_slave, learnt = measured.sites["s"], measured.estimates["s"]
+    measured = compute_log_metrics(make_pair_log(motion, seconds=6.0, more=LEARNS))
+    figures_of_slave = measured.sites["s"]
+    learnt = measured.estimates["s"]
     assert figures_of_slave["theta_error_first"].value == pytest.approx(13.0)
     assert figures_of_slave["theta_energy_first_j"].value == pytest.approx(
         0.5 * (9.0 + 16.0 + 144.0 / 2.0)
@@ -327,14 +333,14 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
 
 
 def test_a_law_without_estimates_is_reported() -> None:
-    figure = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
+    figure = compute_log_metrics(make_pair_log(lambda _, __: {})).sites["m"]["theta_error_last"]
     assert figure.value is None
     assert figure.why == "nothing is learnt"
     assert not figure.applies
 
 
 def test_without_truth_estimates_have_no_error() -> None:
-    log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
     changes = {
         "sites.s.plant": "external",
         "sites.s.arm.known": False,

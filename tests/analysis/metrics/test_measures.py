@@ -8,7 +8,7 @@ import pytest
 
 import trilat_net
 from tests import metric_labels
-from tests.dropped_files import look
+from tests.dropped_files import run_in_folder
 from trilat_net.analysis.metrics.log_metrics import find_quantity
 from trilat_net.analysis.metrics.measures import list_measures, measures
 from trilat_net.analysis.run_view import RunView
@@ -46,7 +46,7 @@ print(json.dumps({
 
 def test_an_added_file_is_a_metric_everywhere(tmp_path: Path) -> None:
     (tmp_path / "haste.py").write_text(METRIC)
-    output = look(LOOK, tmp_path)
+    output = run_in_folder(LOOK, tmp_path)
     assert 0.0 < output["json"] < output["compared"][0] == output["compared"][1]
     assert "mean |qd|" in output["text"]
     assert "haste_rad_s" in output["frame"]

@@ -8,13 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from tests.analysis.logs import rewritten
+from tests.analysis.builders import make_pair_log, make_run
+from tests.log.builders import replace_scenario, rewrite_log
 from tests.theory.delay_equations import inertia, regressor, theta_of
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.port_energy import held_work, trapezoid_work
 from trilat_net.scenario.arms import build_arm
-
-from .written import pair, replace_scenario, simulated
 
 
 def test_work_of_springs_is_exact_path_independent() -> None:
@@ -36,7 +35,7 @@ def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
     """1/2 qd'M qd + U grows by the energy of controller and hands; the held torque's work is exact."""
     rests = []
     for rate_hz in (100, 200):
-        log = simulated("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme})
+        log = make_run("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme}).log
         sites = compute_log_metrics(log).sites
         for site in log.sites:
             change = _mechanical(log, site)
@@ -49,16 +48,18 @@ def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
 
 
 def _mechanical(log, site: str):
-    spec, part = log.scenario.sites[site], log[site]
+    spec = log.scenario.sites[site]
+    part = log[site]
     theta = theta_of(spec.arm)
     kinetic = 0.5 * np.einsum("ki,kij,kj->k", part.qd, inertia(theta, part.q), part.qd)
-    q1, q12 = part.q[:, 0], part.q.sum(axis=1)
+    q1 = part.q[:, 0]
+    q12 = part.q.sum(axis=1)
     return kinetic + spec.arm.g_m_s2 * (theta[3] * np.sin(q1) + theta[4] * np.sin(q12))
 
 
 def test_lossless_walls_return_at_most_their_energy() -> None:
     metrics = compute_log_metrics(
-        simulated("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250})
+        make_run("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250}).log
     ).sites["s"]
     assert metrics["walls_j"].value <= 0.0
     assert metrics["walls_most_j"].value <= 1e-6
@@ -68,7 +69,9 @@ def test_lossless_walls_return_at_most_their_energy() -> None:
 
 def test_a_damper_dissipates_by_the_formula() -> None:
     """int B (A w cos w t)^2 dt = B A^2 w^2 / 2 times the time, to second order of the period."""
-    A, w, B = 0.2, 2.0 * math.pi, 4.0
+    A = 0.2
+    w = 2.0 * math.pi
+    B = 4.0
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         qd = A * w * math.cos(w * t_s)
@@ -76,7 +79,7 @@ def test_a_damper_dissipates_by_the_formula() -> None:
         return {"q": [A * math.sin(w * t_s), 0.0], "qd": [qd, 0.0], "tau_x": [push, 0.0]}
 
     more = 'environment = [{ kind = "viscous", damping_nm_s_rad = 4.0 }]'
-    log = pair(motion, more=more)
+    log = make_pair_log(motion, more=more)
     spent = B * A**2 * w**2 / 2.0 * log["s"].t_s[-1]
     figures = compute_log_metrics(log).sites["s"]
     assert figures["walls_j"].value == pytest.approx(-spent, rel=2e-3)
@@ -88,8 +91,8 @@ def test_periods_without_both_records_are_left_out() -> None:
     def motion(_: str, t_s: float) -> dict[str, list[float]]:
         return {"q": [t_s, 0.0], "qd": [1.0, 0.0], "tau": [2.0, 0.0], "tau_x": [0.0, 0.0]}
 
-    whole = pair(motion)
-    torn = rewritten(whole, lambda state: not (state.site == "m" and 100 <= state.tick < 200))
+    whole = make_pair_log(motion)
+    torn = rewrite_log(whole, lambda state: not (state.site == "m" and 100 <= state.tick < 200))
     assert compute_log_metrics(whole).sites["m"]["controller_j"].value == pytest.approx(
         2.0 * 799 / 200
     )
@@ -100,7 +103,7 @@ def test_periods_without_both_records_are_left_out() -> None:
 
 def test_an_unknown_arm_has_no_mechanical_energy() -> None:
     """The energy through the ports is known all the same; an external arm was given tau."""
-    log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
     outside = replace_scenario(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
     outside_figures, before = (
         compute_log_metrics(measured_log).sites["s"] for measured_log in (outside, log)
@@ -119,7 +122,10 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
 
     Arms that move against each other are given energy, arms that move together lose it.
     """
-    A, w, K, delay_s = 0.2, 2.0 * math.pi, 10.0, 0.05
+    A = 0.2
+    w = 2.0 * math.pi
+    K = 10.0
+    delay_s = 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         sign = distance if site == "s" else 1.0
@@ -130,7 +136,7 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
         return {**wave, "tau": [0.0, 0.0], "tau_x": [0.0, 0.0]}
 
     seconds = 10.0
-    figures = compute_log_metrics(pair(motion, seconds=seconds)).links["m->s"]
+    figures = compute_log_metrics(make_pair_log(motion, seconds=seconds)).links["m->s"]
     # until the first sample comes the peer is at its start pose
     begun = 0.5 * w * delay_s / math.pi
     expected = -distance * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
@@ -140,10 +146,12 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
 @pytest.mark.parametrize("law", ["pd_d", "adaptive", "p_d"])
 def test_delay_energy_is_the_ports_excess(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
-    log = simulated("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law})
-    metrics, largest = compute_log_metrics(log), 0.0
+    log = make_run("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law}).log
+    metrics = compute_log_metrics(log)
+    largest = 0.0
     for site in log.sites:
-        part, spec = log[site], log.scenario.sites[site]
+        part = log[site]
+        spec = log.scenario.sites[site]
         shares = log.scenario.dominance[site]
         e, ed = (
             getattr(part, name)
@@ -185,16 +193,18 @@ LAWS = {"pd_d": _pd, "p_d": _pd, "adaptive": _adaptive}
 
 def test_force_reflection_counts_only_late_force() -> None:
     """If the slave meets no wall, no force is late, and the master's law sees nothing of its peer."""
-    calm = simulated("contact", {"duration_s": 3.0, "rate_hz": 200, "sites.s.environment": []})
+    calm = make_run(
+        "contact", {"duration_s": 3.0, "rate_hz": 200, "sites.s.environment": []}
+    ).log
     assert compute_log_metrics(calm).links["s->m"]["delay_j"].value == 0.0
-    pushed = simulated("contact", {"duration_s": 3.0, "rate_hz": 200})
+    pushed = make_run("contact", {"duration_s": 3.0, "rate_hz": 200}).log
     assert compute_log_metrics(pushed).links["s->m"]["delay_most_j"].value > 0.0
 
 
 def test_a_users_own_law_is_not_judged() -> None:
-    log = simulated(
+    log = make_run(
         "free", {"duration_s": 0.2, "rate_hz": 100, "control.law": "tests.laws:Adaptive"}
-    )
+    ).log
     said = compute_log_metrics(log).links["m1->s"]["delay_j"]
     assert said.value is None
     assert "tests.laws:Adaptive does not say which part" in said.why

@@ -5,14 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from tests.analysis.logs import rewritten, simulated
+from tests.analysis.builders import make_pair_log, make_short_log
+from tests.log.builders import rewrite_log
 from trilat_net.analysis.aligned import align_records, find_latest_rows
 from trilat_net.analysis.dominance_history import trace_dominance
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_view import RunView
-
-from .written import pair
 
 RATE_HZ = 200
 
@@ -25,7 +24,7 @@ def test_rms_and_peak_of_a_sinusoid() -> None:
         wave = size * math.sin(2.0 * math.pi * t_s)
         return {"q": [1.0 + wave, 2.0 + 0.5 * wave], "q_des": [1.0, 2.0]}
 
-    sites = compute_log_metrics(pair(motion)).sites
+    sites = compute_log_metrics(make_pair_log(motion)).sites
     assert sites["s"]["rms_error_rad"].value == pytest.approx(0.3 / math.sqrt(2.0), rel=1e-9)
     assert sites["m"]["rms_error_rad"].value == pytest.approx(0.1 / math.sqrt(2.0), rel=1e-9)
     assert sites["s"]["max_error_rad"].value == pytest.approx(0.3, rel=1e-12)
@@ -33,7 +32,9 @@ def test_rms_and_peak_of_a_sinusoid() -> None:
 
 def test_settling_is_the_last_time_above_the_limit() -> None:
     """exp(-t) sinks below 0.01 rad at t = ln 100."""
-    log = pair(lambda _, t_s: {"q": [math.exp(-t_s), 0.0], "q_des": [0.0, 0.0]}, seconds=6.0)
+    log = make_pair_log(
+        lambda _, t_s: {"q": [math.exp(-t_s), 0.0], "q_des": [0.0, 0.0]}, seconds=6.0
+    )
     figures = compute_log_metrics(log).sites["m"]
     assert figures["settle_s"].value == pytest.approx(math.log(100.0), abs=1.0 / RATE_HZ)
     assert figures["max_error_end_rad"].value == pytest.approx(
@@ -42,7 +43,9 @@ def test_settling_is_the_last_time_above_the_limit() -> None:
 
 
 def test_an_unsettled_run_is_reported() -> None:
-    metrics = compute_log_metrics(pair(lambda _, __: {"q": [0.5, 0.0], "q_des": [0.0, 0.0]}))
+    metrics = compute_log_metrics(
+        make_pair_log(lambda _, __: {"q": [0.5, 0.0], "q_des": [0.0, 0.0]})
+    )
     settled = metrics.sites["m"]["settle_s"]
     assert settled.value is None
     assert "exceeds 0.01 rad" in settled.why
@@ -50,13 +53,14 @@ def test_an_unsettled_run_is_reported() -> None:
 
 def test_following_allows_for_delay_unlike_spread() -> None:
     """A slave that is exactly its master's past: q_m(t - T) - q_s is zero, and the spread is v T."""
-    speed, delay_s = 0.4, 0.05
+    speed = 0.4
+    delay_s = 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         past = t_s if site == "m" else max(0.0, t_s - delay_s)
         return {"q": [speed * past, -0.5 * speed * past]}
 
-    metrics = compute_log_metrics(pair(motion))
+    metrics = compute_log_metrics(make_pair_log(motion))
     assert metrics.links["m->s"]["following_max_rad"].value == pytest.approx(0.0, abs=1e-12)
     assert metrics.run["spread_max_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
     assert metrics.run["spread_end_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
@@ -66,14 +70,15 @@ def test_following_allows_for_delay_unlike_spread() -> None:
 
 def test_undelayed_error_includes_what_the_delay_costs() -> None:
     """A slave at q_m(t - T), with q_m = v t, has e = 0 and the undelayed error v T, as its master has."""
-    speed, delay_s = 0.4, 0.05
+    speed = 0.4
+    delay_s = 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         past = t_s if site == "m" else max(0.0, t_s - delay_s)
         angles = [speed * past, -0.5 * speed * past]
         return {"q": angles, "q_des": angles}
 
-    sites = compute_log_metrics(pair(motion)).sites
+    sites = compute_log_metrics(make_pair_log(motion)).sites
     assert sites["s"]["max_error_rad"].value == 0.0
     for site in ("m", "s"):
         assert sites[site]["undelayed_max_rad"].value == pytest.approx(
@@ -87,7 +92,7 @@ def test_undelayed_error_includes_what_the_delay_costs() -> None:
 
 def test_undelayed_error_weighs_peers_by_dominance() -> None:
     """During a handover, the slave's undelayed error is q_s - sum_j alpha_sj(t) q_j, at every tick."""
-    log = simulated("handover")
+    log = make_short_log("handover")
     sites = compute_log_metrics(log).sites
     alpha = trace_dominance(log, "s", log["s"].t_s).alpha
     peers = log.scenario.peers("s")
@@ -103,8 +108,8 @@ def test_undelayed_error_keeps_to_common_times() -> None:
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         return {"q": [-t_s if site == "s" else 0.0, 0.0]}
 
-    short = RunView(pair(motion, seconds=1.0))
-    long = RunView(pair(motion, seconds=2.0))
+    short = RunView(make_pair_log(motion, seconds=1.0))
+    long = RunView(make_pair_log(motion, seconds=2.0))
     end_s = short.sites["s"].records.t_s[-1]
     for view, other, error_rad in ((long, short, end_s), (short, long, end_s)):
         metrics = measure_undelayed_error(view, "s", other)
@@ -120,7 +125,7 @@ def test_following_uses_the_delay_in_use() -> None:
         used = {"m": max(-1, tick - 37)} if site == "s" else {"s": max(-1, tick - 10)}
         return {"q": [t_s, 0.0], "used": used}
 
-    figures = compute_log_metrics(pair(motion)).links["m->s"]
+    figures = compute_log_metrics(make_pair_log(motion)).links["m->s"]
     assert figures["following_rms_rad"].value == pytest.approx(37 / RATE_HZ, rel=1e-9)
     assert figures["age_mean_ms"].value == pytest.approx(37 / RATE_HZ * 1e3, rel=1e-9)
 
@@ -130,14 +135,14 @@ def test_instants_with_a_missing_record_do_not_count() -> None:
         error_rad = 5.0 if site == "s" and 1.0 <= t_s < 1.5 else 0.25
         return {"q": [error_rad if site == "s" else 0.0, 0.0]}
 
-    whole = pair(motion)
-    torn = rewritten(whole, lambda state: not (state.site == "m" and 200 <= state.tick < 300))
+    whole = make_pair_log(motion)
+    torn = rewrite_log(whole, lambda state: not (state.site == "m" and 200 <= state.tick < 300))
     assert compute_log_metrics(whole).run["spread_max_rad"].value == 5.0
     assert compute_log_metrics(torn).run["spread_max_rad"].value == 0.25
 
 
 def test_the_latest_record_is_the_last_tick() -> None:
-    track = align_records(pair(lambda _, __: {}))["m"]
+    track = align_records(make_pair_log(lambda _, __: {}))["m"]
     row, exists = find_latest_rows(track, np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
     assert row.tolist() == [0, 0, 1, 799, 799, 0]
     assert exists.tolist() == [True, True, True, True, False, False]

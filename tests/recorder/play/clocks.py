@@ -9,7 +9,8 @@ class LookedAt:
     """
 
     def __init__(self, start_ns: int = 1_000_000_000, oversleep_ns: int = 0) -> None:
-        self.now_ns, self.oversleep_ns = start_ns, oversleep_ns
+        self.now_ns = start_ns
+        self.oversleep_ns = oversleep_ns
 
     def monotonic_ns(self) -> int:
         self.now_ns += 1_000

@@ -1,4 +1,4 @@
-"""The content of a log, by an independent reader; and logs whose messages are placed by a test."""
+"""The content of a log, read by an independent reader, and logs of events at prescribed times."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +19,7 @@ BOOT = 7
 EPOCH_UNIX_NS = 1_700_000_000_000_000_000
 
 
-def payloads(path: Path) -> dict[str, list[bytes]]:
+def read_payloads(path: Path) -> dict[str, list[bytes]]:
     """Returns every payload of a finished file by topic, in file order, read by the `mcap` package."""
     payloads_by_topic: dict[str, list[bytes]] = {}
     with path.open("rb") as stream:
@@ -28,20 +28,20 @@ def payloads(path: Path) -> dict[str, list[bytes]]:
     return payloads_by_topic
 
 
-def session_payloads(path: Path) -> dict[str, list[bytes]]:
+def read_session_payloads(path: Path) -> dict[str, list[bytes]]:
     """Returns the same for the messages of sites: by member and channel, as in "m1/state"."""
     return {
         "/".join(topic.split("/")[3:]): payload_list
-        for topic, payload_list in payloads(path).items()
+        for topic, payload_list in read_payloads(path).items()
         if topic.startswith("/trilat/") and "/recorder/" not in topic
     }
 
 
-def event(site: str, n: int) -> bytes:
+def encode_event(site: str, n: int) -> bytes:
     return encode(Event(member=site, boot=BOOT, kind="mode", text=f"{site} {n}", n=n))
 
 
-def write(
+def write_event_log(
     path: Path, messages: Iterable[tuple[str, int, int, int]], session: str = "paper"
 ) -> Path:
     """Writes a log of events.
@@ -58,12 +58,12 @@ def write(
         for site, n, sent_ms, came_ms in messages:
             key = topics.key(session, site, topics.EVENT)
             came_ns = EPOCH_UNIX_NS + came_ms * 1_000_000
-            writer.add(key, event(site, n), sent_ms * 1_000_000, came_ns, n)
+            writer.add(key, encode_event(site, n), sent_ms * 1_000_000, came_ns, n)
         writer.finish({})
     return path
 
 
-def loaded(*paths: Path, **selection: Any) -> tuple[SessionHeader, MessageBatch]:
+def preload_paths(*paths: Path, **selection: Any) -> tuple[SessionHeader, MessageBatch]:
     header, batch = preload_messages(paths, PlaySelection(**selection), 1 << 28)
     assert batch is not None
     return header, batch

@@ -17,19 +17,19 @@ messages = st.lists(
 Messages = list[tuple[int, int, int, bytes]]
 
 
-def gathered(given: Messages, kept: MessageBatch | None = None) -> BatchBuilder:
+def gather_messages(messages_in: Messages, kept: MessageBatch | None = None) -> BatchBuilder:
     gathering = BatchBuilder(kept)
-    for message in given:
+    for message in messages_in:
         gathering.add(*message)
     return gathering
 
 
 @given(messages)
-def test_payloads_stay_with_channel_and_number(given: Messages) -> None:
+def test_payloads_stay_with_channel_and_number(messages_in: Messages) -> None:
     """Duplicates, as in two parts of one session, appear once."""
-    block = gathered(given).ordered()
+    block = gather_messages(messages_in).ordered()
     assert sorted(message[1:] for message in block.messages()) == sorted(
-        {message[1:] for message in given}
+        {message[1:] for message in messages_in}
     )
     assert [block.payload(n) for n in range(len(block))] == [
         message[3] for message in block.messages()
@@ -37,8 +37,8 @@ def test_payloads_stay_with_channel_and_number(given: Messages) -> None:
 
 
 @given(messages, st.integers(1, 7))
-def test_pieces_and_own_bytes_are_the_whole(given: Messages, size: int) -> None:
-    block = gathered(given).ordered()
+def test_pieces_and_own_bytes_are_the_whole(messages_in: Messages, size: int) -> None:
+    block = gather_messages(messages_in).ordered()
     whole = list(block.messages())
     pieces = list(block.pieces(size))
     assert all(len(piece) and len(piece.compact().data) <= size + 9 for piece in pieces)
@@ -47,11 +47,17 @@ def test_pieces_and_own_bytes_are_the_whole(given: Messages, size: int) -> None:
 
 
 @given(messages, messages)
-def test_ordered_messages_may_be_ordered_again_with_more(one: Messages, two: Messages) -> None:
-    """For messages whose numbers ascend in the file, as in a complete log."""
+def test_ordered_messages_may_be_ordered_again_with_more(
+    first: Messages, two: Messages
+) -> None:
+    """The numbers of the messages ascend in the file, as in a complete log."""
     rising = [
         (t_ns, channel, n, payload + b".")
-        for n, (t_ns, channel, _, payload) in enumerate(one + two)
+        for n, (t_ns, channel, _, payload) in enumerate(first + two)
     ]
-    again = gathered(rising[len(one) :], gathered(rising[: len(one)]).ordered())
-    assert list(again.ordered().messages()) == list(gathered(rising).ordered().messages())
+    again = gather_messages(
+        rising[len(first) :], gather_messages(rising[: len(first)]).ordered()
+    )
+    assert list(again.ordered().messages()) == list(
+        gather_messages(rising).ordered().messages()
+    )

@@ -10,22 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.waiting import until
+from tests.recorder.play.logs import preload_paths, write_event_log
 from trilat_net.app.play.batch import BatchBuilder, MessageBatch, PlayedMessage
 from trilat_net.app.play.message_source import MessageSource, feed_player, sort_messages
 from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from trilat_net.errors import LogError, RuntimeFault
 
-from .logs import loaded, write
 
-
-def whole(messages: list[PlayedMessage]) -> list[PlayedMessage]:
+def check_whole(messages: list[PlayedMessage]) -> list[PlayedMessage]:
     gathering = BatchBuilder()
     for message in messages:
         gathering.add(*message)
     return list(gathering.ordered().messages())
 
 
-def joined(blocks: list[MessageBatch]) -> list[PlayedMessage]:
+def join_blocks(blocks: list[MessageBatch]) -> list[PlayedMessage]:
     return [message for block in blocks for message in block.messages()]
 
 
@@ -33,7 +32,7 @@ def sorted_in(
     messages: list[PlayedMessage], *how: int, **limits: int
 ) -> tuple[list[PlayedMessage], int]:
     sorted_messages = list(sort_messages(messages, *how, **limits))
-    return joined([batch for batch, _ in sorted_messages]), sum(
+    return join_blocks([batch for batch, _ in sorted_messages]), sum(
         strays for _, strays in sorted_messages
     )
 
@@ -48,14 +47,15 @@ def test_messages_within_the_horizon_are_put_in_order(
     steps: list[tuple[int, int, int]], step_ns: int
 ) -> None:
     """Messages come up to 30 ns late in the file; a channel's times ascend with its numbers."""
-    t_ns, made = 0, [0, 0, 0]
+    t_ns = 0
+    numbers = [0, 0, 0]
     sent = []
     for step, channel, delay in steps:
         t_ns += step
-        sent.append((t_ns + delay, (t_ns, channel, made[channel], bytes([len(sent)]))))
-        made[channel] += 1
+        sent.append((t_ns + delay, (t_ns, channel, numbers[channel], bytes([len(sent)]))))
+        numbers[channel] += 1
     messages = [message for _, message in sorted(sent, key=lambda entry: entry[0])]
-    assert sorted_in(messages, 30, step_ns) == (whole(messages), 0)
+    assert sorted_in(messages, 30, step_ns) == (check_whole(messages), 0)
 
 
 def test_distant_messages_are_played_and_counted() -> None:
@@ -71,16 +71,15 @@ def test_times_before_the_epoch_are_too_far() -> None:
 
 def test_messages_beyond_the_memory_limit_are_given_early() -> None:
     """A file in which all messages have one time."""
-    given = [(0, 0, n, bytes(100)) for n in range(1000)]
-    assert sorted_in(given, limit_bytes=20_000) == (given, 0)
+    many = [(0, 0, n, bytes(100)) for n in range(1000)]
+    assert sorted_in(many, limit_bytes=20_000) == (many, 0)
     assert (
-        max(len(batch) for batch, _ in sort_messages(given, limit_bytes=20_000))
-        <= 20_000 // 100
+        max(len(batch) for batch, _ in sort_messages(many, limit_bytes=20_000)) <= 20_000 // 100
     )
 
 
 @contextmanager
-def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionHeader]]:
+def open_source(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionHeader]]:
     header, _ = preload_messages([path], PlaySelection(), 0)
     with closing(MessageSource(header, None)) as source:
         source.start_reader([path], PlaySelection(), loop=loop)
@@ -101,21 +100,21 @@ def read_batches(source: MessageSource) -> list[MessageBatch]:
     return blocks
 
 
-def rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
+def iterate_rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
     for _ in range(count):
-        yield joined(read_batches(source))
+        yield join_blocks(read_batches(source))
         source.restart()
 
 
 def test_reading_processes_give_the_same_rounds(log_file: Path) -> None:
-    preloaded, block = loaded(log_file)
-    with reading(log_file, loop=True) as (source, header):
-        assert list(rounds(source, 3)) == [list(block.messages())] * 3
+    preloaded, block = preload_paths(log_file)
+    with open_source(log_file, loop=True) as (source, header):
+        assert list(iterate_rounds(source, 3)) == [list(block.messages())] * 3
         assert header.topics == preloaded.topics
         assert (source.strays, header.torn) == (0, {})
 
 
-def _killed(source: MessageSource, _path: Path) -> None:
+def _kill_source(source: MessageSource, _path: Path) -> None:
     assert source._process is not None
     source._process.kill()
 
@@ -124,7 +123,7 @@ def _killed(source: MessageSource, _path: Path) -> None:
     ("happens", "error", "says"),
     [
         (lambda _, path: path.unlink(), LogError, r"run\.mcap: cannot be read"),
-        (_killed, RuntimeFault, "the process that reads the log ended with exit code -9"),
+        (_kill_source, RuntimeFault, "the process that reads the log ended with exit code -9"),
     ],
 )
 def test_unreadable_messages_are_errors_here(
@@ -133,13 +132,13 @@ def test_unreadable_messages_are_errors_here(
     says: str,
     tmp_path: Path,
 ) -> None:
-    path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
+    path = write_event_log(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
     header, _ = preload_messages([path], PlaySelection(), 0)
     with closing(MessageSource(header, None)) as source:
         source.start_reader([path], PlaySelection(), loop=True)
         happens(source, path)
         with pytest.raises(error, match=says):
-            list(rounds(source, 1000))
+            list(iterate_rounds(source, 1000))
 
 
 def test_processes_without_player_end_alone(log_file: Path) -> None:

@@ -25,8 +25,8 @@ paces = st.builds(Pace, st.integers(0, 10**15), times, rates)
 
 
 @given(paces, times, times)
-def test_later_messages_are_never_due_earlier(pace: Pace, one: int, other: int) -> None:
-    assert (pace.due_ns(min(one, other))) <= pace.due_ns(max(one, other))
+def test_later_messages_are_never_due_earlier(pace: Pace, first: int, other: int) -> None:
+    assert (pace.due_ns(min(first, other))) <= pace.due_ns(max(first, other))
 
 
 @given(paces, times)

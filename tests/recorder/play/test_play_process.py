@@ -12,6 +12,7 @@ import pytest
 from tests.net.local_bus import LocalNetwork
 from tests.net.parties import answer_info
 from tests.net.waiting import drained
+from tests.recorder.play.logs import read_session_payloads, write_event_log
 from trilat_net.app.play.message_source import MessageSource
 from trilat_net.app.play.play_process import (
     LINGER_NS,
@@ -35,7 +36,6 @@ from trilat_net.net.session import SessionJoin
 from trilat_net.net.wire import decode, encode
 
 from .clocks import LookedAt
-from .logs import session_payloads, write
 
 SESSION = "replay-paper"
 RECORDER_BOOT = 99
@@ -123,7 +123,7 @@ class Scribe:
 def test_payloads_come_in_order_of_their_channel(log_file: Path) -> None:
     hall = Hall(log_file)
     outcome = hall.play()
-    assert hall.heard == session_payloads(log_file)
+    assert hall.heard == read_session_payloads(log_file)
     assert outcome.counts == {
         f"/trilat/paper/{key}": len(payload_list) for key, payload_list in hall.heard.items()
     }
@@ -203,7 +203,7 @@ def test_the_past_is_given_as_far_as_played(log_file: Path) -> None:
 
     hall.acts = {200: ask}
     outcome = hall.play()
-    published = session_payloads(log_file)
+    published = read_session_payloads(log_file)
     early, later, unplayed, links = (
         decode(drained(ring)[0][1], Backfill) for ring in rings[:4]
     )
@@ -221,7 +221,7 @@ def test_the_past_is_given_as_far_as_played(log_file: Path) -> None:
 
 
 def test_joining_recorders_learn_tick_0(log_file: Path) -> None:
-    """By the code of the recorder's own way into a session."""
+    """The recorder joins by its own code."""
     hall = Hall(log_file)
     bus = hall.network.join()
     info = answer_info(topics.RECORDER, RECORDER_BOOT)
@@ -265,7 +265,7 @@ def test_logs_play_under_their_own_name(log_file: Path) -> None:
     hall.play()
     wanted = {
         key: payload_list
-        for key, payload_list in session_payloads(log_file).items()
+        for key, payload_list in read_session_payloads(log_file).items()
         if not key.endswith("link")
     }
     assert hall.heard == wanted
@@ -281,7 +281,9 @@ def test_replays_end_in_order_on_request(log_file: Path) -> None:
 
 
 def test_progress_is_shown_twice_a_second(tmp_path: Path) -> None:
-    hall = Hall(write(tmp_path / "run.mcap", [("m1", n, 100 * n, 100 * n) for n in range(31)]))
+    hall = Hall(
+        write_event_log(tmp_path / "run.mcap", [("m1", n, 100 * n, 100 * n) for n in range(31)])
+    )
     hall.play()
     positions = [progress.position_ns for progress in hall.shown]
     assert positions == sorted(positions)
@@ -289,8 +291,10 @@ def test_progress_is_shown_twice_a_second(tmp_path: Path) -> None:
 
 
 def test_existing_sessions_are_refused() -> None:
-    network, clock = LocalNetwork(), LookedAt()
-    visitor, playing = network.join(), network.join()
+    network = LocalNetwork()
+    clock = LookedAt()
+    visitor = network.join()
+    playing = network.join()
     playing.respond(
         topics.key("other", "m1", topics.INFO),
         lambda _: encode(answer_info("m1", RECORDER_BOOT)),

@@ -28,9 +28,9 @@ MS = 1_000_000
 messages = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 2)), min_size=1, max_size=60)
 
 
-def block(given: Iterable[tuple[int, int]]) -> MessageBatch:
+def make_block(messages_in: Iterable[tuple[int, int]]) -> MessageBatch:
     gathering = BatchBuilder()
-    for number, (t_ms, channel) in enumerate(sorted(given)):
+    for number, (t_ms, channel) in enumerate(sorted(messages_in)):
         gathering.add(t_ms * MS, channel, number, bytes([number]))
     return gathering.ordered()
 
@@ -38,14 +38,15 @@ def block(given: Iterable[tuple[int, int]]) -> MessageBatch:
 HEADER = SessionHeader("s", load_scenario("paper"), "", "", 0)
 
 
-def given_at_once(given: Iterable[tuple[int, int]]) -> MessageSource:
-    return MessageSource(HEADER, block(given))
+def make_source(messages_in: Iterable[tuple[int, int]]) -> MessageSource:
+    return MessageSource(HEADER, make_block(messages_in))
 
 
 class Trickle:
     """A source that gives its messages in pieces, and sometimes nothing between two pieces."""
 
-    whole, strays = False, 0
+    whole = False
+    strays = 0
 
     def __init__(self, blocks: list[MessageBatch | None]) -> None:
         self._blocks = blocks
@@ -63,7 +64,8 @@ class Trickle:
         return False
 
     def restart(self) -> None:
-        self._left, self.ended = iter(self._blocks), False
+        self._left = iter(self._blocks)
+        self.ended = False
 
     def close(self) -> None:
         pass
@@ -103,14 +105,14 @@ class Stage:
 
 @pytest.mark.parametrize("low_cpu", [False, True])
 @given(
-    given=messages,
+    messages_in=messages,
     rate=st.sampled_from([0.5, 1.0, 4.0, math.inf]),
     cuts=st.lists(st.integers(0, 60)),
 )
 def test_messages_are_published_once_at_their_deadlines(
-    given: list[tuple[int, int]], rate: float, cuts: list[int], low_cpu: bool
+    messages_in: list[tuple[int, int]], rate: float, cuts: list[int], low_cpu: bool
 ) -> None:
-    whole = block(given)
+    whole = make_block(messages_in)
     edges = sorted({0, len(whole), *(cut for cut in cuts if cut < len(whole))})
     pieces: list[MessageBatch | None] = []
     for begin, end in pairwise(edges):
@@ -121,7 +123,7 @@ def test_messages_are_published_once_at_their_deadlines(
         assert first_ns == whole.times_ns[0]
         pace = Pace(stage.clock.now_ns + 50 * MS, first_ns, rate)
         stage.player.play(pace)
-        assert [number for _, _, number in stage.heard] == list(range(len(given)))
+        assert [number for _, _, number in stage.heard] == list(range(len(messages_in)))
         assert [channel for _, channel, _ in stage.heard] == whole.channels.tolist()
         for (heard_ns, _, _), t_ns in zip(stage.heard, whole.times_ns.tolist(), strict=True):
             assert heard_ns >= pace.due_ns(t_ns)
@@ -129,13 +131,13 @@ def test_messages_are_published_once_at_their_deadlines(
                 assert heard_ns <= pace.due_ns(t_ns) + (
                     len(pieces) * MS if isinstance(source, Trickle) else 10**5
                 )
-        assert sum(stage.player.counts) == len(given)
+        assert sum(stage.player.counts) == len(messages_in)
         assert stage.memory.next_numbers == {c: n + 1 for _, c, n in stage.heard}
 
 
 def test_late_messages_delay_no_later_ones() -> None:
     """A publisher that waits for 30 ms: messages due meanwhile follow at once, all others are in time."""
-    stage = Stage(given_at_once((t, 0) for t in range(60)))
+    stage = Stage(make_source((t, 0) for t in range(60)))
     stage.stall_ns[10] = 30 * MS
     pace = stage.play()
     late_ms = [round((ns - pace.due_ns(n * MS)) / MS) for ns, _, n in stage.heard]
@@ -146,14 +148,14 @@ def test_late_messages_delay_no_later_ones() -> None:
 
 
 def test_publishers_waiting_for_seconds_are_counted() -> None:
-    stage = Stage(given_at_once([(0, 0), (1, 0)]))
+    stage = Stage(make_source([(0, 0), (1, 0)]))
     stage.stall_ns[1] = CUT_NS
     stage.play()
     assert stage.player.stalls == 1
 
 
 def test_rounds_have_the_same_messages() -> None:
-    stage = Stage(given_at_once([(0, 0), (5, 1), (7, 0)]), stop_at=7)
+    stage = Stage(make_source([(0, 0), (5, 1), (7, 0)]), stop_at=7)
     pace = stage.play(later_ns=MS, loop=True)
     assert [n for _, _, n in stage.heard] == [0, 1, 2, 0, 1, 2, 0]
     assert stage.player.rounds == 3
@@ -167,15 +169,15 @@ def test_rounds_have_the_same_messages() -> None:
 
 @pytest.mark.parametrize("count", [1, 5, 300])
 def test_players_stop_on_request(count: int) -> None:
-    """Between two messages, and no later than the next check."""
-    stage = Stage(given_at_once((t % 60, 0) for t in range(250)), stop_at=count)
+    """A player stops between two messages, at its next check."""
+    stage = Stage(make_source((t % 60, 0) for t in range(250)), stop_at=count)
     stage.play()
     assert count <= len(stage.heard) <= count + 10 or len(stage.heard) == 250
 
 
 def test_other_tasks_run_without_spare_time() -> None:
-    """At the highest rate: a hundred times a second; and in idle times: a thousand times."""
-    stage = Stage(given_at_once((0, 0) for _ in range(200)))
+    """Other tasks run a hundred times a second at the highest rate, and a thousand times in idle periods."""
+    stage = Stage(make_source((0, 0) for _ in range(200)))
     for n in range(200):
         stage.stall_ns[n] = MS
     stage.play(math.inf)
@@ -184,7 +186,7 @@ def test_other_tasks_run_without_spare_time() -> None:
     assert (
         max(later - earlier for earlier, later in pairwise(looked)) <= SERVICE_EVERY_NS + 2 * MS
     )
-    quiet = Stage(given_at_once([(0, 0), (60, 0)]))
+    quiet = Stage(make_source([(0, 0), (60, 0)]))
     quiet.play()
     assert len(quiet.looks) >= 40
     assert [progress.published for _, progress in quiet.looks][-1] == 1

@@ -8,10 +8,11 @@ from trilat_net.app.play.batch import BatchBuilder
 from trilat_net.app.play.site_stand_ins import PlayedHistory
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES
 
-CHANNEL, OTHER = 3, 4
+CHANNEL = 3
+OTHER = 4
 
 
-def remembered(
+def make_history(
     numbers: list[int], played: int, size: int = 1, kept_ns: int | None = None
 ) -> PlayedHistory:
     memory = PlayedHistory(kept_ns)
@@ -26,7 +27,7 @@ def remembered(
     return memory
 
 
-def naive(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
+def answer_naively(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
     """Returns messages from the first number there is, one after the other, until a gap."""
     next_number = numbers[-1] + 1 if numbers else 0
     if first >= next_number:
@@ -50,9 +51,9 @@ def test_answers_go_up_to_the_next_gap(
     numbers: list[int], data: st.DataObject, first: int, more: int
 ) -> None:
     played = data.draw(st.integers(0, len(numbers)))
-    memory = remembered(numbers, played)
+    memory = make_history(numbers, played)
     told_first, payloads = memory.find_messages(CHANNEL, first, first + more)
-    assert (told_first, [int.from_bytes(p, "big") for p in payloads]) == naive(
+    assert (told_first, [int.from_bytes(p, "big") for p in payloads]) == answer_naively(
         numbers[:played], first, first + more
     )
 
@@ -65,27 +66,27 @@ def test_without_gaps_answers_equal_a_sites(
     ring = ChannelBuffer(200, 400_000)
     for number in range(count):
         ring.store(number.to_bytes(2, "big") * size)
-    memory = remembered(list(range(count)), count, size)
+    memory = make_history(list(range(count)), count, size)
     messages = memory.find_messages(CHANNEL, first, first + more)
     assert messages == ring.read_chunk(first, first + more)
     assert sum(map(len, messages[1])) <= BACKFILL_BYTES
 
 
 def test_unplayed_messages_are_not_sent() -> None:
-    memory = remembered(list(range(30)), 10)
+    memory = make_history(list(range(30)), 10)
     assert len(memory.find_messages(CHANNEL, 0, 29)[1]) == 10
     assert memory.find_messages(CHANNEL, 10, 29) == (10, [])
 
 
 def test_forgotten_messages_are_missing() -> None:
-    memory = remembered(list(range(200)), 200, kept_ns=50)
+    memory = make_history(list(range(200)), 200, kept_ns=50)
     first, payloads = memory.find_messages(CHANNEL, 0, 199)
     assert 130 <= first <= 150
     assert int.from_bytes(payloads[0], "big") == first
 
 
 def test_forgetting_removes_everything_before() -> None:
-    memory = remembered(list(range(30)), 30)
+    memory = make_history(list(range(30)), 30)
     memory.clear()
     assert memory.find_messages(CHANNEL, 3, 9) == (30, [])
     assert memory.find_messages(CHANNEL, 40, 50) == (40, [])

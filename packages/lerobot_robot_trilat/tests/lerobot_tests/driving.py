@@ -13,7 +13,8 @@ from trilat_net.log.log_reader import Log
 
 from .lerobot_stub import make_device
 
-ROBOT, TELEOPERATOR = "lerobot_robot_trilat", "lerobot_teleoperator_trilat"
+ROBOT = "lerobot_robot_trilat"
+TELEOPERATOR = "lerobot_teleoperator_trilat"
 
 
 def drive(
@@ -24,7 +25,8 @@ def drive(
     teleoperator = make_device(plugins[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
     robot.connect()
     teleoperator.connect()
-    first, before = robot.get_observation(), teleoperator.get_teleop_events()
+    first = robot.get_observation()
+    before = teleoperator.get_teleop_events()
     goal = {"x.pos": first["x.pos"] + 0.1, "y.pos": first["y.pos"]}
     for n in range(60):
         assert robot.send_action(goal) == goal
@@ -52,9 +54,13 @@ def drive(
 
 
 def assert_taken_over(seen: dict[str, Any], log: Log) -> None:
-    intervenes = {key.value: (seen["before"][key], seen["after"][key]) for key in seen["after"]}
-    assert intervenes["is_intervention"] == (False, True)
-    assert intervenes["terminate_episode"] == (False, False)
+    """Asserts that the person's arm leads after the takeover, and that the policy's arm is held."""
+    before = {key.value: value for key, value in seen["before"].items()}
+    after = {key.value: value for key, value in seen["after"].items()}
+    assert not before["is_intervention"]
+    assert after["is_intervention"]
+    assert not before["terminate_episode"]
+    assert not after["terminate_episode"]
     assert list(seen["observed"]) == list(seen["features"])
     assert seen["felt"] < -0.1  # the arm hangs back from where the policy pulls it
     assert seen["observed"]["x.pos"] > seen["first"]["x.pos"] + 0.02

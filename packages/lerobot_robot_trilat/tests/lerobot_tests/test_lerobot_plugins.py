@@ -1,6 +1,7 @@
 """A policy and a person in one session, through the interfaces of LeRobot."""
 
 import json
+import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ import pytest
 
 import trilat_net
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reached
+from tests.sites.sessions import SESSION, Session, reach_session
 from trilat_net.app.running_session import open_hand
 from trilat_net.errors import UsageError
 from trilat_net.log.log_reader import Log
@@ -48,15 +49,11 @@ def test_lerobot_finds_a_plugin_by_its_distribution_name(
 
 
 def test_plugins_import_the_interface_alone() -> None:
-    for path in (folder / f"{folder.name}.py" for folder in PLUGINS):
-        lines = [
-            line
-            for line in path.read_text(encoding="utf-8").splitlines()
-            if "trilat_net" in line
-        ]
-        assert [line for line in lines if line.startswith(("import", "from"))] == [
-            "import trilat_net as tn"
-        ]
+    """The one import of each plugin from this program is that of its interface."""
+    for folder in PLUGINS:
+        lines = (folder / f"{folder.name}.py").read_text(encoding="utf-8").splitlines()
+        imports = [line for line in lines if re.match(r"(import|from) .*trilat_net", line)]
+        assert imports == ["import trilat_net as tn"]
 
 
 def test_features_follow_from_the_scenario_before_any_connection(
@@ -121,10 +118,10 @@ def test_a_dataset_has_the_actions_the_plugin_accepts(
     log = trilat_net.simulate(scenario)
     trilat_net.export(log, "lerobot", tmp_path / "set", actions=actions, fps=100)
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text(encoding="utf-8"))
-    about = json.loads((tmp_path / "set" / "about.json").read_text(encoding="utf-8"))
+    origin = json.loads((tmp_path / "set" / "about.json").read_text(encoding="utf-8"))
     assert info["features"]["action"]["names"] == list(features)
     assert info["features"][f"action.{site}"]["shape"] == [len(features)]
-    assert about["actions"] == actions
+    assert origin["actions"] == actions
     frames = pl.read_parquet(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
     q = log[site].q[:: log[site].rate_hz // 100].tolist()
     hand_goal = scenario.arms[site].end_effector if actions == "tip" else tuple
@@ -162,11 +159,10 @@ def test_a_dataset_has_the_observations_of_the_plugin(
 def test_a_policy_gets_both_states_at_its_rate(
     found_plugins: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The names are the dataset's, the numbers the robot's in its own order, and actions go by
-    their keys.
-    """
+    """A policy gets the numbers in the order of the features, and its actions get their names."""
     now_s = 0.0
-    sent, request_times_s = list[Any](), list[float]()
+    actions: list[Any] = []
+    request_times_s: list[float] = []
 
     def sleep(time_s: float) -> None:
         nonlocal now_s
@@ -186,11 +182,11 @@ def test_a_policy_gets_both_states_at_its_rate(
         get_observation=lambda: {"b": 2, "a": 1},
         observation_features={"a": float, "b": float},
         action_features={"x.pos": float, "y.pos": float},
-        send_action=sent.append,
+        send_action=actions.append,
     )
     assert found_plugins[ROBOT].run_policy(robot, decide, 0.5, 10) == 5
     assert request_times_s == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
-    assert sent == 5 * [{"x.pos": 3.0, "y.pos": 4.0}]
+    assert actions == 5 * [{"x.pos": 3.0, "y.pos": 4.0}]
 
 
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
@@ -206,7 +202,8 @@ def test_a_person_takes_over_from_a_policy(
     found_plugins: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = load_scenario("play", {"duration_s": 4.0, "rate_hz": 200})
-    session, seen = Session.whole(scenario, tmp_path), dict[str, Any]()
+    session = Session.whole(scenario, tmp_path)
+    seen: dict[str, Any] = {}
 
     def act(bus: Bus, clock: RelayClock) -> None:
         def wait_s(time_s: float) -> None:
@@ -219,12 +216,12 @@ def test_a_person_takes_over_from_a_policy(
 
         monkeypatch.setattr(trilat_net, "hand", hold, raising=False)
         monkeypatch.setattr(
-            trilat_net, "session", lambda *_, **__: reached(bus, clock), raising=False
+            trilat_net, "session", lambda *_, **__: reach_session(bus, clock), raising=False
         )
         relayed = SimpleNamespace(sleep=wait_s, monotonic=lambda: 1e-9 * clock.monotonic_ns())
         monkeypatch.setattr(found_plugins[ROBOT], "time", relayed)
         wait_s(1.0)
-        seen.update(drive(found_plugins, reached(bus, clock), wait_s))
+        seen.update(drive(found_plugins, reach_session(bus, clock), wait_s))
 
     session.stranger(act)
     log = session.run()
@@ -243,7 +240,7 @@ def assert_observed(observed: dict[str, float], log: Log, folder: Path) -> None:
     for part in (np.array(slave), ~np.array(slave)):
         distance = np.abs(state[:, part] - seen[part]).max(axis=1)
         assert distance.min() < 1e-5
-    about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
-    assert about["program"] == about["sessions"][0]["plugin_site"] == "m2"
+    origin = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+    assert origin["program"] == origin["sessions"][0]["plugin_site"] == "m2"
     assert frames["intervention"].any()
     assert not frames["intervention"].all()

@@ -14,7 +14,7 @@ from trilat_people.devices.haply_inverse3 import SILENCE_S
 from tests.documentation import find_blocks
 from tests.sites.devices import ZERO, ScriptedDevice
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import Session, reached
+from tests.sites.sessions import Session, reach_session
 from trilat_net.app.input_device import DeviceState
 from trilat_net.core.life.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
@@ -30,8 +30,14 @@ SETTLED = 20
 """Ticks from taking hold of an arm, which moves, until its target rests where the arm was seen."""
 
 
-class Led:
-    """A session in which a device leads m1: its log, the device, and the printed texts."""
+class DeviceSession:
+    """A session in which a device leads m1.
+
+    Attributes:
+        log: The log of the session.
+        device: The device.
+        said: The printed texts.
+    """
 
     def __init__(
         self,
@@ -51,49 +57,48 @@ class Led:
 
         def act(bus: Bus, clock: RelayClock) -> None:
             self.device = ScriptedDevice(clock, script, hangs_s)
-            reached(bus, clock).lead("m1", self.device, say=self.said.append)
+            reach_session(bus, clock).lead("m1", self.device, say=self.said.append)
 
         session.stranger(act)
         self.log: Log = session.run()
 
     @property
     def target(self) -> "np.ndarray[Any, np.dtype[np.float64]]":
-        """Returns the target while the arm is held, without the first ticks, in which the
-        target finds its place.
-        """
+        """The target while the arm is held, after the ticks in which the target settles."""
         hand = self.log["m1"].hand
         return hand[hand[:, 2] > 0.0, 3:5][SETTLED:]
 
     @property
     def changes(self) -> list[str]:
+        """The texts of the events in which the hand takes or leaves the arm."""
         texts = [event.text for event in self.log.events if event.kind == "hand"]
         return [text.partition(" at t")[0] for text in texts]
 
 
-def clutched(t_s: float) -> bool:
+def is_clutched(t_s: float) -> bool:
+    """Returns True from 0.2 s on."""
     return t_s >= 0.2
 
 
-def moving(
-    place_m: Callable[[float], tuple[float, float, float]], pressed: Callable[[float], bool]
+def make_script(
+    place_m: Callable[[float], tuple[float, float, float]], is_pressed: Callable[[float], bool]
 ) -> Script:
-    return lambda t_s: DeviceState(place_m(t_s), ZERO, HELD if pressed(t_s) else FREE)
+    """Returns the states of a device by its places, in m, and by its clutch."""
+    return lambda t_s: DeviceState(place_m(t_s), ZERO, HELD if is_pressed(t_s) else FREE)
 
 
-def up(t_s: float) -> tuple[float, float, float]:
-    """Moves up by 50 mm from 0.5 s to 1 s."""
+def place_upwards_m(t_s: float) -> tuple[float, float, float]:
+    """Returns the place of a device that moves up by 50 mm from 0.5 s to 1 s."""
     return 0.3, -0.12, 0.15 + 0.1 * min(max(t_s - 0.5, 0.0), 0.5)
 
 
 def test_devices_lead_arms_as_logs_repeat(tmp_path: Path) -> None:
-    """Up in the frame of the device is y of a planar arm; the starting place of the device does
-    not matter.
-    """
-    led = Led(tmp_path, moving(up, clutched))
-    moved = led.target[-1] - led.target[0]
+    """Up in the frame of the device is y of a planar arm, from whatever place the device starts."""
+    session = DeviceSession(tmp_path, make_script(place_upwards_m, is_clutched))
+    moved = session.target[-1] - session.target[0]
     assert moved == pytest.approx([0.0, 0.05], abs=1e-9)
-    assert led.changes[0] == "m1: ScriptedDevice takes hold"
-    assert verify(led.log).passed
+    assert session.changes[0] == "m1: ScriptedDevice takes hold"
+    assert verify(session.log).passed
 
 
 @pytest.mark.parametrize(
@@ -107,36 +112,50 @@ def test_devices_lead_arms_as_logs_repeat(tmp_path: Path) -> None:
 def test_frame_and_scale_transform_its_motion(
     frame: list[str], scale: float, moved: list[float], tmp_path: Path
 ) -> None:
-    led = Led(tmp_path, moving(up, clutched), {"frame": frame, "scale": scale})
-    assert led.target[-1] - led.target[0] == pytest.approx(moved, abs=1e-9)
+    session = DeviceSession(
+        tmp_path, make_script(place_upwards_m, is_clutched), {"frame": frame, "scale": scale}
+    )
+    assert session.target[-1] - session.target[0] == pytest.approx(moved, abs=1e-9)
 
 
 def test_closing_a_clutch_makes_no_jump(tmp_path: Path) -> None:
     """The device goes up by 50 mm with the clutch open; the arm stays held at its place."""
-    led = Led(tmp_path, moving(up, lambda t_s: 0.2 <= t_s < 0.4 or t_s > 1.5))
-    assert np.abs(led.target - led.target[0]).max() < 1e-12
-    assert led.changes == ["m1: ScriptedDevice takes hold"]  # held to the end
-    open_s = [t_s for t_s, force in led.device.rendered if force != ZERO and 0.41 < t_s < 1.5]
+    session = DeviceSession(
+        tmp_path, make_script(place_upwards_m, lambda t_s: 0.2 <= t_s < 0.4 or t_s > 1.5)
+    )
+    assert np.abs(session.target - session.target[0]).max() < 1e-12
+    assert session.changes == ["m1: ScriptedDevice takes hold"]  # held to the end
+    open_s = [
+        t_s for t_s, force in session.device.rendered if force != ZERO and 0.41 < t_s < 1.5
+    ]
     assert open_s == []
 
 
 def test_the_button_lets_go(tmp_path: Path) -> None:
-    def script(t_s: float) -> DeviceState:
-        return DeviceState(
-            up(t_s), ZERO, {"a": t_s < 2.0, "b": 1.0 < t_s < 1.1} if t_s > 0.2 else FREE
-        )
+    """The second button releases the arm, and the clutch takes hold no second time."""
 
-    led = Led(tmp_path, script)
-    assert led.changes == ["m1: ScriptedDevice takes hold", "m1: ScriptedDevice lets go"]
-    held = led.log["m1"].t_s[led.log["m1"].hand[:, 2] > 0.0]
+    def script(t_s: float) -> DeviceState:
+        buttons = {"a": t_s < 2.0, "b": 1.0 < t_s < 1.1} if t_s > 0.2 else FREE
+        return DeviceState(place_upwards_m(t_s), ZERO, buttons)
+
+    session = DeviceSession(tmp_path, script)
+    assert session.changes == [
+        "m1: ScriptedDevice takes hold",
+        "m1: ScriptedDevice lets go",
+    ]
+    held = session.log["m1"].t_s[session.log["m1"].hand[:, 2] > 0.0]
     assert held[-1] - held[0] == pytest.approx(0.8, abs=0.02)
 
 
-def jumping(wrong: DeviceState) -> Script:
-    """Reports a jump or an invalid number for three states while it moves up."""
-    return lambda t_s: (
-        wrong if 0.7 <= t_s < 0.715 else DeviceState(up(t_s), ZERO, HELD if t_s > 0.2 else FREE)
-    )
+def make_wrong_script(wrong: DeviceState) -> Script:
+    """Returns the states of a device that moves up, of which three are replaced."""
+
+    def script(t_s: float) -> DeviceState:
+        if 0.7 <= t_s < 0.715:
+            return wrong
+        return DeviceState(place_upwards_m(t_s), ZERO, HELD if t_s > 0.2 else FREE)
+
+    return script
 
 
 @pytest.mark.parametrize(
@@ -156,99 +175,113 @@ def test_jumps_and_invalid_numbers_move_nothing(
     wrong: DeviceState, counted: str, tmp_path: Path
 ) -> None:
     """The target misses at most the motion of the device meanwhile, 2 mm, and stands still at the end."""
-    led = Led(tmp_path, jumping(wrong))
-    moved = led.target[-1] - led.target[0]
+    session = DeviceSession(tmp_path, make_wrong_script(wrong))
+    moved = session.target[-1] - session.target[0]
     assert moved == pytest.approx([0.0, 0.05], abs=2.1e-3)
-    assert np.abs(np.diff(led.target, axis=0)).max() < 2.1e-3
-    assert counted in led.said[-1]
+    assert np.abs(np.diff(session.target, axis=0)).max() < 2.1e-3
+    assert counted in session.said[-1]
 
 
-def felt(led: Led) -> "np.ndarray[Any, np.dtype[np.float64]]":
-    """Returns the largest force that the device rendered, and the last forces, N."""
-    return np.array([force for _, force in led.device.rendered])
+def list_forces_n(session: DeviceSession) -> "np.ndarray[Any, np.dtype[np.float64]]":
+    """Returns the forces that the device rendered, in N."""
+    return np.array([force for _, force in session.device.rendered])
 
 
 def test_devices_render_the_arms_reaction(tmp_path: Path) -> None:
     """Where the hand pulls the arm up, the device pulls down, by the record's force, and not ahead."""
-    led = Led(tmp_path, moving(up, clutched), {"force_limit_n": 1000.0})
-    rendered = felt(led)
+    session = DeviceSession(
+        tmp_path, make_script(place_upwards_m, is_clutched), {"force_limit_n": 1000.0}
+    )
+    rendered = list_forces_n(session)
     assert rendered[:, 2].min() < -1.0
     assert np.abs(rendered[:, 1]).max() == 0.0
-    arm, part = led.log.scenario.arms["m1"], led.log["m1"]
-    pulls = [
-        300.0 * (row[4] - arm.end_effector(q)[1])
-        for row, q in zip(part.hand, part.q, strict=True)
-        if row[0] == 1.0
-    ]
-    assert rendered[:, 2].min() == pytest.approx(-max(pulls), rel=0.3)
+    part = session.log["m1"]
+    arm = session.log.scenario.arms["m1"]
+    pulls_n = []
+    for hand, q in zip(part.hand, part.q, strict=True):
+        if hand[0] == 1.0:
+            pulls_n.append(300.0 * (hand[4] - arm.end_effector(q)[1]))
+    assert rendered[:, 2].min() == pytest.approx(-max(pulls_n), rel=0.3)
 
 
 @pytest.mark.parametrize(("scale", "limit"), [(1.0, 2.0), (1.0, 0.5), (50.0, 1.5)])
 def test_force_stays_within_its_limit(scale: float, limit: float, tmp_path: Path) -> None:
-    led = Led(tmp_path, moving(up, clutched), {"force_scale": scale, "force_limit_n": limit})
-    assert np.linalg.norm(felt(led), axis=1).max() == pytest.approx(limit)
+    session = DeviceSession(
+        tmp_path,
+        make_script(place_upwards_m, is_clutched),
+        {"force_scale": scale, "force_limit_n": limit},
+    )
+    assert np.linalg.norm(list_forces_n(session), axis=1).max() == pytest.approx(limit)
 
 
 def test_closing_clutches_let_the_force_grow(tmp_path: Path) -> None:
     """A target 50 mm off pulls the arm all the time: no force is felt at once."""
-    led = Led(
+    session = DeviceSession(
         tmp_path,
-        moving(up, lambda t_s: 0.2 <= t_s < 1.0 or t_s > 1.2),
+        make_script(place_upwards_m, lambda t_s: 0.2 <= t_s < 1.0 or t_s > 1.2),
         {"force_limit_n": 1000.0},
     )
-    after = [math.hypot(*force) for t_s, force in led.device.rendered if 1.2 < t_s < 1.4]
+    after = [math.hypot(*force) for t_s, force in session.device.rendered if 1.2 < t_s < 1.4]
     assert after[0] < 0.2 * max(after)
     assert max(np.diff(after)) < 0.2 * max(after)
 
 
-@pytest.mark.parametrize("how", ["raises", "hangs"])
-def test_silent_devices_need_their_button_anew(how: str, tmp_path: Path) -> None:
-    """The device is away from 1 s to 1.5 s with its clutch pressed; the clutch is released at 2
-    s and pressed at 2.2 s.
+@pytest.mark.parametrize("fault", ["raises", "hangs"])
+def test_silent_devices_need_their_button_anew(fault: str, tmp_path: Path) -> None:
+    """A device that was away with its clutch pressed takes hold when the clutch is pressed again.
+
+    The device is away from 1 s to 1.5 s. The clutch is open from 2 s to 2.2 s.
     """
 
     def script(t_s: float) -> DeviceState:
-        if 1.0 <= t_s < 1.5 and how == "raises":
+        if 1.0 <= t_s < 1.5 and fault == "raises":
             raise TimeoutError("the device is silent")
-        return DeviceState(up(t_s), ZERO, FREE if t_s < 0.2 or 2.0 < t_s < 2.2 else HELD)
+        return DeviceState(
+            place_upwards_m(t_s), ZERO, FREE if t_s < 0.2 or 2.0 < t_s < 2.2 else HELD
+        )
 
-    led = Led(tmp_path, script, hangs_s=(1.0, 0.5) if how == "hangs" else (1e9, 0.0))
-    gone = "lets go" if how == "raises" else "is silent: let go"
-    assert (
-        led.changes
-        == [f"m1: ScriptedDevice {what}" for what in ("takes hold", gone) * 2][:3]
-        + led.changes[3:]
+    session = DeviceSession(
+        tmp_path, script, hangs_s=(1.0, 0.5) if fault == "hangs" else (1e9, 0.0)
     )
-    part = led.log["m1"]
+    release = "lets go" if fault == "raises" else "is silent: let go"
+    assert session.changes[:3] == [
+        "m1: ScriptedDevice takes hold",
+        f"m1: ScriptedDevice {release}",
+        "m1: ScriptedDevice takes hold",
+    ]
+    part = session.log["m1"]
     held = part.t_s[part.hand[:, 2] > 0.0]
     (rest,) = np.flatnonzero(np.diff(held) > 0.1)
     assert 0.9 < held[rest + 1] - held[rest] < 1.3
-    assert verify(led.log).passed
-    if how == "raises":
-        assert sum("the device is silent; the arm is let go" in line for line in led.said) == 1
-        assert led.device.entered == 2
+    assert verify(session.log).passed
+    if fault == "raises":
+        assert (
+            sum("the device is silent; the arm is let go" in line for line in session.said) == 1
+        )
+        assert session.device.entered == 2
 
 
 def test_lost_devices_are_reported_and_tried_again(tmp_path: Path) -> None:
     def script(_: float) -> DeviceState:
         raise ConnectionError("no service")
 
-    led = Led(tmp_path, script)
-    assert [line for line in led.said if "no service" in line] == [
+    session = DeviceSession(tmp_path, script)
+    assert [line for line in session.said if "no service" in line] == [
         "m1: no service; the arm is let go, and the device is tried again"
     ]
-    assert led.device.entered > 2
-    assert led.changes == []
+    assert session.device.entered > 2
+    assert session.changes == []
 
 
 def test_old_records_are_not_felt(tmp_path: Path) -> None:
     """A site that stalls sends nothing: after 0.1 s the device is free."""
     scenario = load_scenario("play", {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 10})
-    session, devices = Session.whole(scenario, tmp_path), list[ScriptedDevice]()
+    session = Session.whole(scenario, tmp_path)
+    devices: list[ScriptedDevice] = []
 
     def act(bus: Bus, clock: RelayClock) -> None:
-        devices.append(ScriptedDevice(clock, moving(up, clutched)))
-        reached(bus, clock).lead("m1", devices[0], say=lambda _: None)
+        devices.append(ScriptedDevice(clock, make_script(place_upwards_m, is_clutched)))
+        reach_session(bus, clock).lead("m1", devices[0], say=lambda _: None)
 
     session.stranger(act)
     session.clocks["m1"].stall(session.relay.now_ns + 2_300_000_000, 400_000_000)
@@ -260,9 +293,7 @@ def test_old_records_are_not_felt(tmp_path: Path) -> None:
 
 
 def test_the_documented_device_leads_an_arm(tmp_path: Path) -> None:
-    """The class of docs/sessions/devices.md, which moves to the right at 5 cm/s and presses its
-    clutch after 1 cm.
-    """
+    """The class of docs/sessions/devices.md moves to the right at 5 cm/s, clutched after 1 cm."""
     names: dict[str, Any] = {}
     (code,) = [
         block.text
@@ -270,13 +301,14 @@ def test_the_documented_device_leads_an_arm(tmp_path: Path) -> None:
         if block.language == "python"
     ]
     exec(code, names)
-    pushed, felt_n = names["Pushed"](), list[float]()
+    pushed = names["Pushed"]()
+    felt_n: list[float] = []
     pushed.render = lambda force_n: felt_n.append(force_n[0])
     session = Session.whole(
         load_scenario("play", {"duration_s": 3.0, "rate_hz": 200}), tmp_path
     )
     session.stranger(
-        lambda bus, clock: reached(bus, clock).lead("m1", pushed, say=lambda _: None)
+        lambda bus, clock: reach_session(bus, clock).lead("m1", pushed, say=lambda _: None)
     )
     log = session.run()
     target = log["m1"].hand[log["m1"].hand[:, 2] > 0.0, 3:5]
@@ -288,7 +320,7 @@ def test_the_documented_device_leads_an_arm(tmp_path: Path) -> None:
 
 def test_hands_not_led_by_tips_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="mode 'tip'"):
-        Led(tmp_path, moving(up, clutched), mode="joint")
+        DeviceSession(tmp_path, make_script(place_upwards_m, is_clutched), mode="joint")
 
 
 def test_services_are_given_up_before_hand_silence() -> None:
@@ -309,19 +341,19 @@ def pumped(t_s: float) -> DeviceState:
 
 def test_repeated_clutching_keeps_the_target_within_reach(tmp_path: Path) -> None:
     """Five strokes of 0.3 m, twice as large at the arm; the first motion back moves the target at once."""
-    led = Led(tmp_path, pumped, {"scale": 2.0})
-    reach_m = sum(led.log.scenario.arms["m1"].lengths_m)
-    hand = led.log["m1"].hand
+    session = DeviceSession(tmp_path, pumped, {"scale": 2.0})
+    reach_m = sum(session.log.scenario.arms["m1"].lengths_m)
+    hand = session.log["m1"].hand
     held = hand[hand[:, 2] > 0.0]
     radius_m = np.hypot(held[:, 3], held[:, 4])
     assert radius_m.max() == pytest.approx(reach_m, abs=1e-6)
-    t_s = led.log["m1"].t_s[hand[:, 2] > 0.0]
+    t_s = session.log["m1"].t_s[hand[:, 2] > 0.0]
     begun = int(np.argmax(radius_m > reach_m - 1e-3))
     back = held[-1, 3] - held[begun:, 3].max()
     # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
     assert back < -0.3
     assert t_s[begun] < 2.2
-    assert verify(led.log).passed
+    assert verify(session.log).passed
 
 
 LATER = [pytest.param(gaps, marks=pytest.mark.long) for gaps in ((150, 10), (30, 90))]
@@ -336,9 +368,9 @@ def test_uneven_states_never_jerk_the_target(gaps_ms: tuple[int, int], tmp_path:
         seen_s = t_s - t_s % (late if int(t_s / 0.3) % 2 else even)
         return 0.1 * math.sin(3.0 * seen_s), 0.0, 0.0
 
-    led = Led(tmp_path, moving(place, clutched))
-    m1 = led.log["m1"]
-    live = led.log.scenario.sites["m1"].find_live_hand()
+    session = DeviceSession(tmp_path, make_script(place, is_clutched))
+    m1 = session.log["m1"]
+    live = session.log.scenario.sites["m1"].find_live_hand()
     held = m1.hand[m1.hand[:, 2] > 0.0]
     rates = held[:, 5:7]
     change = np.linalg.norm(np.diff(rates, axis=0), axis=1)

@@ -23,19 +23,21 @@ FORCE = (0.5, -1.0, 1.5)
 
 @pytest.fixture
 def service() -> Iterator[HaplyService]:
-    with HaplyService() as made:
-        yield made
+    """A service that speaks the protocol of Haply's Inverse3."""
+    with HaplyService() as haply_service:
+        yield haply_service
 
 
 @pytest.fixture
 def cap() -> Iterator[CapReports]:
-    made = CapReports()
-    yield made
-    made.close()
+    """A file with the reports of a SpaceMouse."""
+    reports = CapReports()
+    yield reports
+    reports.close()
 
 
 @pytest.fixture(params=["haply_inverse3", "spacemouse"])
-def there(
+def removable_device(
     request: pytest.FixtureRequest, service: HaplyService, cap: CapReports
 ) -> tuple[Device, Callable[[], None]]:
     """Returns a device by its name and address, and a function that removes the device."""
@@ -47,9 +49,10 @@ def there(
 
 
 def test_device_reads_renders_and_is_entered_again(
-    there: tuple[Device, Callable[[], None]],
+    removable_device: tuple[Device, Callable[[], None]],
 ) -> None:
-    device, _ = there
+    """A device gives finite states and takes forces, also when it is entered a second time."""
+    device, _ = removable_device
     assert 50 <= device.rate_hz <= 1000
     for _ in range(2):
         with device:
@@ -63,18 +66,18 @@ def test_device_reads_renders_and_is_entered_again(
 
 
 def test_lost_devices_raise_a_system_error(
-    there: tuple[Device, Callable[[], None]],
+    removable_device: tuple[Device, Callable[[], None]],
 ) -> None:
-    """And again when an absent device is entered."""
-    device, lose = there
+    """A device that is removed while it is used raises an error of the system."""
+    device, lose = removable_device
     with device:
         device.read()
         lose()
         with pytest.raises(OSError, match=r"service|SpaceMouse"):
-            lasts(device)
+            use_device(device)
 
 
-def lasts(device: Device) -> None:
+def use_device(device: Device) -> None:
     """Renders and reads a few times."""
     for _ in range(3):
         device.render(ZERO)
@@ -87,12 +90,12 @@ def test_devices_are_known_by_name() -> None:
 
 
 def test_the_command_names_its_missing_device(tmp_path: Path) -> None:
-    for words, problem in (
+    for options, problem in (
         (("--session", "play"), "needs --scenario"),
         (("--session", "play", "--device", "spacemouse", "--set", "seed=2"), "leave out --set"),
         (("--device", "spacemouse"), "a session's name must"),
     ):
-        trilat("hand", "m1", *words, cwd=tmp_path).refuses(problem)
+        trilat("hand", "m1", *options, cwd=tmp_path).refuses(problem)
 
 
 # --- Haply's Inverse3 -------------------------------------------------------------------------------------
@@ -116,8 +119,8 @@ def test_every_state_follows_a_force(service: HaplyService) -> None:
 @pytest.mark.parametrize("key", ["vector", "values"])
 def test_force_uses_the_services_own_key(key: str) -> None:
     with HaplyService(force_key=key) as service:
-        way = "#values" if key == "values" else ""
-        with HaplyInverse3(service.address + way) as device:
+        fragment = "#values" if key == "values" else ""
+        with HaplyInverse3(service.address + fragment) as device:
             device.read()
             device.render(FORCE)
             device.read()

@@ -27,17 +27,20 @@ def test_smoothness_has_the_numbers_of_its_authors() -> None:
     assert f"{sparc(BELL, 100.0):.5f}" == "-1.41403"
 
 
-def _minimum_jerk(duration_s: float, rate_hz: float) -> np.ndarray:
+def make_minimum_jerk_speed(duration_s: float, rate_hz: float) -> np.ndarray:
+    """Returns the speed of a movement of minimum jerk over 1 m."""
     tau = np.linspace(0.0, 1.0, int(duration_s * rate_hz) + 1)
     return 30.0 * tau**2 * (1.0 - tau) ** 2 / duration_s
 
 
 def test_smoothness_ignores_amplitude_and_falls_with_submovements() -> None:
-    one = _minimum_jerk(1.0, 200.0)
-    two = np.concatenate([one, one])
-    assert sparc(7.0 * one, 200.0) == pytest.approx(sparc(one, 200.0), abs=1e-9)
-    assert sparc(two, 200.0) < sparc(one, 200.0) - 0.2
-    assert sparc(_minimum_jerk(2.0, 100.0), 100.0) == pytest.approx(sparc(one, 200.0), abs=0.02)
+    """Smoothness depends on neither amplitude nor duration, and two movements are less smooth."""
+    speed = make_minimum_jerk_speed(1.0, 200.0)
+    smoothness = sparc(speed, 200.0)
+    slower = make_minimum_jerk_speed(2.0, 100.0)
+    assert sparc(7.0 * speed, 200.0) == pytest.approx(smoothness, abs=1e-9)
+    assert sparc(slower, 100.0) == pytest.approx(smoothness, abs=0.02)
+    assert sparc(np.concatenate([speed, speed]), 200.0) < smoothness - 0.2
 
 
 def test_rest_has_neither_smoothness_nor_movement_time() -> None:
@@ -46,7 +49,7 @@ def test_rest_has_neither_smoothness_nor_movement_time() -> None:
 
 
 def test_movement_lasts_while_speed_is_above_its_threshold() -> None:
-    speed = np.concatenate([np.zeros(30), _minimum_jerk(0.8, 1000.0), np.zeros(100)])
+    speed = np.concatenate([np.zeros(30), make_minimum_jerk_speed(0.8, 1000.0), np.zeros(100)])
     tau = np.linspace(0.0, 1.0, 100_001)
     above = tau[16.0 * tau**2 * (1.0 - tau) ** 2 >= 0.05]
     assert movement_time_s(speed, 1000.0) == pytest.approx(
@@ -76,11 +79,10 @@ HEIGHTS = "534 496 608 547 651 554 650 568 642 567 653 604 704 610 675 606 666 6
 TIMES_MS = "262 268 248 233 251 252 283 214 301 266 258 258 248 242 241 252 243 255 252 210"
 
 
-def _published() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    starts, targets = (
-        np.array([[540.0, 592.0], [227.0, 592.0]] * 10),
-        np.array([[227.0, 592.0], [540.0, 592.0]] * 10),
-    )
+def read_published_movements() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Returns starts, targets, ends and times (s) of the published example."""
+    starts = np.array([[540.0, 592.0], [227.0, 592.0]] * 10)
+    targets = np.array([[227.0, 592.0], [540.0, 592.0]] * 10)
     ends = np.column_stack(
         [np.array(text.split(), dtype=float) for text in (SELECTED, HEIGHTS)]
     )
@@ -88,16 +90,16 @@ def _published() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_throughput_equals_the_published_example() -> None:
-    found = measure_throughput(*_published(), serial=True)
-    assert found.distance_m == pytest.approx(327.05, abs=5e-7)
-    assert found.width_m == pytest.approx(105.692130, abs=5e-7)
-    assert found.difficulty_bits == pytest.approx(2.033640, abs=5e-7)
-    assert found.time_s == pytest.approx(0.25185, abs=5e-9)
-    assert found.bits_s == pytest.approx(8.074805, abs=5e-7)
+    throughput = measure_throughput(*read_published_movements(), serial=True)
+    assert throughput.distance_m == pytest.approx(327.05, abs=5e-7)
+    assert throughput.width_m == pytest.approx(105.692130, abs=5e-7)
+    assert throughput.difficulty_bits == pytest.approx(2.033640, abs=5e-7)
+    assert throughput.time_s == pytest.approx(0.25185, abs=5e-9)
+    assert throughput.bits_s == pytest.approx(8.074805, abs=5e-7)
 
 
 def test_throughput_depends_on_no_frame_and_no_unit() -> None:
-    starts, targets, ends, times_s = _published()
+    starts, targets, ends, times_s = read_published_movements()
     angle = 0.7
     turn = 2.5e-4 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     turned = measure_throughput(
@@ -110,7 +112,7 @@ def test_throughput_depends_on_no_frame_and_no_unit() -> None:
 
 
 def test_end_points_without_spread_have_no_throughput() -> None:
-    starts, targets, _, times_s = _published()
+    starts, targets, _, times_s = read_published_movements()
     assert measure_throughput(starts, targets, targets, times_s) is None
     assert measure_throughput(starts[:1], targets[:1], targets[:1] + 1.0, times_s[:1]) is None
 
@@ -127,28 +129,34 @@ def test_useful_forces_oppose_each_other_nowhere() -> None:
 
 
 def test_users_who_oppose_each_other_move_nothing() -> None:
-    push, rest = np.full((101, 1), 3.0), np.zeros((101, 1))
-    against = measure_pair(push, -push, rest, 100.0)
-    assert (against.internal_rms_n, against.useful_rms_n, against.internal_share) == (
-        3.0,
-        0.0,
-        1.0,
-    )
-    together = measure_pair(push, 2.0 * push, np.full((101, 1), 0.5), 100.0)
-    assert together.internal_share == 0.0
-    assert together.first_effort_share == pytest.approx(1.0 / 5.0)
-    assert (together.first_work_j, together.second_work_j) == pytest.approx((1.5, 3.0))
-    assert measure_pair(rest, rest, rest, 100.0).first_effort_share is None
+    push_n = np.full((101, 1), 3.0)
+    at_rest = np.zeros((101, 1))
+    measures = measure_pair(push_n, -push_n, at_rest, 100.0)
+    assert measures.internal_rms_n == 3.0
+    assert measures.useful_rms_n == 0.0
+    assert measures.internal_share == 1.0
+    assert measure_pair(at_rest, at_rest, at_rest, 100.0).first_effort_share is None
+
+
+def test_users_who_push_together_share_the_work() -> None:
+    """Forces of 3 N and 6 N at 0.5 m/s over 1 s do 1.5 J and 3 J, and none of them is internal."""
+    push_n = np.full((101, 1), 3.0)
+    speed_m_s = np.full((101, 1), 0.5)
+    measures = measure_pair(push_n, 2.0 * push_n, speed_m_s, 100.0)
+    assert measures.internal_share == 0.0
+    assert measures.first_effort_share == pytest.approx(1.0 / 5.0)
+    assert measures.first_work_j == pytest.approx(1.5)
+    assert measures.second_work_j == pytest.approx(3.0)
 
 
 def test_power_flows_from_the_user_who_leads() -> None:
     t_s = np.linspace(0.0, 1.0, 1001)
     velocity = np.sin(np.pi * t_s)[:, None]
-    found = measure_pair(4.0 * velocity, -1.0 * velocity, velocity, 1000.0)
-    assert (found.first_taken_j, found.second_taken_j) == pytest.approx((0.0, 0.5), abs=1e-5)
-    assert found.first_work_j + found.second_work_j == pytest.approx(
-        energy_j(3.0 * velocity, velocity, 1000.0)
-    )
+    measures = measure_pair(4.0 * velocity, -1.0 * velocity, velocity, 1000.0)
+    assert measures.first_taken_j == pytest.approx(0.0, abs=1e-5)
+    assert measures.second_taken_j == pytest.approx(0.5, abs=1e-5)
+    work_j = measures.first_work_j + measures.second_work_j
+    assert work_j == pytest.approx(energy_j(3.0 * velocity, velocity, 1000.0))
 
 
 def test_samples_that_do_not_belong_together_are_named() -> None:
@@ -157,7 +165,7 @@ def test_samples_that_do_not_belong_together_are_named() -> None:
     with pytest.raises(UsageError, match="speed: a sample is not a finite number"):
         sparc([0.0, np.nan, 1.0], 100.0)
     with pytest.raises(UsageError, match="give a time above 0 for each of 20"):
-        measure_throughput(*_published()[:3], np.zeros(20))
+        measure_throughput(*read_published_movements()[:3], np.zeros(20))
 
 
 # The demonstration of github.com/nicoversity/tlx-vis-r: weights and ratings in tlx_individual_demo.R; the bar
@@ -190,11 +198,9 @@ def test_ratings_out_of_range_are_refused_by_name() -> None:
 def test_usability_score_has_its_example_and_its_ends() -> None:
     """Brooke (1996), from memory: contributions of 22 times 2.5."""
     assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0
-    assert (sus_score([5, 1] * 5), sus_score([1, 5] * 5), sus_score([3] * 10)) == (
-        100.0,
-        0.0,
-        50.0,
-    )
+    assert sus_score([5, 1] * 5) == 100.0
+    assert sus_score([1, 5] * 5) == 0.0
+    assert sus_score([3] * 10) == 50.0
     with pytest.raises(UsageError, match="answer 4 = 6"):
         sus_score([1, 2, 3, 6, 1, 1, 1, 1, 1, 1])
     with pytest.raises(UsageError, match="SUS has 10"):

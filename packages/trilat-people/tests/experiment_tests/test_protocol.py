@@ -1,6 +1,6 @@
 """Protocols of experiments: orders that balance, a digest, and everything that is wrong at once."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,15 @@ LIVE = {"sites.m1.hands": [{"kind": "live"}], "sites.m2.hands": [{"kind": "live"
 
 
 def make_protocol(**keys: Any) -> Protocol:
-    conditions = {"near": {"link.delay_ms": 0}, "far": {"link.delay_ms": 300}}
-    given = {
+    """Returns the protocol of four participants and two conditions, with some keys replaced."""
+    protocol = {
         "name": "study",
         "scenario": "paper",
         "set": LIVE,
-        "conditions": conditions,
+        "conditions": {"near": {"link.delay_ms": 0}, "far": {"link.delay_ms": 300}},
         "participants": 4,
     }
-    return msgspec.convert({**given, **keys}, Protocol)
+    return msgspec.convert({**protocol, **keys}, Protocol)
 
 
 def test_keys_of_a_site_leave_its_others() -> None:
@@ -80,25 +80,30 @@ def test_random_orders_are_a_function_of_the_seed() -> None:
 def test_every_trial_has_its_place_and_seed() -> None:
     plan = plan_experiment(make_protocol(practice=1, trials=3))
     assert len(plan.trials) == 4 * 2 * 4
-    assert [one.number for one in plan.trials] == list(range(1, 33))
-    assert (
-        len({one.seed for one in plan.trials}) == len({one.file for one in plan.trials}) == 32
-    )
-    assert sum(one.practice for one in plan.trials) == 8
-    assert [one.before for one in plan.trials[:8]] == list(range(8))
-    blocks = [[one.target for one in plan.trials[n : n + 4]] for n in range(0, 32, 4)]
-    assert all(block == list(range(block[0], block[0] + 4)) for block in blocks)
-    assert len({block[0] for block in blocks}) > 4
+    assert [planned.number for planned in plan.trials] == list(range(1, 33))
+    assert len({planned.seed for planned in plan.trials}) == 32
+    assert len({planned.file for planned in plan.trials}) == 32
+    assert sum(planned.practice for planned in plan.trials) == 8
+    assert [planned.before for planned in plan.trials[:8]] == list(range(8))
     assert plan.list_orders()["P1"] == ["near", "far"]
     assert plan.list_orders()["P2"] == ["far", "near"]
 
 
+def test_targets_of_a_block_follow_one_another() -> None:
+    """The targets of a block are consecutive, from a first target that is drawn for each block."""
+    plan = plan_experiment(make_protocol(practice=1, trials=3))
+    first_targets = set()
+    for first in range(0, 32, 4):
+        targets = [planned.target for planned in plan.trials[first : first + 4]]
+        assert targets == list(range(targets[0], targets[0] + 4))
+        first_targets.add(targets[0])
+    assert len(first_targets) > 4
+
+
 def test_pairs_hold_two_masters() -> None:
     plan = plan_experiment(make_protocol(users=["m1", "m2"]))
-    assert [one.group for one in plan.trials[:: len(plan.trials) // 2]] == [
-        ("P1", "P2"),
-        ("P3", "P4"),
-    ]
+    groups = list(dict.fromkeys(planned.group for planned in plan.trials))
+    assert groups == [("P1", "P2"), ("P3", "P4")]
 
 
 def test_the_digest_covers_the_plan() -> None:
@@ -118,16 +123,18 @@ def test_catch_trials_share_every_other_block() -> None:
     plan = plan_experiment(
         make_protocol(trials=10, practice=2, catch={"condition": "near", "share": 0.2})
     )
-    of = {
-        (group, block): [one for one in plan.trials if (one.group, one.block) == (group, block)]
-        for group, block in {(one.group, one.block) for one in plan.trials}
-    }
-    for trials in of.values():
-        own = next(one.condition for one in trials if not one.catch)
-        caught = [one for one in trials if one.catch]
-        assert len(caught) == (0 if own == "near" else 2)
-        assert all(one.condition == "near" and not one.practice for one in caught)
-    assert len({one.trial for one in plan.trials if one.catch}) > 2  # drawn for every block
+    blocks = defaultdict(list)
+    for planned in plan.trials:
+        blocks[planned.group, planned.block].append(planned)
+    for block in blocks.values():
+        condition = next(planned.condition for planned in block if not planned.catch)
+        catch_trials = [planned for planned in block if planned.catch]
+        assert len(catch_trials) == (0 if condition == "near" else 2)
+        for planned in catch_trials:
+            assert planned.condition == "near"
+            assert not planned.practice
+    places = {planned.trial for planned in plan.trials if planned.catch}
+    assert len(places) > 2  # drawn for every block
     assert plan.list_orders()["P1"] == ["near", "far"]
     assert plan.to_dict()["counted"] == 4 * (10 + 8)
 
@@ -145,10 +152,11 @@ def test_participant_who_bears_less_has_a_weaker_hand() -> None:
 
 
 def test_people_are_asked_around_their_trials() -> None:
-    asked = [{"name": "tlx"}, {"name": "sus", "after": "experiment"}]
-    plan = plan_experiment(make_protocol(trials=1, consent="Yes?", questionnaires=asked))
-    own = [step.key for step in plan.list_steps() if step.planned.group == ("P1",)]
-    assert own == [
+    """A participant consents first, answers after each block, and answers once more at the end."""
+    forms = [{"name": "tlx"}, {"name": "sus", "after": "experiment"}]
+    plan = plan_experiment(make_protocol(trials=1, consent="Yes?", questionnaires=forms))
+    keys = [step.key for step in plan.list_steps() if step.planned.group == ("P1",)]
+    assert keys == [
         "consent 1",
         "trial 1",
         "questionnaire 1 tlx",
@@ -156,7 +164,7 @@ def test_people_are_asked_around_their_trials() -> None:
         "questionnaire 2 tlx",
         "questionnaire 2 sus",
     ]
-    assert len(list(plan.list_steps())) == 4 * len(own)
+    assert len(list(plan.list_steps())) == 4 * len(keys)
 
 
 def test_shipped_questionnaires_have_their_published_scores() -> None:

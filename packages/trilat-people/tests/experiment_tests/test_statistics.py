@@ -35,7 +35,7 @@ SLEEP = {
 
 
 def tidy(values: Mapping[str, Any], trials: int = 1) -> list[Row]:
-    """Rows of values by condition, one for each participant; two participants make a pair."""
+    """Returns rows of values by condition; two participants make a pair."""
     return [
         {"participant": n, "pair": n // 2, "condition": name, "trial": trial, "time_s": value}
         for name, column in values.items()
@@ -44,38 +44,40 @@ def tidy(values: Mapping[str, Any], trials: int = 1) -> list[Row]:
     ]
 
 
-def draw(
-    seed: int, number: int, effects: list[float], *, of_pair: float = 0.0, of_user: float = 1.0
+def draw_rows(
+    seed: int,
+    number: int,
+    effects: list[float],
+    *,
+    pair_deviation: float = 0.0,
+    user_deviation: float = 1.0,
 ) -> list[Row]:
-    """Rows of participants in pairs, with one mean a condition, and deviations of pairs and users."""
+    """Returns rows of participants in pairs, with drawn deviations of pairs, users and trials."""
     rng = np.random.default_rng(seed)
-    base = np.repeat(rng.normal(0.0, of_pair, number // 2), 2) + rng.normal(
-        0.0, of_user, number
-    )
-    return tidy(
-        {
-            f"c{n}": base + effect + rng.normal(0.0, 1.0, number)
-            for n, effect in enumerate(effects)
-        }
-    )
+    of_pairs = np.repeat(rng.normal(0.0, pair_deviation, number // 2), 2)
+    of_users = rng.normal(0.0, user_deviation, number)
+    values = {}
+    for n, effect in enumerate(effects):
+        values[f"c{n}"] = of_pairs + of_users + effect + rng.normal(0.0, 1.0, number)
+    return tidy(values)
 
 
 def test_paired_comparison_has_the_published_numbers() -> None:
-    (found,) = compare_conditions(tidy(SLEEP), "time_s")
-    assert (found.number, found.difference) == (10, pytest.approx(1.58))
-    assert found.t == pytest.approx(4.0621, abs=5e-5)
-    assert found.p == pytest.approx(0.002833, abs=5e-7) == found.p_holm
-    assert found.interval == pytest.approx((0.7001142, 2.4598858), abs=5e-8)
-    assert found.d_z == pytest.approx(4.0621 / np.sqrt(10.0), abs=2e-5)
+    (comparison,) = compare_conditions(tidy(SLEEP), "time_s")
+    assert (comparison.number, comparison.difference) == (10, pytest.approx(1.58))
+    assert comparison.t == pytest.approx(4.0621, abs=5e-5)
+    assert comparison.p == pytest.approx(0.002833, abs=5e-7) == comparison.p_holm
+    assert comparison.interval == pytest.approx((0.7001142, 2.4598858), abs=5e-8)
+    assert comparison.d_z == pytest.approx(4.0621 / np.sqrt(10.0), abs=2e-5)
     spreads = [np.std(SLEEP[name], ddof=1) for name in SLEEP]
-    assert found.d_av == pytest.approx(1.58 / np.mean(spreads))
+    assert comparison.d_av == pytest.approx(1.58 / np.mean(spreads))
 
 
 def test_signed_ranks_have_the_published_probability() -> None:
     """Of Darwin's plants, in Wilcoxon, "Individual comparisons by ranking methods" (1945)."""
     higher = [6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75]
-    (found,) = compare_conditions(tidy({"self": [0] * 15, "cross": higher}), "time_s")
-    assert found.p_wilcoxon == pytest.approx(0.041259765625)
+    (comparison,) = compare_conditions(tidy({"self": [0] * 15, "cross": higher}), "time_s")
+    assert comparison.p_wilcoxon == pytest.approx(0.041259765625)
 
 
 def test_holm_corrects_as_r_does() -> None:
@@ -88,43 +90,48 @@ def test_holm_corrects_as_r_does() -> None:
 
 
 def test_more_trials_are_not_more_participants() -> None:
-    once, often = (compare_conditions(tidy(SLEEP, trials), "time_s") for trials in (1, 20))
-    assert once[0].number == often[0].number
-    assert once[0].p == pytest.approx(often[0].p)
+    (single,) = compare_conditions(tidy(SLEEP, trials=1), "time_s")
+    (repeated,) = compare_conditions(tidy(SLEEP, trials=20), "time_s")
+    assert single.number == repeated.number
+    assert single.p == pytest.approx(repeated.p)
 
 
 def test_shared_variance_of_pairs_counts_once() -> None:
-    rows = [{**row, "pair": row["participant"] // 2} for row in draw(1, 12, [0.0, 1.0])]
-    (users,), (pairs,) = (
-        compare_conditions(rows, "time_s", unit=u) for u in ("participant", "pair")
-    )
-    assert (users.number, pairs.number) == (12, 6)
+    rows = [{**row, "pair": row["participant"] // 2} for row in draw_rows(1, 12, [0.0, 1.0])]
+    (users,) = compare_conditions(rows, "time_s", unit="participant")
+    (pairs,) = compare_conditions(rows, "time_s", unit="pair")
+    assert users.number == 12
+    assert pairs.number == 6
     assert users.difference == pytest.approx(pairs.difference)
 
 
 def test_incomplete_participants_are_left_out() -> None:
-    rows = draw(2, 8, [0.0, 1.0, 2.0])
+    rows = draw_rows(2, 8, [0.0, 1.0, 2.0])
     kept = [row for row in rows if row["condition"] != "c2" or row["participant"] != 3]
     empty = [{**row, "time_s": ""} if row not in kept else row for row in rows]
-    found = compare_conditions(kept, "time_s")
-    assert [(one.first, one.second, one.number) for one in found] == [
-        ("c0", "c1", 8), ("c0", "c2", 7), ("c1", "c2", 7)
-    ]  # fmt: skip
-    assert found == compare_conditions(empty, "time_s")
+    comparisons = compare_conditions(kept, "time_s")
+    numbers = {(pair.first, pair.second): pair.number for pair in comparisons}
+    assert numbers == {("c0", "c1"): 8, ("c0", "c2"): 7, ("c1", "c2"): 7}
+    assert comparisons == compare_conditions(empty, "time_s")
     texts = [{key: str(value) for key, value in row.items()} for row in kept]
-    assert found == compare_conditions(texts, "time_s")
+    assert comparisons == compare_conditions(texts, "time_s")
 
 
 def test_undecidable_numbers_are_none() -> None:
-    (alone,) = compare_conditions(tidy({"a": [1.0], "b": [3.0]}), "time_s")
-    assert (alone.difference, alone.p, alone.interval, alone.d_z) == (2.0, None, None, None)
-    (same,) = compare_conditions(tidy({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.5, 0.6]}), "time_s")
-    assert (same.t, same.p, same.p_holm, same.p_wilcoxon) == (None, None, None, None)
+    """One participant, equal differences or no common participant leave tests without numbers."""
+    (single,) = compare_conditions(tidy({"a": [1.0], "b": [3.0]}), "time_s")
+    assert single.difference == 2.0
+    assert single.p is single.interval is single.d_z is None
+
+    equal = tidy({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.5, 0.6]})
+    (same,) = compare_conditions(equal, "time_s")
+    assert same.t is same.p is same.p_holm is same.p_wilcoxon is None
     assert same.interval == pytest.approx((0.3, 0.3))
-    (none,) = compare_conditions(
-        [*tidy({"a": [1.0]}), {**tidy({"b": [2.0]})[0], "participant": 9}], "time_s"
-    )
-    assert (none.number, none.difference) == (0, None)
+
+    other_participant = {**tidy({"b": [2.0]})[0], "participant": 9}
+    (disjoint,) = compare_conditions([*tidy({"a": [1.0]}), other_participant], "time_s")
+    assert disjoint.number == 0
+    assert disjoint.difference is None
 
 
 def test_untidy_rows_name_what_is_missing() -> None:
@@ -183,28 +190,29 @@ def statsmodels() -> None:
 
 @pytest.mark.usefixtures("statsmodels")
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("of_pair", [0.0, 1.0])
-def test_balanced_mixed_model_is_the_paired_t_test(seed: int, of_pair: float) -> None:
+@pytest.mark.parametrize("pair_deviation", [0.0, 1.0])
+def test_balanced_mixed_model_is_the_paired_t_test(seed: int, pair_deviation: float) -> None:
     """Also where the variance of pairs is estimated as 0."""
-    rows = draw(seed, 16, [0.0, 0.8], of_pair=of_pair, of_user=1.5)
+    rows = draw_rows(seed, 16, [0.0, 0.8], pair_deviation=pair_deviation, user_deviation=1.5)
     model = fit_mixed_model(rows, "time_s")
     (paired,) = compare_conditions(rows, "time_s")
-    (found,) = model.effects
-    assert found.estimate == pytest.approx(paired.difference, rel=1e-9)
+    (effect,) = model.effects
+    assert effect.estimate == pytest.approx(paired.difference, rel=1e-9)
     assert model.variances["participant"] > 0.0
-    assert (found.t, found.p) == pytest.approx((paired.t, paired.p), rel=2e-3)
-    assert found.interval == pytest.approx(paired.interval, rel=2e-3)
+    assert (effect.t, effect.p) == pytest.approx((paired.t, paired.p), rel=2e-3)
+    assert effect.interval == pytest.approx(paired.interval, rel=2e-3)
 
 
 @pytest.mark.usefixtures("statsmodels")
 def test_mixed_model_of_three_equals_anova() -> None:
-    rows = draw(4, 16, [0.0, 0.5, 1.0], of_pair=1.5)
+    rows = draw_rows(4, 16, [0.0, 0.5, 1.0], pair_deviation=1.5)
     model = fit_mixed_model(rows, "time_s")
-    table = np.array([list(each.values()) for each in average_trials(rows, "time_s").values()])
+    means = average_trials(rows, "time_s")
+    table = np.array([list(means_of_units.values()) for means_of_units in means.values()])
     rest = table - table.mean(axis=0) - table.mean(axis=1, keepdims=True) + table.mean()
     assert model.freedom == 15 * 2
     error = np.sqrt(2.0 * (rest**2).sum() / model.freedom / 16)
-    assert [one.error for one in model.effects] == pytest.approx([error, error], rel=1e-3)
+    assert [effect.error for effect in model.effects] == pytest.approx([error] * 2, rel=1e-3)
     assert model.variances["residual"] == pytest.approx(
         (rest**2).sum() / model.freedom, rel=1e-3
     )
@@ -213,16 +221,18 @@ def test_mixed_model_of_three_equals_anova() -> None:
 
 @pytest.mark.usefixtures("statsmodels")
 def test_mixed_model_finds_the_variances_that_were_drawn() -> None:
-    model = fit_mixed_model(draw(5, 240, [0.0, 0.2], of_pair=2.0, of_user=1.5), "time_s")
-    found = [model.variances[name] for name in ("pair", "participant", "residual")]
-    assert found == pytest.approx([4.0, 2.25, 1.0], rel=0.3)
+    model = fit_mixed_model(
+        draw_rows(5, 240, [0.0, 0.2], pair_deviation=2.0, user_deviation=1.5), "time_s"
+    )
+    variances = [model.variances[name] for name in ("pair", "participant", "residual")]
+    assert variances == pytest.approx([4.0, 2.25, 1.0], rel=0.3)
 
 
 @pytest.mark.usefixtures("statsmodels")
 def test_mixed_model_takes_participants_who_lack_a_condition() -> None:
     rows = [
         row
-        for row in draw(6, 24, [0.0, 2.0], of_pair=1.0)
+        for row in draw_rows(6, 24, [0.0, 2.0], pair_deviation=1.0)
         if row["participant"] or row["condition"] == "c0"
     ]
     model = fit_mixed_model(rows, "time_s")
@@ -269,7 +279,8 @@ def test_power_has_the_published_values() -> None:
 def test_power_is_the_chance_over_drawn_spreads(d_z: float, number: int) -> None:
     """The integral of a normal over the chi distribution of the standard deviation."""
     spread = stats.chi(number - 1).ppf((np.arange(20_000) + 0.5) / 20_000) / np.sqrt(number - 1)
-    critical, shift = stats.t.ppf(0.975, number - 1) * spread, d_z * np.sqrt(number)
+    critical = stats.t.ppf(0.975, number - 1) * spread
+    shift = d_z * np.sqrt(number)
     chance = stats.norm.cdf(shift - critical) + stats.norm.cdf(-shift - critical)
     assert power(d_z, number) == pytest.approx(chance.mean(), abs=1e-5)
 
@@ -284,67 +295,84 @@ def test_least_number_is_the_first_with_enough_power() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "effect", "trials", "own"), [(34, 0.5, 1, 0.0), (12, 0.8, 4, 0.6)]
+    ("number", "effect", "trials", "effect_deviation"), [(34, 0.5, 1, 0.0), (12, 0.8, 4, 0.6)]
 )
 def test_simulated_power_agrees_with_the_formula(
-    number: int, effect: float, trials: int, own: float
+    number: int, effect: float, trials: int, effect_deviation: float
 ) -> None:
-    (found,) = simulate_power(
+    (comparison,) = simulate_power(
         {"near": 0.0, "far": effect},
         number,
         trial_deviation=np.sqrt(0.5),
         trials=trials,
-        effect_deviation=own,
+        effect_deviation=effect_deviation,
         repetitions=400,
         seed=2,
     )
-    assert found.d_z == pytest.approx(effect / np.sqrt(1.0 / trials + 2.0 * own**2))
-    assert found.interval[0] <= power(found.d_z, number) <= found.interval[1]
-    assert found.found_holm == found.found
+    assert comparison.d_z == pytest.approx(
+        effect / np.sqrt(1.0 / trials + 2.0 * effect_deviation**2)
+    )
+    assert comparison.interval[0] <= power(comparison.d_z, number) <= comparison.interval[1]
+    assert comparison.found_holm == comparison.found
 
 
 def test_correction_costs_power_and_keeps_its_order() -> None:
-    found = simulate_power(
+    comparisons = simulate_power(
         {"a": 0.0, "b": 0.0, "c": 1.0}, 12, trial_deviation=0.8, repetitions=150, seed=3
     )
-    assert [(one.first, one.second) for one in found] == [("a", "b"), ("a", "c"), ("b", "c")]
-    assert all(one.found_holm <= one.found for one in found)
-    assert found[0].found_holm < 0.1 < 0.5 < found[1].found_holm
+    assert [(pair.first, pair.second) for pair in comparisons] == [
+        ("a", "b"),
+        ("a", "c"),
+        ("b", "c"),
+    ]
+    assert all(pair.found_holm <= pair.found for pair in comparisons)
+    assert comparisons[0].found_holm < 0.1 < 0.5 < comparisons[1].found_holm
 
 
 def test_without_effect_families_keep_alpha() -> None:
     runs = [
-        compare_conditions(draw(seed, 10, [0.0, 0.0, 0.0]), "time_s") for seed in range(300)
+        compare_conditions(draw_rows(seed, 10, [0.0, 0.0, 0.0]), "time_s")
+        for seed in range(300)
     ]
     for n in range(3):
         assert stats.kstest([run[n].p for run in runs], "uniform").pvalue > 0.01
-    families = sum(min(one.p_holm for one in run) < 0.05 for run in runs)
+    families = sum(min(pair.p_holm for pair in run) < 0.05 for run in runs)
     assert families <= stats.binom.ppf(0.999, 300, 0.05)
 
 
 # --- figure ------------------------------------------------------------
 
 
+ROWS_WITH_A_GAP = [
+    row
+    for row in draw_rows(9, 6, [0.0, 1.0, 2.0])
+    if row["participant"] != 4 or row["condition"] != "c1"
+]
+"""Rows of six participants, one of whom lacks a condition."""
+
+
 def test_every_participant_is_drawn_under_every_condition() -> None:
-    rows = [
-        row
-        for row in draw(9, 6, [0.0, 1.0, 2.0])
-        if row["participant"] != 4 or row["condition"] != "c1"
-    ]
+    """The figure has each participant's mean, and each condition's mean with its interval."""
+    rows = ROWS_WITH_A_GAP
     figure = draw_conditions(rows, "time_s")
     (axes,) = figure.axes
-    shown = {
-        (float(x), float(y))
-        for line in axes.lines
-        for x, y in zip(*line.get_data(), strict=True)
-    }
-    for n, (name, each) in enumerate(average_trials(rows, "time_s").items()):
-        assert axes.get_xticklabels()[n].get_text() == f"{name}\nn = {len(each)}"
-        assert {(float(n), mean) for mean in each.values()} <= shown
-    for n, one in enumerate(summarise_conditions(rows, "time_s")):
-        assert {(float(n), one.mean), *((float(n), end) for end in one.interval)} <= shown
+    drawn_points = set()
+    for line in axes.lines:
+        for x, y in zip(*line.get_data(), strict=True):
+            drawn_points.add((float(x), float(y)))
+    for n, (name, means) in enumerate(average_trials(rows, "time_s").items()):
+        assert axes.get_xticklabels()[n].get_text() == f"{name}\nn = {len(means)}"
+        assert {(float(n), mean) for mean in means.values()} <= drawn_points
+    for n, summary in enumerate(summarise_conditions(rows, "time_s")):
+        low, high = summary.interval
+        assert {(float(n), value) for value in (low, summary.mean, high)} <= drawn_points
     assert axes.get_ylabel() == "time, s"
-    drawn = [io.BytesIO(), io.BytesIO()]
-    for file in drawn:
-        draw_conditions(rows, "time_s").savefig(file, format="png")
-    assert drawn[0].getvalue() == drawn[1].getvalue()
+
+
+def test_equal_rows_give_equal_pictures() -> None:
+    pictures = []
+    for _ in range(2):
+        file = io.BytesIO()
+        draw_conditions(ROWS_WITH_A_GAP, "time_s").savefig(file, format="png")
+        pictures.append(file.getvalue())
+    assert pictures[0] == pictures[1]

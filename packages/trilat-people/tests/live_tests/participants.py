@@ -7,7 +7,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.live.browsers import launch, role_address
+from tests.live.browsers import launch_browser, role_address
 from tests.live.processes import Process, Stage
 from trilat_net.net.clock import SystemClock
 
@@ -66,9 +66,10 @@ LOOK = """([site, beyond_m]) => {
 }"""
 
 
-def write_protocol(
+def write_live_protocol(
     folder: Path, trials: int, more: str = "", conditions: str = "", task: str = REACH
 ) -> Path:
+    """Writes the protocol of one pair that reaches live; `more` stands before the scenario's keys."""
     file = folder / "short.toml"
     walls = WALL if "contact" in task else ""
     text = PROTOCOL.format(
@@ -82,42 +83,44 @@ class Participant:
     """One user on a page.
 
     Attributes:
-        told: what the page said of each trial that was done, in order: by measure, as text.
-        beyond_m: how far beyond the target along x it goes, as into a wall, m.
+        feedback: The texts that the page showed after each trial, in order, by measure.
+        beyond_m: The distance along x by which the user passes the target, as into a wall, in m.
     """
 
     beyond_m = 0.0
 
     def __init__(self, page: Page, site: str) -> None:
-        self.page, self.site = page, site
-        self.told: list[dict[str, str]] = []
+        self.page = page
+        self.site = site
+        self.feedback: list[dict[str, str]] = []
         self.reached: set[str] = set()
         self._done: tuple[str, str] | None = None
 
     def look(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.page.evaluate(LOOK, [self.site, self.beyond_m])
-        return found
+        """Returns what the page shows of the stage, and where its arm and target are."""
+        shown: dict[str, Any] = self.page.evaluate(LOOK, [self.site, self.beyond_m])
+        return shown
 
     def act(self) -> dict[str, Any]:
-        """Does the next thing that the page asks for; returns what that shows."""
+        """Does the next thing that the page asks for, and returns what the page shows."""
         shown = self.look()
         if shown.get("running"):
             self._reach(shown)
         else:
             self._done = None
-            self._hear()
+            self._read_feedback()
             if shown.get("key") and not shown.get("done") and not shown.get("second"):
                 self._reply(shown)
         return shown
 
-    def _hear(self) -> None:
-        told = self.page.evaluate(
+    def _read_feedback(self) -> None:
+        feedback = self.page.evaluate(
             """() => { const said = [...document.querySelectorAll('#sheet dd[data-measure]')];
             const rows = said.map((dd) => [dd.dataset.measure, dd.textContent]);
             return rows.length ? Object.fromEntries(rows) : null; }"""
         )
-        if told is not None and (not self.told or self.told[-1] != told):
-            self.told.append(told)
+        if feedback is not None and (not self.feedback or self.feedback[-1] != feedback):
+            self.feedback.append(feedback)
 
     def _reply(self, shown: dict[str, Any]) -> None:
         self.page.evaluate(
@@ -154,13 +157,15 @@ def join(browser: Browser, running: Process, site: str) -> Participant:
 def participants(
     running: Process, sites: Sequence[str] = ("m1", "m2")
 ) -> Iterator[list[Participant]]:
+    """Opens a browser with a page for each user; no page may have an error."""
     with sync_playwright() as playwright:
-        browser = launch(playwright)
+        browser = launch_browser(playwright)
         try:
-            found, problems = [join(browser, running, site) for site in sites], list[str]()
-            for one in found:
-                one.page.on("pageerror", lambda error: problems.append(str(error)))
-            yield found
+            people = [join(browser, running, site) for site in sites]
+            problems: list[str] = []
+            for person in people:
+                person.page.on("pageerror", lambda error: problems.append(str(error)))
+            yield people
             assert problems == []
         finally:
             browser.close()
@@ -169,13 +174,13 @@ def participants(
 def take_part(
     people: Sequence[Participant], until: Callable[[], object], timeout_s: float = 120.0
 ) -> None:
-    """Lets all act in turn until something is so."""
+    """Lets all participants act in turn until a condition holds."""
     clock = SystemClock()
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
     while not until():
-        assert clock.monotonic_ns() < give_up_ns, [one.look() for one in people]
-        for one in people:
-            one.act()
+        assert clock.monotonic_ns() < give_up_ns, [person.look() for person in people]
+        for person in people:
+            person.act()
 
 
 def begin(stage: Stage, file: Path | str, *options: str, name: str = "experiment") -> Process:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from tests.live.processes import PAPER, Process, Session, Stage, connections
+from tests.live.processes import PAPER, Process, Session, Stage, connection_options
 from tests.net.waiting import until
 from tests.sites.devices import HaplyService, Vector
 from trilat_net.log.log_reader import Log
@@ -63,7 +63,7 @@ def held(stage: Stage) -> Iterator[Held]:
             "--device",
             f"haply_inverse3={service.address}",
         )
-        process = stage.start("device", *words, *connections(session.endpoints))
+        process = stage.start("device", *words, *connection_options(session.endpoints))
         session.processes["device"] = process
         process.prints("button 'a' takes hold")
         yield Held(session, service, process)

@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from tests.live.browsers import browser_page, needs_browser, page_address, role_address, shows
+from tests.live.browsers import (
+    browser_page,
+    needs_browser,
+    page_address,
+    role_address,
+    wait_until_page,
+)
 from tests.live.page_client import with_query
-from tests.live.processes import Process, Stage, executed_again
+from tests.live.processes import Process, Stage, assert_executed_again
 from trilat_net import create_keys
 from trilat_net.log.log_reader import Log, open_log
 
@@ -55,20 +61,22 @@ class Controllers:
     def place(self, side: str, x: float, y: float, z: float) -> None:
         """Places a controller, and waits until the page has seen it there."""
         frames = self.page.evaluate(MOVE, [side, x, y, z])
-        shows(self.page, f"trilat.parts.headset.frames > {frames + 1}", 60.0)
+        wait_until_page(self.page, f"trilat.parts.headset.frames > {frames + 1}", 60.0)
 
     def press(self, side: str, button: str, value: float) -> None:
         self.page.evaluate(PRESS, [side, button, value])
 
 
 def enter(page: Page) -> Controllers:
-    shows(
+    wait_until_page(
         page,
         "trilat.frame && trilat.frame.t > 1 && trilat.takesPart && trilat.parts.arms.cards[0].graspable",
     )
-    shows(page, "Boolean(document.querySelector('#enter-vr'))")
+    wait_until_page(page, "Boolean(document.querySelector('#enter-vr'))")
     page.click("#enter-vr")
-    shows(page, "trilat.parts.headset.session && trilat.parts.headset.frames > 3", 60.0)
+    wait_until_page(
+        page, "trilat.parts.headset.session && trilat.parts.headset.frames > 3", 60.0
+    )
     return Controllers(page)
 
 
@@ -84,7 +92,7 @@ def ended(running: Process, stage: Stage) -> Log:
     running.signal(signal.SIGINT)  # nobody reads its report
     running.code()
     log = open_log(stage.folder / "out" / "run.mcap")
-    executed_again(log)
+    assert_executed_again(log)
     return log
 
 
@@ -92,10 +100,10 @@ def leads(page: Page, hands: Controllers) -> bool:
     """Takes hold and leads the arm, with a jump there and back; False if a late page had to let go."""
     hands.press("right", "trigger", 0.0)
     hands.place("right", 0.2, 1.2, -0.3)
-    shows(page, "!trilat.frame.holds.length")
+    wait_until_page(page, "!trilat.frame.holds.length")
     dropped = page.evaluate("trilat.parts.headset.dropped")
     hands.press("right", "trigger", 1.0)
-    shows(page, "trilat.frame.holds.includes('m1')")
+    wait_until_page(page, "trilat.frame.holds.includes('m1')")
     way = [(0.2 - 0.004 * n, 1.2 + 0.006 * n, -0.3 - 0.01 * n) for n in range(1, 11)]
     for at in (*way, (0.76, 1.26, -0.4), (0.16, 1.26, -0.4)):
         hands.place("right", *at)
@@ -105,7 +113,7 @@ def leads(page: Page, hands: Controllers) -> bool:
     arrived_s = page.evaluate(
         "trilat.frame.t"
     )  # the target follows with a limited speed and acceleration
-    shows(page, f"trilat.frame.t > {arrived_s + 0.5}")
+    wait_until_page(page, f"trilat.frame.t > {arrived_s + 0.5}")
     return bool(page.evaluate(HELD))
 
 
@@ -120,10 +128,10 @@ def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
         hands = enter(page)
         assert any(leads(page, hands) for _ in range(5))
         hands.press("right", "trigger", 0.0)
-        shows(page, "!trilat.frame.holds.length")
+        wait_until_page(page, "!trilat.frame.holds.length")
         assert page.evaluate("trilat.parts.headset.scenes.length") == 3
         page.evaluate("trilat.parts.headset.session.end()")
-        shows(page, "trilat.parts.headset.session === null")
+        wait_until_page(page, "trilat.parts.headset.session === null")
     log = ended(running, stage)
     part = log["m1"]
     free = np.flatnonzero(~(part.hand[:, 2] > 0.0))
@@ -148,12 +156,12 @@ def test_lost_controllers_let_go_and_buttons_stop(stage: Stage) -> None:
         hands = enter(page)
         hands.place("left", -0.2, 1.2, -0.3)
         hands.press("left", "squeeze", 1.0)
-        shows(page, "trilat.frame.holds.includes('m1')")
+        wait_until_page(page, "trilat.frame.holds.includes('m1')")
         page.evaluate("lost = true")
-        shows(page, "!trilat.frame.holds.length")
+        wait_until_page(page, "!trilat.frame.holds.length")
         page.evaluate("lost = false")
         hands.place("left", -0.2, 1.2, -0.3)
         assert page.evaluate("trilat.frame.holds") == []
         hands.press("right", "b-button", 1.0)
-        shows(page, "trilat.frame.sites.m1.mode === 'stopped'")
+        wait_until_page(page, "trilat.frame.sites.m1.mode === 'stopped'")
     ended(running, stage)

@@ -16,16 +16,23 @@ from websockets.sync.client import connect
 from tests.live.browsers import (
     browser_page,
     chromium_pid,
-    launch,
+    launch_browser,
     needs_browser,
     page_address,
     role_address,
-    shows,
     take_hold,
     tip_px,
+    wait_until_page,
 )
 from tests.live.page_client import page_client, socket_address, with_query
-from tests.live.processes import PAPER, Process, Session, Stage, connections, executed_again
+from tests.live.processes import (
+    PAPER,
+    Process,
+    Session,
+    Stage,
+    assert_executed_again,
+    connection_options,
+)
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from tests.page.whole_pages import watched_page
@@ -78,28 +85,32 @@ def test_people_see_hold_change_and_end_sessions(stage: Stage) -> None:
     # drawing takes what a machine of two cores has
     running = live(stage, "play", "--set", "rate_hz=100")
     with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
+        wait_until_page(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         assert page.locator(".arm").count() == 3
         page.click("#link-presets button:has-text('300 ms')")
         before = page.evaluate("trilat.frame.sites.m1.points.at(-1)")
         take_hold(page, 0, 60.0, 10.0)
-        shows(page, "trilat.frame.holds.includes('m1')")
-        shows(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
+        wait_until_page(page, "trilat.frame.holds.includes('m1')")
+        wait_until_page(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
         # once it is drawn
-        shows(page, "document.querySelector('.arm').innerText.includes('you hold it')")
+        wait_until_page(
+            page, "document.querySelector('.arm').innerText.includes('you hold it')"
+        )
         page.mouse.up()
         page.fill("#mark-text", "felt it")
         page.click("#mark")
-        shows(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
-        shows(page, "Object.values(trilat.frame.links).every((link) => link.age_ms > 290)")
-        shows(page, "trilat.energies.length > 60 && trilat.energies.at(-1)[0] > 2")
+        wait_until_page(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
+        wait_until_page(
+            page, "Object.values(trilat.frame.links).every((link) => link.age_ms > 290)"
+        )
+        wait_until_page(page, "trilat.energies.length > 60 && trilat.energies.at(-1)[0] > 2")
         energies = page.evaluate("trilat.energies")
         end_by_button(page)
         running.prints("checking the log")  # as `demo` does
     running.signal(signal.SIGINT)
     assert running.code() == 130
     log = open_log(stage.folder / "out" / "run.mcap")
-    executed_again(log)
+    assert_executed_again(log)
     assert_energies_are_those_of(log, energies)
     assert len({event.command for event in log.events if event.kind == "change"}) == 6
     assert [event.text for event in log.events if event.kind == "mark"] == ["felt it"]
@@ -118,9 +129,9 @@ def test_every_view_of_a_session_is_whole(who: str, stage: Stage) -> None:
     """With delays that vary: no error, no empty frame, and every line of every plot is drawn."""
     varied = ("rate_hz=250", "link.model=uniform", "link.delay_ms=120", "link.half_width_ms=60")
     running = live(stage, "play", *chain.from_iterable(("--set", one) for one in varied))
-    with sync_playwright() as playwright, watched_page(launch(playwright)) as watched:
+    with sync_playwright() as playwright, watched_page(launch_browser(playwright)) as watched:
         watched.page.goto(role_address(running, who))
-        shows(watched.page, "window.trilat?.frame?.t > 3")
+        wait_until_page(watched.page, "window.trilat?.frame?.t > 3")
         watched.assert_whole(OF_SOME_ROLES)
     running.signal(signal.SIGINT)
     running.prints("checking the log")
@@ -131,7 +142,9 @@ def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
     running = live(stage, "play", "--set", "rate_hz=100")
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     with browser_page(page_address(running), **phone) as page:
-        shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
+        wait_until_page(
+            page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable"
+        )
         page.locator(".arm").first.scroll_into_view_if_needed()
         before = page.evaluate("trilat.frame.sites.m1.points.at(-1)")
         x, y = tip_px(page, 0)
@@ -143,10 +156,10 @@ def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
         touch("touchStart", {"x": x, "y": y})
         for n in range(1, 11):
             touch("touchMove", {"x": x + 4.0 * n, "y": y})
-        shows(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
+        wait_until_page(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
         assert page.evaluate("trilat.frame.holds") == ["m1"]
         touch("touchEnd")
-        shows(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
+        wait_until_page(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
         # the page does not scroll under a finger that leads an arm
         assert page.evaluate("scrollY") == 0
     running.signal(signal.SIGINT)
@@ -183,16 +196,16 @@ def test_a_users_page_draws_what_the_log_says(
         stage, "play", *chain.from_iterable(("--set", one) for one in ("rate_hz=250", *delays))
     )
     with browser_page(role_address(running, "user m1")) as page:
-        shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
+        wait_until_page(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         page.evaluate(KEEP_DRAWN)
         take_hold(page, 0, 60.0, 10.0)
-        shows(page, f"drawn.length >= {count}", 180.0)
+        wait_until_page(page, f"drawn.length >= {count}", 180.0)
         drawn = page.evaluate("drawn")
-        shows(page, "trilat.frame.sites.s.age_ms >= 300")
+        wait_until_page(page, "trilat.frame.sites.s.age_ms >= 300")
         with page_client(page_address(running)) as experimenter:
             experimenter.take()
             experimenter.send(do="ages", shown=False)
-            shows(page, "!('age_ms' in trilat.frame.sites.s)")
+            wait_until_page(page, "!('age_ms' in trilat.frame.sites.s)")
         assert page.is_hidden("#plots")
         assert page.is_hidden("#side")
         assert page.is_hidden("#part")
@@ -226,17 +239,19 @@ def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
     """The browser's own interface, with a pad that is none: no machine of the tests has one."""
     running = live(stage, "play", "--set", "rate_hz=250")
     with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[1].graspable")
+        wait_until_page(
+            page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[1].graspable"
+        )
         page.evaluate(PAD)
         page.evaluate("dispatchEvent(new Event('gamepadconnected'))")
         page.keyboard.press("2")
         before = page.evaluate("trilat.frame.sites.m2.points.at(-1)")
         page.evaluate("pad.buttons[0].pressed = true")
-        shows(page, "trilat.frame.holds.includes('m2')")
+        wait_until_page(page, "trilat.frame.holds.includes('m2')")
         page.evaluate("pad.axes[0] = 0.5")
-        shows(page, f"trilat.frame.sites.m2.points.at(-1)[0] > {before[0]} + 0.02")
+        wait_until_page(page, f"trilat.frame.sites.m2.points.at(-1)[0] > {before[0]} + 0.02")
         page.evaluate("Object.assign(pad.axes, [0, 0]); pad.buttons[0].pressed = false")
-        shows(page, "trilat.frame.sites.m2.grip === 0 && !trilat.frame.holds.length")
+        wait_until_page(page, "trilat.frame.sites.m2.grip === 0 && !trilat.frame.holds.length")
     running.signal(signal.SIGINT)
     running.prints("checking the log")
 
@@ -256,20 +271,22 @@ def test_gamepads_rumble_as_arms_meet_walls(stage: Stage) -> None:
     """Ten times a second at most, as strong as the wall pushes; not before, and not once it is let go."""
     running = live(stage, "play", "--set", "rate_hz=250")
     with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[2].graspable")
+        wait_until_page(
+            page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[2].graspable"
+        )
         page.evaluate(PAD)
         page.evaluate(MOTORS)
         page.evaluate("dispatchEvent(new Event('gamepadconnected'))")
         page.keyboard.press("3")
         page.evaluate("pad.buttons[0].pressed = true")
-        shows(page, "trilat.frame.holds.includes('s')")
+        wait_until_page(page, "trilat.frame.holds.includes('s')")
         assert page.evaluate("rumbles") == []
         page.evaluate("pad.axes[0] = 1.0")
-        shows(page, "rumbles.length > 5")
+        wait_until_page(page, "rumbles.length > 5")
         page.evaluate("Object.assign(pad.axes, [0, 0]); pad.buttons[0].pressed = false")
-        shows(page, "trilat.frame.sites.s.grip === 0 && !trilat.frame.holds.length")
+        wait_until_page(page, "trilat.frame.sites.s.grip === 0 && !trilat.frame.holds.length")
         rumbles = page.evaluate("rumbles")
-        shows(page, "trilat.frame.n > 30")
+        wait_until_page(page, "trilat.frame.n > 30")
         assert page.evaluate("rumbles.length") == len(rumbles)
     assert min(np.diff([one["at"] for one in rumbles])) >= 100.0
     for one in rumbles:
@@ -285,15 +302,15 @@ def test_arms_are_free_after_their_page_dies(killed: str, stage: Stage) -> None:
     """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
     session = Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=250")
     session.all()
-    ways = connections(session.endpoints)
+    ways = connection_options(session.endpoints)
     page_server = stage.start("page", "live", "--session", "t", "--no-browser", *ways)
     with sync_playwright() as playwright:
-        browser = launch(playwright)
+        browser = launch_browser(playwright)
         page = browser.new_page()
         page.goto(page_address(page_server))
-        shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
+        wait_until_page(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         take_hold(page, 0, 40.0, 10.0)
-        shows(page, "trilat.frame.sites.m1.grip === 1")
+        wait_until_page(page, "trilat.frame.sites.m1.grip === 1")
         os.kill(page_server.pid if killed == "server" else chromium_pid(), signal.SIGKILL)
     session.ends_well()
     log = open_log(session.log)
@@ -311,7 +328,7 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
     running = live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as page:
-        shows(page, "trilat.frame && trilat.frame.t > 1")
+        wait_until_page(page, "trilat.frame && trilat.frame.t > 1")
         for _ in range(3):
             with (
                 connect(socket_address(address), max_size=None) as hostile,
@@ -327,7 +344,7 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
                 contextlib.suppress(ConnectionClosed),
             ):
                 hostile.send("x" * (10 << 20))
-        shows(page, "trilat.frame.refused > 3000")
+        wait_until_page(page, "trilat.frame.refused > 3000")
         assert page.evaluate("trilat.frame.sites.m1.grip") == 0
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
@@ -342,7 +359,7 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
 def test_three_arms_are_drawn_with_webgl_and_without(gl: bool, stage: Stage) -> None:
     running = live(stage, "paper", "--duration", "30")
     with browser_page(with_query(page_address(running), "webgl"), gl=gl) as page:
-        shows(page, "trilat.frame && trilat.frame.t > 2")
+        wait_until_page(page, "trilat.frame && trilat.frame.t > 2")
         until(
             lambda: page.inner_text("#painter").startswith("drawn with" if gl else "no WebGL")
         )
@@ -366,15 +383,15 @@ def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
     running = live(stage, "two_sites", "--duration", "30")
     address = page_address(running)
     with browser_page(address) as first:
-        shows(first, "trilat.frame && trilat.takesPart")
+        wait_until_page(first, "trilat.frame && trilat.takesPart")
         second = first.context.browser.new_page()  # type: ignore[union-attr]
         second.goto(address)
-        shows(second, "trilat.frame && trilat.frame.pages === 2")
+        wait_until_page(second, "trilat.frame && trilat.frame.pages === 2")
         assert not second.evaluate("trilat.takesPart")
         assert second.is_disabled("#link-delay")
         second.click("#part")
-        shows(second, "trilat.takesPart")
-        shows(first, "trilat.takesPart")
+        wait_until_page(second, "trilat.takesPart")
+        wait_until_page(first, "trilat.takesPart")
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
 
@@ -392,17 +409,17 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
     options = chain.from_iterable(("--set", one) for one in glide)
     running = live(stage, "two_sites", "--duration", "60", *options)
     with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && trilat.frame.sites.s.mode === 'run'")
+        wait_until_page(page, "trilat.frame && trilat.frame.sites.s.mode === 'run'")
         assert page.locator("#alarms .raised").count() == 0
         arm = page.locator(".arm").first.bounding_box()
-        ways = connections(re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2])
+        ways = connection_options(re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2])
         name = page.evaluate("trilat.hello.session")
         stop = stage.start("stop", "stop", "--session", name, "s", *ways)
         assert stop.code() == 0, stop
         page.wait_for_selector("#alarms .raised")
         words = page.inner_text("#alarms .raised")
         assert "s STOPPED" in words
-        shows(
+        wait_until_page(
             page,
             "document.querySelector('#alarms .raised').innerText.includes('ordered by the operator')",
         )
@@ -414,7 +431,7 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
         assert 0.0 < box["y"] < page.evaluate("innerHeight") - box["height"]
         # what somebody holds stays under the pointer
         assert page.locator(".arm").first.bounding_box() == arm
-        shows(page, "document.querySelector('#state').textContent === 's STOPPED'")
+        wait_until_page(page, "document.querySelector('#state').textContent === 's STOPPED'")
         page.evaluate(
             "document.querySelector('#state').textContent = 's STOPPED, m STOPPED, and more'"
         )
@@ -425,7 +442,7 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
         if "TRILAT_PICTURES" in os.environ:
             page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stopped.png")
         page.click("#alarms button")
-        shows(
+        wait_until_page(
             page,
             "trilat.frame.sites.s.mode === 'run' && !document.querySelector('#alarms .raised')",
         )
@@ -433,7 +450,7 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
             "s was stopped by the operator at",
             "s was enabled by the experimenter at",
         ):
-            shows(
+            wait_until_page(
                 page, f"document.querySelector('#event-list').innerText.includes('{sentence}')"
             )
         assert "{" not in page.inner_text("#event-list")
@@ -458,7 +475,7 @@ def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     link = role_address(running, who)
     with browser_page(link, **(phone if way == "finger" else {})) as page:
-        shows(page, "trilat.frame && trilat.frame.t > 1")
+        wait_until_page(page, "trilat.frame && trilat.frame.t > 1")
         if way == "key":
             page.keyboard.press("Escape")
         elif way == "pad":
@@ -490,7 +507,9 @@ def test_browsers_get_in_by_their_links_token() -> None:
         (line,) = (line for line in said if line.startswith("user m1: "))
         link = line.removeprefix("user m1: ").replace("0.0.0.0", "127.0.0.1")
         with browser_page(link) as page:
-            shows(page, "trilat.hello?.role === 'user' && trilat.hello.as === 'm1'")
+            wait_until_page(page, "trilat.hello?.role === 'user' && trilat.hello.as === 'm1'")
             page.goto(link.replace("as=m1", "as=m2"))
-            shows(page, "document.querySelector('#notice').textContent.includes('no token')")
+            wait_until_page(
+                page, "document.querySelector('#notice').textContent.includes('no token')"
+            )
             assert page.evaluate("trilat.hello") is None

@@ -6,22 +6,22 @@ from typing import Any
 
 import msgspec
 import pytest
+from people_builders import PAIR, make_experiment_trial, replace_text
 from playwright.sync_api import Browser, Page
 from trilat_people.experiment.experiment_run import Experiment, begin_experiment
-from trilat_people.experiment.trial_run import ExperimentTrial, SyntheticTrial
+from trilat_people.experiment.trial_run import SyntheticTrial
 from trilat_people.live_page.experiment_stage import Stage, TrialWatch
 from trilat_people.live_page.page_server import PageServer
 
-from tests.analysis.logs import BUSY, FOUR
-from tests.chains import six_joints
+from tests.analysis.builders import BUSY, FOUR
 from tests.experiments import APART, REACH, write_protocol
-from tests.live.browsers import needs_browser, shows
+from tests.live.browsers import needs_browser, wait_until_page
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.page.whole_pages import watched_page
-from tests.sites.sessions import Session, gliding, reached
-from tests.task_arms import planar_task, posed_arms
+from tests.scenario.builders import planar_task_text, posed_task_text, six_joint_text
+from tests.sites.sessions import Session, make_gliding_scenario, reach_session
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
@@ -39,23 +39,29 @@ OF_LINKS = {name for model in DELAY_MODELS.values() for name in model.__struct_f
 
 
 def list_optional_fields(session: RecordedSession, role: str) -> list[str]:
-    """Patterns of the fields that a page of a role may read although its frames lack them.
+    """Returns patterns of the fields that a page may read although its frames lack them.
 
     A message is a hello or a frame. A stage belongs to an experiment. A link has the fields of its
     model. A user's page gets all fields of its own site, and of the other sites what the user is
     shown of them.
     """
-    own = {"age_ms", *OF_A_HAND, *session.frames[role][-1]["sites"][session.user]}
+    user_fields = {"age_ms", *OF_A_HAND, *session.frames[role][-1]["sites"][session.user]}
     links = [f"links.*.stated.{name}" for name in OF_LINKS]
-    return ["hello", "hello.stage", "stage", *(f"sites.*.{name}" for name in own), *links]
+    return [
+        "hello",
+        "hello.stage",
+        "stage",
+        *(f"sites.*.{name}" for name in user_fields),
+        *links,
+    ]
 
 
 def give_orders(orders: Mapping[float, str], bus: Bus, clock: Clock) -> None:
-    """Orders sites of a running session, at times after its start, s."""
+    """Sends orders to the slave of a running session, at times after its start, in s."""
     begun_ns = clock.monotonic_ns()
     for at_s, order in orders.items():
         clock.sleep_until(begun_ns + int(at_s * 1e9))
-        reached(bus, clock).send_order(["s"], order)
+        reach_session(bus, clock).send_order(["s"], order)
 
 
 def record(scenario: Scenario, user: str, orders: Mapping[float, str] = {}) -> Views:
@@ -70,7 +76,8 @@ def record(scenario: Scenario, user: str, orders: Mapping[float, str] = {}) -> V
     return run
 
 
-def parse(text: str, **overrides: Any) -> Scenario:
+def parse_at_200_hz(text: str, **overrides: Any) -> Scenario:
+    """Returns the scenario of a text at 200 Hz."""
     return parse_scenario(text, overrides={"rate_hz": 200, **overrides})
 
 
@@ -93,17 +100,19 @@ SESSIONS: dict[str, Views] = {
         ),
         "m",
     ),
-    "six joints": record(parse(six_joints(3.0)), "m1"),
-    "planar task": record(parse(planar_task(3.0)), "m"),
-    "posed task": record(parse(posed_arms(3.0)), "m2"),
+    "six joints": record(parse_at_200_hz(six_joint_text(3.0)), "m1"),
+    "planar task": record(parse_at_200_hz(planar_task_text(3.0)), "m"),
+    "posed task": record(parse_at_200_hz(posed_task_text(3.0)), "m2"),
     "carried bodies": record(
         load_scenario("paper", {"duration_s": 3.0, "rate_hz": 200, "sites.s.plant": CAROUSEL}),
         "m1",
     ),
     "wall": record(load_scenario("contact", {"duration_s": 3.0, "rate_hz": 200}), "m"),
-    "stopped": record(gliding(5.0), "m", {2.5: "stop"}),
-    "stopped and enabled": record(gliding(6.0), "m", {2.0: "stop", 3.5: "enable"}),
-    "fault": record(gliding(4.0, **{"sites.s.limits.qd_limit_rad_s": 0.1}), "m"),
+    "stopped": record(make_gliding_scenario(5.0), "m", {2.5: "stop"}),
+    "stopped and enabled": record(
+        make_gliding_scenario(6.0), "m", {2.0: "stop", 3.5: "enable"}
+    ),
+    "fault": record(make_gliding_scenario(4.0, **{"sites.s.limits.qd_limit_rad_s": 0.1}), "m"),
     "diverged": record(
         load_scenario(
             "free", {"duration_s": 4.0, "rate_hz": 200, "limits.qd_limit_rad_s": 4.5}
@@ -168,7 +177,7 @@ def test_view_of_waiting_session_has_no_empty_frame(address: str, browser: Brows
     for query in ("", "as=m1", "watch"):
         with watched_page(browser) as watched:
             watched.page.goto(with_query(address, query))
-            shows(watched.page, "window.trilat?.hello?.running === false")
+            wait_until_page(watched.page, "window.trilat?.hello?.running === false")
             watched.assert_whole(["hello", "hello.stage"])
 
 
@@ -197,11 +206,9 @@ PHASES = ("no step", "consent", "invitation", "rest", "success", "failure", "rep
 
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    """An experiment of a pair with every kind of step."""
     folder = tmp_path_factory.mktemp("experiment")
-    file = write_protocol(folder, '["m1", "m2"]')
-    file.write_text(
-        file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8"
-    )
+    file = replace_text(write_protocol(folder, PAIR), "trials = 2\n", ASKS)
     return begin_experiment(file, folder / "out")
 
 
@@ -216,16 +223,16 @@ def set_phase(
     }
     trial = steps["trial", ""]
     if phase in ("success", "failure"):
-        made = SyntheticTrial(
+        trial_of_models = SyntheticTrial(
             plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest
         )
-        entry = made.write(folder / "log.mcap")
+        entry = trial_of_models.write(folder / "log.mcap")
         stage.show_feedback(msgspec.structs.replace(entry, succeeded=phase == "success"))
     if phase == "repetition":
         stage.show_feedback(None, "an arm was stopped")
     if phase == "starting":
         stage.request_step(trial)
-        stage.show_trial(TrialWatch(watched_trial(experiment), clock))
+        stage.show_trial(TrialWatch(make_experiment_trial(experiment, plan.trials[0]), clock))
     elif phase == "checking":
         stage.request_step(trial)
         stage.show_checking()
@@ -240,11 +247,6 @@ def set_phase(
         stage.request_step(
             steps[step.get(phase, ("trial", ""))], rest_s=30.0 if phase == "rest" else 0.0
         )
-
-
-def watched_trial(experiment: Experiment) -> ExperimentTrial:
-    plan = experiment.plan
-    return ExperimentTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
 
 
 STAGED_VIEWS = {"participant": "as=m1", "experimenter": "", "watcher": "watch"}
@@ -268,7 +270,7 @@ def test_stage_between_trials_has_no_empty_frame(
             with watched_page(browser) as watched:
                 page = watched.page
                 page.goto(with_query(server.address, query))
-                shows(page, "Boolean(window.trilat?.hello?.stage)")
+                wait_until_page(page, "Boolean(window.trilat?.hello?.stage)")
                 watched.assert_whole(OF_STAGED_PAGES)
                 assert page.is_visible("#sheet") == (view == "participant")
                 if page.locator("#sheet button.main:enabled").count():
@@ -288,15 +290,13 @@ def test_stage_in_a_trial_draws_everything(
     task: str, browser: Browser, address: str, tmp_path: Path
 ) -> None:
     text = {"reach": REACH, "apart": APART, "corridor": f"{REACH}\ncorridor_m = 0.03"}[task]
-    experiment = begin_experiment(
-        write_protocol(tmp_path, '["m1", "m2"]', text), tmp_path / "out"
-    )
+    experiment = begin_experiment(write_protocol(tmp_path, PAIR, text), tmp_path / "out")
     clock = ManualClock(1)
     stage = Stage(experiment.plan, clock)
     stage.request_step(
         next(step for step in experiment.plan.list_steps() if step.kind == "trial")
     )
-    trial = watched_trial(experiment)
+    trial = make_experiment_trial(experiment, experiment.plan.trials[0])
     stage.show_trial(TrialWatch(trial, clock))
     (tmp_path / "log").mkdir()
     session = record_views(

@@ -1,11 +1,19 @@
 """An experiment with people, without browsers: whose word counts, and what a folder holds after any end."""
 
-import csv
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from people_builders import (
+    NO_SESSION,
+    PAIR,
+    Killed,
+    People,
+    make_experiment_trial,
+    read_table,
+    replace_text,
+)
 from trilat_people.experiment.experiment_analysis import analyse_experiment
 from trilat_people.experiment.experiment_run import (
     Experiment,
@@ -35,8 +43,6 @@ from trilat_net.execution.verification import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
 
-from .people import NO_SESSION, Killed, People
-
 ASKS = """
 trials = 1
 consent = "We record how the arms move."
@@ -51,10 +57,8 @@ feedback = ["completion_s"]
 
 @pytest.fixture
 def experiment(tmp_path: Path) -> Experiment:
-    file = write_protocol(tmp_path, '["m1", "m2"]')
-    file.write_text(
-        file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8"
-    )
+    """An experiment of a pair with two trials, consent, questionnaires and rest."""
+    file = replace_text(write_protocol(tmp_path, PAIR), "trials = 2\n", ASKS)
     return begin_experiment(file, tmp_path / "out")
 
 
@@ -68,13 +72,8 @@ def stage(experiment: Experiment, clock: ManualClock) -> Stage:
     return Stage(experiment.plan, clock)
 
 
-def rows_of(experiment: Experiment, name: str) -> list[dict[str, str]]:
-    with (experiment.folder / name).open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
 def assert_whole(experiment: Experiment) -> None:
-    """Every trial is there once, by a log that verifies and of which the table has the digest."""
+    """Asserts that a folder has each trial once, with a verified log, and all answers once."""
     rows = open_experiment(experiment.folder).to_rows()
     assert [row["trial_number"] for row in rows] == [1, 2]
     assert {row["people"] for row in rows} == {1}
@@ -82,22 +81,18 @@ def assert_whole(experiment: Experiment) -> None:
     assert len(list((experiment.folder / "logs").iterdir())) == 2
     answers = [
         (row["participant"], row["block"], row["item"])
-        for row in rows_of(experiment, "questionnaires.csv")
+        for row in read_table(experiment.folder, "questionnaires.csv")
     ]
     assert len(set(answers)) == len(answers) == 2 * (2 * 6 + 1)
-    assert [
-        row["who"] for row in rows_of(experiment, "events.csv") if row["event"] == "consent"
-    ] == [
-        "P1",
-        "P2",
-    ]
+    events = read_table(experiment.folder, "events.csv")
+    assert [row["who"] for row in events if row["event"] == "consent"] == ["P1", "P2"]
 
 
 def test_people_are_asked_in_plan_order(experiment: Experiment) -> None:
+    """Participants are asked in the order of the plan, and rest between two blocks."""
     people = People(experiment)
     assert people.run()
-    asked = list(dict.fromkeys(key for _, key in people.steps))
-    assert asked == [
+    assert list(dict.fromkeys(key for _, key in people.steps)) == [
         "consent 1",
         "trial 1",
         "questionnaire 1 tlx",
@@ -107,15 +102,28 @@ def test_people_are_asked_in_plan_order(experiment: Experiment) -> None:
     ]
     assert {site for site, _ in people.steps} == {"m1", "m2"}
     assert_whole(experiment)
-    assert people.monotonic_ns() > 30 * NS_PER_S  # they have rested between two blocks
-    assert people.stage.describe("user", "m1", 0, None)["phase"] == "over"
-    told = people.stage.describe("user", "m1", 0, None)["told"]
-    assert told["measures"] == {"completion_s": experiment.to_rows()[-1]["completion_s"]}
-    found = analyse_experiment(experiment.folder)
-    assert {one.mean for one in found.means.get("tlx", [])} <= {40.0}
+    assert people.monotonic_ns() > 30 * NS_PER_S
 
 
-def killed_in(when: str, number: int) -> Any:
+def test_the_last_page_shows_the_last_measures(experiment: Experiment) -> None:
+    people = People(experiment)
+    people.run()
+    page = people.stage.describe("user", "m1", 0, None)
+    assert page["phase"] == "over"
+    completion_s = experiment.to_rows()[-1]["completion_s"]
+    assert page["told"]["measures"] == {"completion_s": completion_s}
+
+
+def test_answers_of_participants_are_averaged(experiment: Experiment) -> None:
+    """Participants who answer 40 to every question have a mean of 40."""
+    People(experiment, answer=40.0).run()
+    means = analyse_experiment(experiment.folder).means["tlx"]
+    assert {mean.mean for mean in means} == {40.0}
+
+
+def kill_in(when: str, number: int) -> Any:
+    """Returns a fault that ends the program in the session of a trial, or at its start."""
+
     def fault(watch: TrialWatch, folder: Path) -> SessionResult | None:
         if watch.trial.planned.number == number:
             if when == "the session":
@@ -132,25 +140,24 @@ def test_a_killed_program_resumes_at_the_trial(
     when: str, number: int, experiment: Experiment
 ) -> None:
     with pytest.raises(Killed):
-        People(experiment).run(killed_in(when, number))
+        People(experiment).run(kill_in(when, number))
     again = People(open_experiment(experiment.folder))
     assert again.run()
     assert ("m1", "consent 1") not in again.steps
     assert_whole(experiment)
-    aborted = [
-        row["text"] for row in rows_of(experiment, "events.csv") if row["event"] == "aborted"
-    ]
-    assert aborted == (["the program was ended"] if when == "the session" else [])
+    events = read_table(experiment.folder, "events.csv")
+    reasons = [row["text"] for row in events if row["event"] == "aborted"]
+    assert reasons == (["the program was ended"] if when == "the session" else [])
 
 
 def test_trials_with_finished_logs_survive_a_kill(
     experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(*_: object) -> None:
+    def kill(*_: object) -> None:
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(ExperimentTrial, "settle", killed)
+        patch.setattr(ExperimentTrial, "settle", kill)
         patch.setattr(SyntheticTrial, "settle", lambda *_, **__: None)
         with pytest.raises(Killed):
             People(experiment).run()
@@ -164,17 +171,14 @@ def test_trials_with_finished_logs_survive_a_kill(
 
 
 def test_a_full_disk_is_reported_and_loses_nothing(experiment: Experiment) -> None:
-    def full(watch: TrialWatch, folder: Path) -> SessionResult | None:
+    def fill_disk_in_second(watch: TrialWatch, folder: Path) -> SessionResult | None:
+        if watch.trial.planned.number == 1:
+            return None
         problems = ["recorder ended with code 5: No space left on device"]
-        second = watch.trial.planned.number == 2
-        return (
-            SessionResult(folder / "run.mcap", problems, exit_code=LogRefused.exit_code)
-            if second
-            else None
-        )
+        return SessionResult(folder / "run.mcap", problems, exit_code=LogRefused.exit_code)
 
     with pytest.raises(LogRefused, match="No space left"):
-        People(experiment).run(full)
+        People(experiment).run(fill_disk_in_second)
     assert len(open_experiment(experiment.folder).to_rows()) == 1
     assert People(open_experiment(experiment.folder)).run()
     assert_whole(experiment)
@@ -186,10 +190,10 @@ def test_stepping_wall_clocks_change_only_note_times(
 ) -> None:
     people = People(experiment)
 
-    def steps(watch: TrialWatch, _: Path) -> None:
-        people.wall_ns = step_ns * (watch.trial.planned.number == 1)
+    def step_wall_clock(watch: TrialWatch, _: Path) -> None:
+        people.wall_ns = step_ns if watch.trial.planned.number == 1 else 0
 
-    assert people.run(steps)
+    assert people.run(step_wall_clock)
     assert_whole(experiment)
     assert people.monotonic_ns() < 120 * NS_PER_S
 
@@ -197,7 +201,7 @@ def test_stepping_wall_clocks_change_only_note_times(
 def test_aborted_trials_are_kept_aside_and_repeated(experiment: Experiment) -> None:
     tries: list[str] = []
 
-    def stops(watch: TrialWatch, folder: Path) -> SessionResult | None:
+    def stop_first_try(watch: TrialWatch, folder: Path) -> SessionResult | None:
         tries.append(folder.name)
         if len(tries) > 1:
             return None
@@ -206,7 +210,7 @@ def test_aborted_trials_are_kept_aside_and_repeated(experiment: Experiment) -> N
         return SessionResult(folder / "run.mcap")
 
     people = People(experiment)
-    assert people.run(stops)
+    assert people.run(stop_first_try)
     assert tries == ["00001-01", "00001-02", "00002-01"]
     assert (experiment.folder / "tries" / "00001-01" / "run.mcap").exists()
     assert "trial 1 must be repeated: m1 stopped it" in people.said
@@ -214,24 +218,17 @@ def test_aborted_trials_are_kept_aside_and_repeated(experiment: Experiment) -> N
 
 
 def test_logs_that_end_early_do_not_count(experiment: Experiment) -> None:
-    trial = ExperimentTrial(
-        experiment.plan.protocol,
-        experiment.plan.scenarios["near"],
-        experiment.plan.trials[0],
-        experiment.plan.digest,
-    )
-    assert TrialJudge(trial).accept(0.0, [-0.6, 1.2], [0.0, 0.0]) is None
-    people = People(experiment)
-    left: list[int] = [1]
+    """A trial whose log ends early is kept aside and repeated."""
+    tries: list[str] = []
 
-    def breaks(_: TrialWatch, folder: Path) -> SessionResult | None:
-        if not left:
+    def break_first_log(_: TrialWatch, folder: Path) -> SessionResult | None:
+        tries.append(folder.name)
+        if len(tries) > 1:
             return None
-        left.clear()
         (folder / "run.mcap").write_bytes(b"no log")
         return SessionResult(folder / "run.mcap")
 
-    assert people.run(breaks)
+    assert People(experiment).run(break_first_log)
     assert (experiment.folder / "tries" / "00001-01").is_dir()
     assert_whole(experiment)
 
@@ -245,52 +242,56 @@ def test_people_and_models_share_no_folder(experiment: Experiment) -> None:
         open_experiment(experiment.folder).run(jobs=1)
 
 
-def first_trial(experiment: Experiment) -> Any:
+def test_a_trial_goes_on_after_its_first_tick(experiment: Experiment) -> None:
+    trial = make_experiment_trial(experiment, experiment.plan.trials[0])
+    assert TrialJudge(trial).accept(0.0, [-0.6, 1.2], [0.0, 0.0]) is None
+
+
+def find_first_trial(experiment: Experiment) -> Any:
+    """Returns the step of the first trial."""
     return next(step for step in experiment.plan.list_steps() if step.kind == "trial")
 
 
 def test_first_page_of_a_role_speaks_for_it(experiment: Experiment, stage: Stage) -> None:
-    asked = stage.request_step(first_trial(experiment))
+    request = stage.request_step(find_first_trial(experiment))
     stage.poll(NO_SESSION, [("m1", 7), ("m1", 9), ("m2", 8)])
     ready = DoStep(key="trial 1")
     assert not stage.accept("m1", 9, ready)
     assert not stage.accept("m1", 7, DoStep(key="trial 2"))
     assert not stage.accept("", 3, ready)
     assert stage.accept("m1", 7, ready)
-    assert asked.replies.keys() == {"m1"}
+    assert request.replies.keys() == {"m1"}
     assert stage.describe("user", "m1", 9, None)["second"]
     assert not stage.describe("user", "m1", 7, None)["second"]
     stage.poll(NO_SESSION, [("m1", 9), ("m2", 8)])  # who leaves is not ready any more
-    assert not asked.replies
+    assert not request.replies
     assert stage.accept("m1", 9, ready)
 
 
 def test_answers_are_those_of_the_scale(experiment: Experiment, stage: Stage) -> None:
-    step = next(one for one in experiment.plan.list_steps() if one.kind == "questionnaire")
-    asked = stage.request_step(step)
+    step = next(step for step in experiment.plan.list_steps() if step.kind == "questionnaire")
+    request = stage.request_step(step)
     stage.poll(NO_SESSION, [("m1", 1), ("m2", 2)])
     for answers in ([], [40.0] * 5, [41.0] * 6, [105.0] * 6, [-5.0] * 6):
         assert not stage.accept("m1", 1, DoStep(key=step.key, answers=answers))
     assert stage.accept(
         "m1", 1, DoStep(key=step.key, answers=[0.0, 100.0, 5.0, 50.0, 60.0, 95.0])
     )
-    assert asked.replies["m1"][0]["physical"] == 100.0
+    assert request.replies["m1"][0]["physical"] == 100.0
     assert stage.accept(
         "m2", 2, DoStep(key=step.key, answers=[0.0, None, 5.0, None, 60.0, 95.0])
     )
-    assert asked.replies["m2"][0]["physical"] is None  # a slider that nobody touched
+    assert request.replies["m2"][0]["physical"] is None  # a slider that nobody touched
 
 
 def test_users_are_not_told_the_condition(experiment: Experiment, stage: Stage) -> None:
-    stage.request_step(first_trial(experiment))
+    stage.request_step(find_first_trial(experiment))
     stage.poll(NO_SESSION, [("m1", 1)])
-    shown = {
-        who: stage.describe(who, site, 1, None)
-        for who, site in (("user", "m1"), ("experimenter", ""))
-    }
-    assert "near" not in str(shown["user"])
-    assert shown["experimenter"]["condition"] == "near"
-    assert [one["state"] for one in shown["user"]["users"]] == ["here", ""]
+    user_page = stage.describe("user", "m1", 1, None)
+    experimenter_page = stage.describe("experimenter", "", 1, None)
+    assert "near" not in str(user_page)
+    assert experimenter_page["condition"] == "near"
+    assert [user["state"] for user in user_page["users"]] == ["here", ""]
 
 
 @pytest.fixture
@@ -302,7 +303,8 @@ def watched(experiment: Experiment, tmp_path: Path) -> tuple[Any, Any, Any]:
     return trial, entry, open_log(tmp_path / "log.mcap")
 
 
-def view_of(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> Any:
+def make_view(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> Any:
+    """Returns a view of a session whose slave has made the ticks of a log up to `last`."""
     window = RecordWindow(trial.scenario, "s", kept_s=60.0)
     for record in log["s"].states[: last + 1]:
         window.receive(record)
@@ -311,30 +313,34 @@ def view_of(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> A
 
 
 def test_users_see_own_target_and_corridor(tmp_path: Path, clock: ManualClock) -> None:
-    def shown(task: str, site: str) -> Any:
-        (folder := tmp_path / task[-3:] / (site or "-")).mkdir(parents=True)
-        plan = begin_experiment(
-            write_protocol(folder, '["m1", "m2"]', task), folder / "out"
-        ).plan
-        trial = ExperimentTrial(
-            plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest
-        )
+    """Each user sees a target of its own, and a corridor only if the task has one."""
+
+    def describe_first_trial(task: str, site: str) -> Any:
+        folder = tmp_path / task[-3:] / (site or "-")
+        folder.mkdir(parents=True)
+        experiment = begin_experiment(write_protocol(folder, PAIR, task), folder / "out")
+        trial = make_experiment_trial(experiment, experiment.plan.trials[0])
         return TrialWatch(trial, clock).describe(trial.appears_s + 0.5, site)
 
-    first, second, middle = (shown(APART, site)["target"]["at"] for site in ("m1", "m2", ""))
-    assert first[0] - second[0] == pytest.approx(0.1)
-    assert middle[0] == pytest.approx(0.5 * (first[0] + second[0]))
-    carried = shown(f"{REACH}\ncorridor_m = 0.03", "m1")
-    assert carried["way"]["width_m"] == 0.03
-    assert carried["way"]["from"] != carried["target"]["at"]
-    assert "way" not in shown(REACH, "m1")
+    first_m = describe_first_trial(APART, "m1")["target"]["at"]
+    second_m = describe_first_trial(APART, "m2")["target"]["at"]
+    middle_m = describe_first_trial(APART, "")["target"]["at"]
+    assert first_m[0] - second_m[0] == pytest.approx(0.1)
+    assert middle_m[0] == pytest.approx(0.5 * (first_m[0] + second_m[0]))
+
+    with_corridor = describe_first_trial(f"{REACH}\ncorridor_m = 0.03", "m1")
+    assert with_corridor["way"]["width_m"] == 0.03
+    assert with_corridor["way"]["from"] != with_corridor["target"]["at"]
+    assert "way" not in describe_first_trial(REACH, "m1")
 
 
 def test_watch_judges_as_the_log_does(watched: Any, clock: ManualClock) -> None:
+    """A watch of the records during a trial has the outcome of the finished log."""
     trial, entry, log = watched
-    watch, moments = TrialWatch(trial, clock), []
+    watch = TrialWatch(trial, clock)
+    moments = []
     for last in range(3, len(log["s"]), 17):
-        moments += watch.poll(view_of(trial, log, last), ())
+        moments += watch.poll(make_view(trial, log, last), ())
     assert watch.judge.outcome is not None
     assert watch.judge.outcome.succeeded == entry.succeeded
     assert watch.judge.outcome.ended_s - trial.appears_s == entry.measures["completion_s"]
@@ -347,7 +353,7 @@ def test_watch_judges_as_the_log_does(watched: Any, clock: ManualClock) -> None:
 def test_a_stopped_arm_ends_the_trial(watched: Any, clock: ManualClock) -> None:
     trial, _, log = watched
     watch = TrialWatch(trial, clock)
-    assert watch.poll(view_of(trial, log, 5, "stopped"), ()) == ["trial 1 aborted: s stopped"]
+    assert watch.poll(make_view(trial, log, 5, "stopped"), ()) == ["trial 1 aborted: s stopped"]
     assert watch.over
 
 
@@ -356,7 +362,7 @@ def test_an_absent_page_ends_the_trial(
 ) -> None:
     trial, _, log = watched
     clock = stage._clock
-    stage.request_step(first_trial(experiment))
+    stage.request_step(find_first_trial(experiment))
     both = [("m1", 1), ("m2", 2)]
     stage.poll(NO_SESSION, both)
     watch = TrialWatch(trial, clock)
@@ -368,10 +374,10 @@ def test_an_absent_page_ends_the_trial(
         (both[:1], 1),
     ):
         clock.sleep_until(clock.monotonic_ns() + passed_ns)
-        stage.poll(view_of(trial, log, 5), pages)
+        stage.poll(make_view(trial, log, 5), pages)
         assert not watch.aborted  # a page that was reloaded is back in time
     clock.sleep_until(clock.monotonic_ns() + MAX_ABSENCE_NS + 1)
-    stage.poll(view_of(trial, log, 5), both[:1])
+    stage.poll(make_view(trial, log, 5), both[:1])
     assert watch.aborted == "the page of m2 is gone"
 
 
@@ -389,9 +395,10 @@ def test_users_and_experimenters_stop_a_trial(stage: Stage, watched: Any) -> Non
 
 def test_server_turns_from_session_to_session(experiment: Experiment) -> None:
     """A user's page answers for its own site; each session greets every page anew."""
-    clock, network = SystemClock(), LocalNetwork()
+    clock = SystemClock()
+    network = LocalNetwork()
     stage = Stage(experiment.plan, clock)
-    asked = stage.request_step(first_trial(experiment))
+    request = stage.request_step(find_first_trial(experiment))
     with (
         PageServer(network.join(), clock, "idle", stage=stage) as server,
         page_client(with_query(server.address, "as=m1")) as user,
@@ -405,7 +412,7 @@ def test_server_turns_from_session_to_session(experiment: Experiment) -> None:
         user.send(do="step", key="consent 1")
         until(lambda: server.refused["was not asked"] == 1)
         user.send(do="step", key="trial 1")
-        until(lambda: "m1" in asked.replies)
+        until(lambda: "m1" in request.replies)
         server.show(network.join(), "another")
         assert server.view.session == "another"
         until(lambda: user.take() == {} and user.hello["session"] == "another")

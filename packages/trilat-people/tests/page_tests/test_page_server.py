@@ -45,36 +45,43 @@ def network() -> LocalNetwork:
 
 @pytest.fixture
 def server(network: LocalNetwork) -> Iterator[PageServer]:
-    with PageServer(network.join(), SystemClock(), "s1") as made:
-        yield made
+    """A server of the pages of a session without sites."""
+    with PageServer(network.join(), SystemClock(), "s1") as page_server:
+        yield page_server
 
 
-def socket(server: PageServer, origin: str | None = None, link: str = "") -> ClientConnection:
+def open_socket(
+    server: PageServer, origin: str | None = None, link: str = ""
+) -> ClientConnection:
+    """Returns the socket of a page, at the link of a role or of the experimenter."""
     return connect(socket_address(link or server.address), origin=origin, max_size=None)
 
 
 def get(server: PageServer, path: str, **headers: str) -> tuple[int, str, bytes]:
+    """Returns the status, the security policy and the content at a path."""
     connection = HTTPConnection(urlsplit(server.address).netloc, timeout=5)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     return answer.status, answer.headers["Content-Security-Policy"] or "", answer.read()
 
 
-def hears(client: ClientConnection) -> dict[str, object]:
+def receive(client: ClientConnection) -> dict[str, object]:
+    """Returns the next message that a page gets."""
     return json.loads(client.recv(timeout=5))  # type: ignore[no-any-return]
 
 
-def raw(server: PageServer, request: bytes) -> bytes:
-    with create_connection(
-        (urlsplit(server.address).hostname, urlsplit(server.address).port), 5
-    ) as there:
-        there.sendall(request)
+def send_request(server: PageServer, request: bytes) -> bytes:
+    """Sends bytes to the server, and returns all bytes of the answer."""
+    address = urlsplit(server.address)
+    with create_connection((address.hostname, address.port), 5) as connection:
+        connection.sendall(request)
         if b"\r\n\r\n" not in request:
-            there.shutdown(SHUT_WR)
-        return b"".join(iter(lambda: there.recv(65_536), b""))
+            connection.shutdown(SHUT_WR)
+        return b"".join(iter(lambda: connection.recv(65_536), b""))
 
 
 def flood(client: ClientConnection, count: int) -> None:
+    """Sends many messages that a page has drawn a frame."""
     for _ in range(count):
         client.send('{"do":"seen","n":0}')
 
@@ -108,10 +115,10 @@ def test_a_page_of_another_site_gets_no_socket(server: PageServer) -> None:
     own_origin = server.address.partition("/#")[0]
     for origin in ("http://evil.example", "null", own_origin.replace("http", "https")):
         with pytest.raises(InvalidStatus, match="403"):
-            socket(server, origin)
+            open_socket(server, origin)
     assert server.refused["foreign origin"] == 3
-    with socket(server, own_origin) as own:
-        assert "hello" in hears(own)
+    with open_socket(server, own_origin) as page:
+        assert "hello" in receive(page)
 
 
 def test_foreign_names_for_this_address_are_refused(server: PageServer) -> None:
@@ -153,8 +160,8 @@ def test_every_socket_needs_the_token_of_its_link(host: str, network: LocalNetwo
         for query in ("?watch", "?as=m1"):
             assert get(server, f"/socket{query}")[0] == 403
         assert server.refused["no token"] == 8
-        with socket(server) as page:
-            assert "hello" in hears(page)
+        with open_socket(server) as page:
+            assert "hello" in receive(page)
         assert get(server, "/")[0] == 200  # what everybody may read; a fragment is not sent
 
 
@@ -172,7 +179,7 @@ def test_pages_with_keys_are_encrypted_and_named(network: LocalNetwork, tmp_path
         assert b"trilat live" in page.getresponse().read()
         wss = at.replace("https", "wss") + f"socket?{token}"
         with connect(wss, ssl=trusted, origin=Origin(at.rstrip("/"))) as client:
-            assert "hello" in hears(client)
+            assert "hello" in receive(client)
         with (
             pytest.raises(InvalidStatus, match="403"),
             connect(wss, ssl=trusted, origin=Origin("http://a")),
@@ -210,30 +217,30 @@ def test_unusable_keys_are_found_before_anything_begins(tmp_path: Path) -> None:
     ],
 )
 def test_nonsense_is_counted_and_dropped(server: PageServer, text: str, reason: str) -> None:
-    with socket(server) as page:
+    with open_socket(server) as page:
         page.send(text)
         until(lambda: server.refused[reason] == 1)
         page.send(b"\xff\xfe")
         until(lambda: server.refused.total() == 2)
-        assert "hello" in hears(page)
+        assert "hello" in receive(page)
 
 
 @pytest.mark.long
 def test_megabytes_and_floods_end_the_connection(
     server: PageServer,
 ) -> None:
-    with socket(server) as page:
+    with open_socket(server) as page:
         page.send("x" * (10 << 20))
         with pytest.raises(ConnectionClosed) as closed:
-            until(lambda: hears(page) and False)
+            until(lambda: receive(page) and False)
         assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
     until(lambda: server.refused["too large"] == 1)
-    with socket(server) as hostile, pytest.raises(ConnectionClosed):
+    with open_socket(server) as hostile, pytest.raises(ConnectionClosed):
         flood(hostile, 100_000)
     assert server.refused["too many"] == MAX_EXCESS + 1
-    with socket(server) as page:
+    with open_socket(server) as page:
         page.send("x" * (MAX_MESSAGE_BYTES - 2))
-        assert "hello" in hears(page)
+        assert "hello" in receive(page)
 
 
 def test_only_participating_pages_give_orders(
@@ -243,8 +250,9 @@ def test_only_participating_pages_give_orders(
     questions = site.query_inbox("trilat/s1/s/set")
     server.view.links = {"m1->s": {}}
     order = '{"do":"link","link":"m1->s","to":{"delay_ms":300,"deviation_ms":0,"loss":0}}'
-    with socket(server) as first, socket(server) as second:
-        hears(first), hears(second)
+    with open_socket(server) as first, open_socket(server) as second:
+        receive(first)
+        receive(second)
         second.send(order)
         until(lambda: server.refused["does not take part"] == 1)
         assert questions.poll() is None
@@ -264,13 +272,13 @@ def test_only_participating_pages_give_orders(
 
 def test_hand_requests_are_in_range_or_refused(server: PageServer) -> None:
     """An arm that is not there, or that nobody can hold, is refused; so is what is no number."""
-    with socket(server) as page:
+    with open_socket(server) as page:
         page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
         until(lambda: server.refused["nobody can hold it"] == 1)
         for to in ("[NaN,0]", "[1e999,0]", '["1",0]', str([0.0] * 13)):
             page.send(f'{{"do":"hand","site":"m1","grip":true,"to":{to}}}')
         until(lambda: server.refused["malformed"] == 4)
-        assert "hello" in hears(page)
+        assert "hello" in receive(page)
 
 
 def test_pages_hands_end_with_their_page(network: LocalNetwork) -> None:
@@ -283,7 +291,7 @@ def test_pages_hands_end_with_their_page(network: LocalNetwork) -> None:
     hands[0].release()
     hands[0].release()
     sent = [decode(payload, HandMessage) for _, payload in drained(messages)]
-    assert [(one.source, one.n, one.grip, one.target) for one in sent] == [
+    assert [(message.source, message.n, message.grip, message.target) for message in sent] == [
         ("page 1", 1, True, [1.0, 0.5]),
         ("page 2", 1, True, [1.0, 0.5]),
         ("page 1", 2, True, [1.1, 0.5]),
@@ -310,34 +318,34 @@ def test_pages_hands_end_with_their_page(network: LocalNetwork) -> None:
 def test_invalid_requests_get_400_and_are_counted(
     server: PageServer, request_: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert raw(server, request_).startswith(b"HTTP/1.1 400 ")
+    assert send_request(server, request_).startswith(b"HTTP/1.1 400 ")
     assert server.refused == {"malformed request": 1}
-    assert raw(server, b"") == b""  # a connection that is opened ahead is not counted
+    assert send_request(server, b"") == b""  # a connection that is opened ahead is not counted
     assert get(server, "/")[0] == 200
     assert server.refused.total() == 1
     assert capfd.readouterr() == ("", "")
 
 
 def test_a_socket_that_breaks_the_protocol_is_counted(server: PageServer) -> None:
-    with socket(server) as page:
+    with open_socket(server) as page:
         page.socket.sendall(b"\xff" * 64)
         until(lambda: server.refused["broken frames"] == 1)
     request = (
         f"GET /socket?{urlsplit(server.address).fragment} HTTP/1.1\r\nHost: localhost\r\n\r\n"
     )
-    assert raw(server, request.encode()).startswith(b"HTTP/1.1 426 ")
+    assert send_request(server, request.encode()).startswith(b"HTTP/1.1 426 ")
     assert server.refused["malformed request"] == 1
 
 
 def test_marks_hands_and_control_have_rate_limits(server: PageServer) -> None:
-    with socket(server) as page:
+    with open_socket(server) as page:
         for _ in range(50):
             page.send('{"do":"mark","text":"a"}')
             page.send('{"do":"control","want":true}')
         until(lambda: server.refused["too many: mark"] > 35)
         assert server.refused["too many: control"] > 35
-        assert "hello" in hears(page)
-    with socket(server) as page:
+        assert "hello" in receive(page)
+    with open_socket(server) as page:
         for _ in range(450):
             page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
         until(
@@ -352,10 +360,13 @@ def test_marks_hands_and_control_have_rate_limits(server: PageServer) -> None:
 
 def test_any_page_stops_every_arm_at_once(network: LocalNetwork, server: PageServer) -> None:
     site: LocalBus = network.join()
-    changes, stops = site.query_inbox("trilat/s1/s/set"), site.query_inbox("trilat/s1/s/stop")
-    server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
-    with socket(server) as first, socket(server) as second:
-        hears(first), hears(second)
+    changes = site.query_inbox("trilat/s1/s/set")
+    stops = site.query_inbox("trilat/s1/s/stop")
+    server.view.sites = {"s": None}  # type: ignore[dict-item]
+    server.view.links = {"m1->s": {}}  # type: ignore[dict-item]
+    with open_socket(server) as first, open_socket(server) as second:
+        receive(first)
+        receive(second)
         first.send('{"do":"link","link":"m1->s","to":{"delay_ms":1}}')
         until(changes.poll)  # nobody answers
         second.send('{"do":"stop"}')
@@ -371,10 +382,12 @@ def test_experimenters_release_arms_until_a_stop(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
-    changes, stops = site.query_inbox("trilat/s1/s/set"), site.query_inbox("trilat/s1/s/stop")
-    server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
-    with socket(server) as page:
-        hears(page)
+    changes = site.query_inbox("trilat/s1/s/set")
+    stops = site.query_inbox("trilat/s1/s/stop")
+    server.view.sites = {"s": None}  # type: ignore[dict-item]
+    server.view.links = {"m1->s": {}}  # type: ignore[dict-item]
+    with open_socket(server) as page:
+        receive(page)
         page.send('{"do":"release","order":"enable","sites":["s"]}')
         query = until(changes.poll)  # nobody answers
         released = ChangeRequest(order="enable", source="the experimenter")
@@ -397,11 +410,11 @@ def test_experimenters_release_arms_until_a_stop(
 def test_stops_refused_by_older_sites_are_repeated(
     network: LocalNetwork, server: PageServer
 ) -> None:
-    """It knows no source of an order, and refuses what names one."""
+    """A stop that names its source is repeated without it for a site that refuses sources."""
     stops = network.join().query_inbox("trilat/s1/s/stop")
     server.view.sites = {"s": None}  # type: ignore[dict-item]
-    with socket(server) as page:
-        hears(page)
+    with open_socket(server) as page:
+        receive(page)
         page.send('{"do":"stop"}')
         query = until(stops.poll)
         query.reply(encode(ChangeReply(member="s", accepted=False, text="malformed")))
@@ -416,8 +429,9 @@ def test_inner_failures_are_counted_and_reported(capfd: pytest.CaptureFixture[st
         closing(ZenohBus()) as bus,
         PageServer(bus, SystemClock(), "s1", say=said.append) as server,
     ):
-        server.view.sites, server.view.links = {"a#b": None}, {"m1->a#b": {}}  # type: ignore[dict-item]
-        with socket(server) as page:
+        server.view.sites = {"a#b": None}  # type: ignore[dict-item]
+        server.view.links = {"m1->a#b": {}}  # type: ignore[dict-item]
+        with open_socket(server) as page:
             for _ in range(3):
                 page.send('{"do":"stop"}')
             until(lambda: server.refused["message failed: ZError"] == 3)
@@ -427,7 +441,7 @@ def test_inner_failures_are_counted_and_reported(capfd: pytest.CaptureFixture[st
             until(lambda: server.refused["OrderDesk.poll failed: ZError"] > 1)
             page.send("nonsense")
             until(lambda: server.refused["malformed"] == 1)
-            assert "hello" in hears(page)
+            assert "hello" in receive(page)
     assert sum("message failed: ZError" in text for text in said) == 1
     assert sum("OrderDesk.poll failed: ZError" in text for text in said) == 1
     assert capfd.readouterr() == ("", "")
@@ -436,20 +450,22 @@ def test_inner_failures_are_counted_and_reported(capfd: pytest.CaptureFixture[st
 def test_ended_loops_restart_at_the_same_address(network: LocalNetwork) -> None:
     said: list[str] = []
     with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server:
-        address, loop = server.address, server._loop
+        address = server.address
+        loop = server._loop
         assert loop is not None
-        with socket(server) as page:
-            hears(page)
+        with open_socket(server) as page:
+            receive(page)
             loop.call_soon_threadsafe(loop.stop)
             until(lambda: len(said) > 1 and server._loop is not loop)
-        until(lambda: reached(server))
+        until(lambda: is_reached(server))
         assert server.address == address
-        with socket(server) as page:
-            assert "hello" in hears(page)
+        with open_socket(server) as page:
+            assert "hello" in receive(page)
     assert server.refused["server failed: RuntimeError"] == 1
 
 
-def reached(server: PageServer) -> bool:
+def is_reached(server: PageServer) -> bool:
+    """Returns True if the server answers."""
     with contextlib.suppress(OSError):
         return get(server, "/")[0] == 200
     return False
@@ -467,11 +483,12 @@ ORDERS = [
     '{"do":"release","order":"reset","sites":["s"]}',
     '{"do":"hand","site":"m2","grip":true,"to":[1.0,0.5]}',
 ]
-"""What no user of m1 may ask for; nor may a watcher, who may not hold m1 either."""
+"""Orders that neither a user of m1 nor a watcher may give."""
 OWN_HAND = '{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}'
 
 
-def told_links(server: PageServer, said: list[str]) -> dict[str, str]:
+def read_links(server: PageServer, said: list[str]) -> dict[str, str]:
+    """Returns the links that a server prints, by role and user."""
     server.view.scenario = load_scenario("paper")
     until(lambda: len(said) == 4)
     return dict(line.split(": ", 1) for line in said)
@@ -487,22 +504,23 @@ def roles(
     options: PageOptions = request.param
     with PageServer(
         network.join(), SystemClock(), "s1", options, ends=True, say=said.append
-    ) as made:
-        yield made, told_links(made, said)
+    ) as page_server:
+        yield page_server, read_links(page_server, said)
 
 
 def test_each_role_has_a_link_naming_it(
     roles: tuple[PageServer, dict[str, str]],
 ) -> None:
+    """The page at a link has the link's role and site, and only the experimenter ends sessions."""
     server, links = roles
     assert list(links) == ["experimenter", "user m1", "user m2", "watcher"]
-    seen = {}
-    for who, link in links.items():
-        with socket(server, link=link) as page:
-            hello = hears(page)["hello"]
+    views = {}
+    for name, link in links.items():
+        with open_socket(server, link=link) as page:
+            hello = receive(page)["hello"]
             assert isinstance(hello, dict)
-            seen[who] = hello["role"], hello["as"], hello["ends"]
-    assert seen == {
+            views[name] = hello["role"], hello["as"], hello["ends"]
+    assert views == {
         "user m1": ("user", "m1", False),
         "user m2": ("user", "m2", False),
         "watcher": ("watcher", "", False),
@@ -510,27 +528,28 @@ def test_each_role_has_a_link_naming_it(
     }
 
 
-@pytest.mark.parametrize("who", ["user m1", "watcher"])
+@pytest.mark.parametrize("name", ["user m1", "watcher"])
 def test_users_and_watchers_give_no_orders_but_stop(
-    roles: tuple[PageServer, dict[str, str]], who: str, network: LocalNetwork
+    roles: tuple[PageServer, dict[str, str]], name: str, network: LocalNetwork
 ) -> None:
+    """A user's or watcher's page may stop all arms, and its other orders are counted as refused."""
     server, links = roles
-    stops, changes = (
-        network.join().query_inbox(f"trilat/s1/s/{kind}") for kind in ("stop", "set")
-    )
-    with socket(server, link=links[who]) as page:
-        server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
+    stops = network.join().query_inbox("trilat/s1/s/stop")
+    changes = network.join().query_inbox("trilat/s1/s/set")
+    with open_socket(server, link=links[name]) as page:
+        server.view.sites = {"s": None}  # type: ignore[dict-item]
+        server.view.links = {"m1->s": {}}  # type: ignore[dict-item]
         for order in ORDERS:
             page.send(order)
         until(lambda: server.refused["not of its role"] == len(ORDERS))
-        page.send(OWN_HAND)  # there is no m1 here: what may be sent reaches nobody
+        page.send(OWN_HAND)  # a user may move its hand, but the session has no m1
         counted = Counter({"not of its role": len(ORDERS)})
-        counted["nobody can hold it" if who == "user m1" else "not of its role"] += 1
-        until(lambda: server.refused >= counted)  # and what a site that is none does to frames
+        counted["nobody can hold it" if name == "user m1" else "not of its role"] += 1
+        until(lambda: server.refused >= counted)
         assert {reason: server.refused[reason] for reason in counted} == counted
         page.send('{"do":"stop"}')
         query = until(stops.poll)
-        source = "the user of m1" if who == "user m1" else "a watcher"
+        source = "the user of m1" if name == "user m1" else "a watcher"
         assert decode(query.payload, ChangeRequest) == ChangeRequest(
             order="stop", source=source
         )
@@ -544,37 +563,40 @@ def test_a_users_token_opens_only_its_view() -> None:
     with PageServer(
         LocalNetwork().join(), SystemClock(), "s1", guarded, say=said.append
     ) as server:
-        links = told_links(server, said)
+        links = read_links(server, said)
         token = urlsplit(links["user m1"]).fragment
         for query in ("", "?as=m2", "?as=s", "?as=", "?watch", "?watch&as=m2"):
             with pytest.raises(InvalidStatus, match="403"):
-                socket(server, link=f"{links['user m1'].partition('?')[0]}{query}#{token}")
+                open_socket(server, link=f"{links['user m1'].partition('?')[0]}{query}#{token}")
         watching = urlsplit(links["watcher"]).fragment
-        with socket(server, link=f"{links['watcher'].partition('?')[0]}#{watching}") as page:
+        with open_socket(
+            server, link=f"{links['watcher'].partition('?')[0]}#{watching}"
+        ) as page:
             assert '"role":"watcher"' in str(page.recv(timeout=5))  # without the word too
     assert server.refused["no token"] == 6
 
 
 def test_users_take_part_beside_experimenters(network: LocalNetwork) -> None:
-    """Nobody asks a user, and a user asks nobody."""
+    """A user's page and an experimenter's page both take part without a request."""
     with PageServer(network.join(), SystemClock(), "s1") as server:
         with (
-            socket(server, link=with_query(server.address, "as=m1")) as user,
-            socket(server) as page,
+            open_socket(server, link=with_query(server.address, "as=m1")) as user,
+            open_socket(server) as experimenter,
         ):
-            hears(user), hears(page)
+            receive(user)
+            receive(experimenter)
             until(lambda: len(server._pages) == 2)
-            taking = {one.role.kind: one.takes_part for one in server._pages}
-        assert taking == {"user": True, "experimenter": True}
+            takes_part = {page.role.kind: page.takes_part for page in server._pages}
+        assert takes_part == {"user": True, "experimenter": True}
 
 
 def test_pages_of_unknown_sites_are_closed(server: PageServer) -> None:
     server.view.scenario = load_scenario("paper")
     with (
-        socket(server, link=with_query(server.address, "as=m9")) as page,
+        open_socket(server, link=with_query(server.address, "as=m9")) as page,
         pytest.raises(ConnectionClosed) as closed,
     ):
-        hears(page)
+        receive(page)
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.reason == "the session has no such site"
 
@@ -582,19 +604,19 @@ def test_pages_of_unknown_sites_are_closed(server: PageServer) -> None:
 def test_report_and_log_are_the_experimenters_only(
     server: PageServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At an address that no other page is told and nobody guesses; the report's scripts reach nothing."""
+    """Only the experimenter's page gets the address of the report, whose scripts reach nothing."""
     monkeypatch.setattr(server._frames, "make_frame", lambda: {"sites": {}, "t": 0.0})
     monkeypatch.setattr(server._frames, "describe_as", lambda *_, **__: {"t": 0.0})
     report = tmp_path / "report.html"
     report.write_text("<p>a report</p>")
     server.files.results = {"/secret/report.html": report}
-    told = {}
+    results = {}
     for link in ("", "as=m1", "watch", "watch&as=m1"):
-        with socket(server, link=with_query(server.address, link)) as page:
-            while "results" not in (message := hears(page)):
+        with open_socket(server, link=with_query(server.address, link)) as page:
+            while "results" not in (message := receive(page)):
                 page.send(json.dumps({"do": "seen", "n": 2**40}))
-            told[link] = message["results"]
-    assert told == {"": ["/secret/report.html"], "as=m1": [], "watch": [], "watch&as=m1": []}
+            results[link] = message["results"]
+    assert results == {"": ["/secret/report.html"], "as=m1": [], "watch": [], "watch&as=m1": []}
     status, policy, content = get(server, "/secret/report.html")
     assert (status, content) == (200, b"<p>a report</p>")
     assert "sandbox" in policy
@@ -603,43 +625,45 @@ def test_report_and_log_are_the_experimenters_only(
 
 
 def test_watchers_take_no_other_places(network: LocalNetwork) -> None:
-    """Whoever has the watchers' link takes all places of watchers, and locks nobody else out."""
+    """Watchers who fill all their places exclude no experimenter and no user."""
     said: list[str] = []
     with (
         PageServer(network.join(), SystemClock(), "s1", say=said.append) as server,
         ExitStack() as stack,
     ):
-        links = told_links(server, said)
+        links = read_links(server, said)
         for _ in range(MAX_PAGES["watcher"]):
-            hears(stack.enter_context(socket(server, link=links["watcher"])))
+            receive(stack.enter_context(open_socket(server, link=links["watcher"])))
         for _ in range(3):
             with pytest.raises(InvalidStatus, match="503"):
-                socket(server, link=links["watcher"])
+                open_socket(server, link=links["watcher"])
         assert server.refused["too many watchers"] == 3
-        for who in ("experimenter", "user m1", "user m2"):
-            assert "hello" in hears(stack.enter_context(socket(server, link=links[who])))
+        for name in ("experimenter", "user m1", "user m2"):
+            assert "hello" in receive(
+                stack.enter_context(open_socket(server, link=links[name]))
+            )
 
 
-@pytest.mark.parametrize("who", ["experimenter", "user m1"])
-def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNetwork) -> None:
-    """Pages that were left open elsewhere give way, the one that takes part last."""
+@pytest.mark.parametrize("name", ["experimenter", "user m1"])
+def test_newest_page_of_experimenter_or_user_gets_in(name: str, network: LocalNetwork) -> None:
+    """The oldest page of a role gives way to a new one, but not the experimenter who takes part."""
     said: list[str] = []
     with (
         PageServer(network.join(), SystemClock(), "s1", say=said.append) as server,
         ExitStack() as stack,
     ):
-        links = told_links(server, said)
-        kind = who.split()[0]
+        links = read_links(server, said)
+        kind = name.split()[0]
         pages = []
         for _ in range(MAX_PAGES[kind] + 1):
-            pages.append(stack.enter_context(socket(server, link=links[who])))
-            assert "hello" in hears(pages[-1])
-        other = stack.enter_context(socket(server, link=links["user m2"]))
-        assert "hello" in hears(other)
+            pages.append(stack.enter_context(open_socket(server, link=links[name])))
+            assert "hello" in receive(pages[-1])
+        other = stack.enter_context(open_socket(server, link=links["user m2"]))
+        assert "hello" in receive(other)
         # the first experimenter takes part
         oldest = pages[1] if kind == "experimenter" else pages[0]
         with pytest.raises(ConnectionClosed) as closed:
-            until(lambda: hears(oldest) and False)
+            until(lambda: receive(oldest) and False)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.reason == "a newer page took its place"
         until(lambda: len(server._pages) == MAX_PAGES[kind] + 1)
@@ -650,22 +674,22 @@ def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNet
     "sent", [b"", b"GET / HT", b"GET /three.module.min.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"]
 )
 def test_silent_and_slow_connections_exclude_nobody(sent: bytes, server: PageServer) -> None:
-    """Connections that say nothing, half of a request, or never read their answer."""
-    at = urlsplit(server.address)
+    """Connections that send nothing, half of a request, or never read their answer exclude no page."""
+    address = urlsplit(server.address)
     with ExitStack() as stack:
         for _ in range(3 * MAX_STRANGERS):
-            slow = stack.enter_context(create_connection((at.hostname, at.port), 5))
+            slow = stack.enter_context(create_connection((address.hostname, address.port), 5))
             slow.sendall(sent)
-        with socket(server) as page:
-            assert "hello" in hears(page)
+        with open_socket(server) as page:
+            assert "hello" in receive(page)
         assert get(server, "/")[0] == 200
     if len(sent) < 10:  # the others were answered, and closed
         assert server.refused["too many connections"] >= 2 * MAX_STRANGERS - 10
 
 
 def test_silent_connections_are_closed(server: PageServer) -> None:
-    at = urlsplit(server.address)
-    with create_connection((at.hostname, at.port), 20 * REQUEST_TIMEOUT_S) as silent:
+    address = urlsplit(server.address)
+    with create_connection((address.hostname, address.port), 20 * REQUEST_TIMEOUT_S) as silent:
         silent.sendall(b"GET / HT")
         assert silent.recv(100) == b""
 
@@ -675,15 +699,17 @@ def test_silent_connections_to_encrypted_page_are_closed(
 ) -> None:
     (keys,) = create_keys(tmp_path / "keys", ["operator"])
     with PageServer(network.join(), SystemClock(), "s1", PageOptions(tls=keys)) as server:
-        at = urlsplit(server.address)
-        with create_connection((at.hostname, at.port), 20 * REQUEST_TIMEOUT_S) as silent:
+        address = urlsplit(server.address)
+        with create_connection(
+            (address.hostname, address.port), 20 * REQUEST_TIMEOUT_S
+        ) as silent:
             assert silent.recv(100) == b""
 
 
 def test_browsers_are_opened_by_the_users_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The token stands in no command line, which every user of the machine can list."""
+    """The browser opens a private file with the link, so that no command line has the token."""
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
@@ -694,6 +720,7 @@ def test_browsers_are_opened_by_the_users_file(
     assert opened == [file.as_uri()]
     assert "secret" not in opened[0]
     assert 'href="http://127.0.0.1:1/?as=m1&amp;x=&lt;b&gt;#token=secret"' in file.read_text()
-    assert (folder.stat().st_mode & 0o777, file.stat().st_mode & 0o777) == (0o700, 0o600)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert file.stat().st_mode & 0o777 == 0o600
     opening.remove_file()
     assert not list(tmp_path.iterdir())

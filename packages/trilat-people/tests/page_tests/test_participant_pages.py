@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from people_builders import NO_SESSION, PAIR, replace_text
 from playwright.sync_api import Browser, Page, WebSocketRoute
 from trilat_people.experiment.experiment_run import begin_experiment
 from trilat_people.live_page.experiment_stage import Stage
@@ -16,7 +17,6 @@ from tests.live.page_client import with_query
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
 
-from .people import NO_SESSION
 from .recorded_session import SCREENS, RecordedSession, record_session
 
 pytestmark = [needs_browser, pytest.mark.long]
@@ -31,28 +31,26 @@ Json = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Json]:
-    """What a user's page is shown when each questionnaire is asked, by its name."""
-    folder = tmp_path_factory.mktemp("asked")
-    file = write_protocol(folder, '["m1", "m2"]')
-    text = file.read_text(encoding="utf-8").replace("trials = 2\n", f"trials = 2\n{FORMS}")
-    file.write_text(text, encoding="utf-8")
+def forms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Json]:
+    """By the name of a questionnaire, the stage that a user's page shows for its form."""
+    folder = tmp_path_factory.mktemp("forms")
+    file = replace_text(write_protocol(folder, PAIR), "trials = 2\n", f"trials = 2\n{FORMS}")
     experiment = begin_experiment(file, folder / "out")
     stage = Stage(experiment.plan, ManualClock(1))
-    found = {}
+    stages = {}
     for step in experiment.plan.list_steps():
-        if step.form is not None and step.form.name not in found:
+        if step.form is not None and step.form.name not in stages:
             stage.request_step(step)
             stage.poll(NO_SESSION, [("m1", 1), ("m2", 2)])
-            found[step.form.name] = stage.describe("user", "m1", 1, None)
-    return found
+            stages[step.form.name] = stage.describe("user", "m1", 1, None)
+    return stages
 
 
 @contextmanager
 def form_page(
     browser: Browser, address: str, stage: Json, screen: str
 ) -> Iterator[tuple[Page, list[Json]]]:
-    """A user's page that is asked a questionnaire, and the messages that it sends besides `seen`."""
+    """Opens a user's page with a form; yields the page, and its messages besides `seen`."""
     sent: list[Json] = []
     hello = {
         "running": False,
@@ -87,9 +85,9 @@ def form_page(
 
 @pytest.mark.parametrize("screen", SCREENS)
 def test_untouched_sliders_are_empty_and_sent_as_missing(
-    address: str, browser: Browser, asked: dict[str, Json], screen: str
+    address: str, browser: Browser, forms: dict[str, Json], screen: str
 ) -> None:
-    with form_page(browser, address, asked["tlx"], screen) as (page, sent):
+    with form_page(browser, address, forms["tlx"], screen) as (page, sent):
         sliders = page.locator("#sheet input[type=range]")
         assert sliders.count() == page.locator("#sheet input.unset").count() == 6
         sliders.nth(0).click()  # in the middle, where the value is already
@@ -107,9 +105,9 @@ def test_untouched_sliders_are_empty_and_sent_as_missing(
 
 @pytest.mark.parametrize("screen", SCREENS)
 def test_touched_sliders_are_placed_where_pressed(
-    address: str, browser: Browser, asked: dict[str, Json], screen: str
+    address: str, browser: Browser, forms: dict[str, Json], screen: str
 ) -> None:
-    with form_page(browser, address, asked["tlx"], screen) as (page, _):
+    with form_page(browser, address, forms["tlx"], screen) as (page, _):
         slider = page.locator("#sheet input[type=range]").nth(1)
         box = slider.bounding_box()
         assert box is not None
@@ -120,9 +118,9 @@ def test_touched_sliders_are_placed_where_pressed(
 
 @pytest.mark.parametrize("screen", SCREENS)
 def test_unmade_choices_are_missing(
-    address: str, browser: Browser, asked: dict[str, Json], screen: str
+    address: str, browser: Browser, forms: dict[str, Json], screen: str
 ) -> None:
-    with form_page(browser, address, asked["trust"], screen) as (page, sent):
+    with form_page(browser, address, forms["trust"], screen) as (page, sent):
         page.locator("#sheet .choices").nth(1).locator("input").nth(6).click()
         page.click("#sheet button.main")
         page.click("#sheet button.main")
@@ -131,9 +129,9 @@ def test_unmade_choices_are_missing(
 
 
 def test_a_forced_choice_waits_for_its_answer(
-    address: str, browser: Browser, asked: dict[str, Json]
+    address: str, browser: Browser, forms: dict[str, Json]
 ) -> None:
-    stage = {**asked["trust"], "form": {**asked["trust"]["form"], "forced": True}}
+    stage = {**forms["trust"], "form": {**forms["trust"]["form"], "forced": True}}
     with form_page(browser, address, stage, "desktop") as (page, sent):
         assert page.is_disabled("#sheet button.main")
         for choices in page.locator("#sheet .choices").all():

@@ -38,11 +38,11 @@ from trilat_ros2.ros2_bridge import (
 from trilat_ros2.ros2_topics import BridgeEnds, SiteTopics
 
 import trilat_net
-from tests.log.standard_files import made
+from tests.log.standard_files import write_standard_files
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
-from tests.task_arms import posed_arms
+from tests.scenario.builders import posed_task_text
 from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from trilat_net.app.running_session import ShareHistory
 from trilat_net.core.step.ticks import Mode, TickRecord
@@ -69,7 +69,8 @@ from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import load_scenario
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
-FIRST, SECOND = Attachment(1, 5, b"a" * 16), Attachment(1, 5, b"b" * 16)
+FIRST = Attachment(1, 5, b"a" * 16)
+SECOND = Attachment(1, 5, b"b" * 16)
 NAMES = [("m1_q1", "q1"), ("m1_q2", "q2")]
 
 
@@ -95,7 +96,9 @@ class Desk:
     """The topic `target_pose` of a planar arm, with a clock and the texts that were printed."""
 
     def __init__(self) -> None:
-        self.arm, self.clock, self.said = HeldArm(), ManualClock(), list[str]()
+        self.arm = HeldArm()
+        self.clock = ManualClock()
+        self.said: list[str] = []
         self.refusals = Refusals(self.said.append)
         self.topic = TargetTopic(
             self.arm,  # type: ignore[arg-type]
@@ -105,22 +108,25 @@ class Desk:
         )
         self.take = self.refusals.guard("play/m1/target_pose", self.topic.receive)
 
-    def hears(
+    def receive(
         self, x: float, sender: Attachment = FIRST, after_ns: int = 0, frame: str = "m1/base"
     ) -> None:
+        """Receives a pose after some time."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.topic.watch()
         self.take(cdr.pack_frame_vectors(7, frame, x, 0.5, 0, 0, 0, 0, 1), sender)
 
 
-def joints(names: Sequence[str], angles: Sequence[float]) -> bytes:
+def pack_joints(names: Sequence[str], angles: Sequence[float]) -> bytes:
+    """Returns a message with the angles of joints, in rad."""
     return cdr.JointStatePacker(names, velocity=False, effort=False).pack(0, angles)
 
 
 def test_a_pose_moves_the_target_until_silence() -> None:
+    """A target is released when its publisher has been silent for longer than `SILENCE_NS`."""
     desk = Desk()
-    desk.hears(0.1)
-    desk.hears(0.2, after_ns=SILENCE_NS)
+    desk.receive(0.1)
+    desk.receive(0.2, after_ns=SILENCE_NS)
     assert desk.arm.goals == [(0.1, 0.5), (0.2, 0.5)]
     desk.clock.sleep_until(desk.clock.monotonic_ns() + SILENCE_NS)
     desk.topic.watch()
@@ -132,13 +138,13 @@ def test_a_pose_moves_the_target_until_silence() -> None:
 
 def test_two_publishers_move_nothing_until_one_is_gone() -> None:
     desk = Desk()
-    desk.hears(0.1)
-    desk.hears(0.9, SECOND, after_ns=10)
+    desk.receive(0.1)
+    desk.receive(0.9, SECOND, after_ns=10)
     assert not desk.arm.holds
     for _ in range(9):
-        desk.hears(0.2, after_ns=100_000_000)
+        desk.receive(0.2, after_ns=100_000_000)
     assert desk.arm.goals == [(0.1, 0.5)]
-    desk.hears(0.3, after_ns=200_000_000)
+    desk.receive(0.3, after_ns=200_000_000)
     assert desk.arm.goals == [(0.1, 0.5), (0.3, 0.5)]
     assert desk.said == [
         "refused: play/m1/target_pose has two publishers: the messages of both are refused until one of them is silent"
@@ -148,18 +154,20 @@ def test_two_publishers_move_nothing_until_one_is_gone() -> None:
 
 @given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
 def test_every_message_is_taken_or_counted(data: bytes) -> None:
+    """Any bytes either give one finite target or count as one refusal."""
     desk = Desk()
     desk.take(data, FIRST)
     assert len(desk.arm.goals) + desk.refusals.counts.total() == 1
-    assert all(map(math.isfinite, (x for goal in desk.arm.goals for x in goal)))
+    for goal in desk.arm.goals:
+        assert all(map(math.isfinite, goal))
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, 1e7])
 def test_an_impossible_target_leaves_the_last_target(x: float) -> None:
     desk = Desk()
-    desk.hears(0.1)
-    desk.hears(x)
-    desk.hears(x)
+    desk.receive(0.1)
+    desk.receive(x)
+    desk.receive(x)
     assert desk.arm.goals == [(0.1, 0.5)]
     assert len(desk.said) == 1
     assert desk.refusals.counts.total() == 2
@@ -167,8 +175,8 @@ def test_an_impossible_target_leaves_the_last_target(x: float) -> None:
 
 def test_a_pose_in_another_frame_moves_nothing() -> None:
     desk = Desk()
-    desk.hears(0.1, frame="")
-    desk.hears(0.2, frame="camera")
+    desk.receive(0.1, frame="")
+    desk.receive(0.2, frame="camera")
     assert desk.arm.goals == [(0.1, 0.5)]
     assert desk.said == [
         "refused: play/m1/target_pose is in the frame 'camera', but this site uses 'm1/base'"
@@ -176,11 +184,10 @@ def test_a_pose_in_another_frame_moves_nothing() -> None:
 
 
 def test_joints_are_found_by_name_in_any_order() -> None:
-    assert read_joint_target(NAMES, joints(["m1_q2", "m1_q1"], [2.0, 1.0])) == [1.0, 2.0]
-    assert read_joint_target(NAMES, joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])) == [
-        1.0,
-        2.0,
-    ]
+    swapped = pack_joints(["m1_q2", "m1_q1"], [2.0, 1.0])
+    with_another = pack_joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])
+    assert read_joint_target(NAMES, swapped) == [1.0, 2.0]
+    assert read_joint_target(NAMES, with_another) == [1.0, 2.0]
 
 
 @pytest.mark.parametrize(
@@ -196,7 +203,7 @@ def test_missing_and_non_finite_joints_are_named(
     names: list[str], angles: list[float], said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
-        read_joint_target(NAMES, joints(names, angles))
+        read_joint_target(NAMES, pack_joints(names, angles))
 
 
 PAGES = "".join(
@@ -280,8 +287,9 @@ class Listener:
     connected = True
 
     def __init__(self) -> None:
-        self.came: dict[str, Topic] = defaultdict(Topic)
-        self.refusals, self.served = Refusals(print), list[str]()
+        self.published: dict[str, Topic] = defaultdict(Topic)
+        self.refusals = Refusals(print)
+        self.served: list[str] = []
         self.offered: dict[str, tuple[str, bool]] = {}
 
     def subscribe(self, *_: object) -> None:
@@ -292,24 +300,34 @@ class Listener:
 
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> Topic:
         self.offered[topic] = kind, qos.latched
-        return self.came[topic]
+        return self.published[topic]
 
 
-def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
-    frames_by_name = {"world": (np.zeros(3), Rotation.identity())}
-    for frame in frames:
-        (at, turned), move, turn = (
-            frames_by_name[frame.header.frame_id],
-            frame.transform.translation,
-            frame.transform.rotation,
-        )
-        position = at + turned.apply([move.x, move.y, move.z])
-        frames_by_name[frame.child_frame_id] = (
-            position,
-            turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]),
-        )
-    return [where for name, where in frames_by_name.items() if name.startswith(f"{site}/")] + [
-        frames_by_name["world"]
+Pose = tuple[Any, Rotation]
+"""A position in m, and a rotation."""
+
+
+def read_pose(position: Any, orientation: Any) -> Pose:
+    """Returns the pose that a message has in its fields."""
+    rotation = Rotation.from_quat([orientation.x, orientation.y, orientation.z, orientation.w])
+    return np.array([position.x, position.y, position.z]), rotation
+
+
+def compose(outer: Pose, inner: Pose) -> Pose:
+    """Returns a pose in the frame of another pose, as a pose in that pose's frame."""
+    position, rotation = outer
+    inner_position, inner_rotation = inner
+    return position + rotation.apply(inner_position), rotation * inner_rotation
+
+
+def place_frames(transforms: Any, site: str) -> list[Pose]:
+    """Returns the poses of a site's frames and of the root in the root's frame."""
+    poses = {"world": (np.zeros(3), Rotation.identity())}
+    for message in transforms:
+        pose = read_pose(message.transform.translation, message.transform.rotation)
+        poses[message.child_frame_id] = compose(poses[message.header.frame_id], pose)
+    return [
+        pose for name, pose in poses.items() if name == "world" or name.startswith(f"{site}/")
     ]
 
 
@@ -320,46 +338,43 @@ def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
         "six_joints",
         "unlike_arms",
         "wall_in_space",
-        pytest.param(posed_arms(), id="posed"),
+        pytest.param(posed_task_text(), id="posed"),
     ],
 )
 def test_transforms_hold_the_pose_of_the_tip(name: str) -> None:
+    """The pose of the end effector is that of one of the published frames."""
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
         ends: Any = BridgeEnds(graph, None, None, "t", TopicTable.read("crisp"))  # type: ignore[arg-type]
-        site_topics = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+        site_topics = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
         site_topics.publish(log[site].states[-1], 1000.0)
         messages = [
-            ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]
+            ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
+            for data in graph.published["tf"]
         ]
-        frames = [one for message in messages for one in message.transforms]
+        transforms = [transform for message in messages for transform in message.transforms]
         tip = ROS.deserialize_cdr(
-            graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped"
+            graph.published[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped"
         )
-        where, turn = tip.pose.position, tip.pose.orientation
-        transform = next(
-            frame for frame in frames if frame.child_frame_id == tip.header.frame_id
-        ).transform
-        base = Rotation.from_quat(
-            [
-                transform.rotation.x,
-                transform.rotation.y,
-                transform.rotation.z,
-                transform.rotation.w,
-            ]
+        base = next(
+            message.transform
+            for message in transforms
+            if message.child_frame_id == tip.header.frame_id
         )
-        position = base.apply([where.x, where.y, where.z])
-        position += [transform.translation.x, transform.translation.y, transform.translation.z]
-        turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
-        distances = [
-            max(np.abs(at - position).max(), (way.inv() * turned).magnitude())
-            for at, way in compose(frames, site)
-        ]
+        tip_position, tip_rotation = compose(
+            read_pose(base.translation, base.rotation),
+            read_pose(tip.pose.position, tip.pose.orientation),
+        )
+        distances = []
+        for position, rotation in place_frames(transforms, site):
+            angle_rad = (rotation.inv() * tip_rotation).magnitude()
+            distances.append(max(np.abs(position - tip_position).max(), angle_rad))
         assert min(distances) < 1e-7
 
 
-def shares(*numbers: float) -> bytes:
+def pack_shares(*numbers: float) -> bytes:
+    """Returns a message with numbers as rosbags encodes them."""
     array = ROS.types["std_msgs/msg/Float64MultiArray"]
     layout = ROS.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     return bytes(
@@ -378,17 +393,17 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
         if sum(wanted.values()) != 1.0:
             raise RunFailed("must sum to 1")
 
-    refusals, clock = Refusals(said.append), ManualClock()
+    refusals = Refusals(said.append)
+    clock = ManualClock()
     topic = DominanceTopic(["m1", "m2"], change, clock)
-    take, ask = (
-        refusals.guard("t/s/set_dominance", act) for act in (topic.receive, topic.send_request)
-    )
+    take = refusals.guard("t/s/set_dominance", topic.receive)
+    ask = refusals.guard("t/s/set_dominance", topic.send_request)
     for data in (
-        shares(0.9, 0.1),
-        shares(0.9, 0.1),
-        shares(0.5, 0.1),
-        shares(1.0),
-        shares(math.nan, 0.0),
+        pack_shares(0.9, 0.1),
+        pack_shares(0.9, 0.1),
+        pack_shares(0.5, 0.1),
+        pack_shares(1.0),
+        pack_shares(math.nan, 0.0),
         b"x",
     ):
         take(data, FIRST)
@@ -403,7 +418,7 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
     ]
     # whoever asks for the same later may have been overruled meanwhile
     clock.sleep_until(2 * SENDER_TIMEOUT_NS)
-    take(shares(0.5, 0.1), FIRST)
+    take(pack_shares(0.5, 0.1), FIRST)
     ask()
     assert requests[2:] == [{"m1": 0.5, "m2": 0.1}]
 
@@ -414,10 +429,14 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
 def test_shares_are_those_that_the_certificate_sees(
     changes: list[tuple[int, int, float]],
 ) -> None:
+    """The history of shares that a live session shows is the history that a certificate reads."""
     scenario = load_scenario("paper")
-    history, ramps = ShareHistory(scenario, "s"), []
+    history = ShareHistory(scenario, "s")
+    ramps = []
     for start, lasts, share in changes:
-        to, at_s, ramp_s = {"m1": share, "m2": 1.0 - share}, start / 10.0, lasts / 10.0
+        to = {"m1": share, "m2": 1.0 - share}
+        at_s = start / 10.0
+        ramp_s = lasts / 10.0
         history.add_change(
             json.dumps({"at_s": at_s, "dominance": "s", "to": to, "ramp_s": ramp_s})
         )
@@ -449,8 +468,11 @@ class Robot:
     """
 
     def __init__(self, controller: Sequence[str] = ("elbow", "shoulder")) -> None:
-        network, self.clock, self.said = LocalNetwork(), ManualClock(10**9), list[str]()
-        site, bridge = network.join(), network.join()
+        network = LocalNetwork()
+        site = network.join()
+        bridge = network.join()
+        self.clock = ManualClock(10**9)
+        self.said: list[str] = []
         self.refusals = Refusals(self.said.append)
         self._measured = site.inbox(topics.key("t", "s", topics.MEASURED))
         self._state = site.publisher(topics.key("t", "s", topics.STATE))
@@ -465,7 +487,7 @@ class Robot:
         self.arm.armed = True
         self.take = self.refusals.guard("joint_states", self.arm.receive)
 
-    def says(
+    def publish_joints(
         self,
         names: Sequence[str],
         q: Sequence[float],
@@ -478,39 +500,64 @@ class Robot:
             sender,
         )
 
-    def measured(self) -> list[ArmMeasurement]:
+    def read_measurements(self) -> list[ArmMeasurement]:
+        """Returns the measurements that the site has received since the last call."""
         return [decode(payload, ArmMeasurement) for _, payload in drained(self._measured)]
 
-    def ticks(self, k: int, *tau: float, mode: Mode = Mode.RUN, since_ns: int = 0) -> None:
-        zeros, mem = [0.0, 0.0], [0.0, 0.0, float(since_ns)]
-        motion = zeros, zeros, zeros, zeros, list(tau), zeros, []
-        record = TickRecord(k, k * 10**6, mode, *motion, [-1], 0, [], mem)
+    def publish_tick(
+        self, k: int, *tau: float, mode: Mode = Mode.RUN, since_ns: int = 0
+    ) -> None:
+        """Publishes a record of the site with these torques, in N m."""
+        zeros = [0.0, 0.0]
+        record = TickRecord(
+            k,
+            k * 10**6,
+            mode,
+            q=zeros,
+            qd=zeros,
+            q_des=zeros,
+            qd_des=zeros,
+            tau=list(tau),
+            tau_x=zeros,
+            theta_hat=[],
+            used=[-1],
+            rx_crc=0,
+            cmd=[],
+            mem=[0.0, 0.0, float(since_ns)],
+        )
         self._state(encode_state("s", 1, ["m"], record, (), 0, 0))
 
-    def driven(self, after_ns: int = 0) -> list[list[float]]:
+    def read_commands(self, after_ns: int = 0) -> list[list[float]]:
+        """Returns the commands that the robot gets after some time."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.commands.clear()
         self.arm.send_command()
-        got = [
+        messages = [
             ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray")
             for data in self.commands
         ]
-        return [message.data.tolist() for message in got]
+        return [message.data.tolist() for message in messages]
 
 
 def test_joint_states_are_measurements_of_the_site() -> None:
-    robot, of_another_clock = Robot(), 1_790_000_000 * 10**9
-    robot.says(
+    """Joints are found by their names, and messages without these joints are ignored."""
+    robot = Robot()
+    of_another_clock = 1_790_000_000 * 10**9
+    robot.publish_joints(
         ["gripper", "elbow", "shoulder"],
         [9.0, 2.0, 1.0],
         [8.0, 4.0, 3.0],
         stamp_ns=of_another_clock,
     )
-    robot.says(["shoulder", "elbow"], [1.5, 2.5], [0.0, 0.0], stamp_ns=0)
-    robot.says(["wheel"], [7.0], [7.0])  # another robot on the same topic
-    first, second = robot.measured()
-    assert (first.q, first.qd, first.sent_ns) == ([1.0, 2.0], [3.0, 4.0], of_another_clock)
-    assert (second.q, second.n, second.sent_ns) == ([1.5, 2.5], 1, 0)
+    robot.publish_joints(["shoulder", "elbow"], [1.5, 2.5], [0.0, 0.0], stamp_ns=0)
+    robot.publish_joints(["wheel"], [7.0], [7.0])  # another robot on the same topic
+    first, second = robot.read_measurements()
+    assert first.q == [1.0, 2.0]
+    assert first.qd == [3.0, 4.0]
+    assert first.sent_ns == of_another_clock
+    assert second.q == [1.5, 2.5]
+    assert second.n == 1
+    assert second.sent_ns == 0
     assert not robot.said
 
 
@@ -524,14 +571,14 @@ def test_silent_robots_are_named_once_then_rarely() -> None:
 
     assert not hear(FIRST_NOTICE_NS - 1)
     assert hear(1) == "no message on /joint_states yet: s waits for its arm"
-    robot.says(["wheel"], [7.0], [7.0])
+    robot.publish_joints(["wheel"], [7.0], [7.0])
     assert not hear(NEXT_NOTICE_NS - 1)
     assert hear(1) == (
         "no measurement on /joint_states yet: s waits for its arm with shoulder, elbow; a "
         "message has wheel"
     )
     for _ in range(3):
-        robot.says(["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
+        robot.publish_joints(["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
         assert not hear(FIRST_NOTICE_NS - 1)
     assert hear(1) == "no further measurement on /joint_states: s has lost its arm"
     assert not hear(NEXT_NOTICE_NS - 1)
@@ -552,20 +599,21 @@ def test_joint_states_that_measure_no_arm_are_named(
     names: list[str], q: list[float], qd: list[float], said: str
 ) -> None:
     robot = Robot()
-    robot.says(names, q, qd)
-    assert robot.measured() == []
+    robot.publish_joints(names, q, qd)
+    assert robot.read_measurements() == []
     assert robot.said == [f"refused: joint_states {said}"]
 
 
 def test_two_robots_on_one_topic_measure_nothing() -> None:
-    robot, pose = Robot(), (["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
-    robot.says(*pose)
-    robot.says(*pose, sender=SECOND)
-    robot.says(*pose)
-    assert len(robot.measured()) == 1
+    robot = Robot()
+    pose = (["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
+    robot.publish_joints(*pose)
+    robot.publish_joints(*pose, sender=SECOND)
+    robot.publish_joints(*pose)
+    assert len(robot.read_measurements()) == 1
     robot.clock.sleep_until(robot.clock.monotonic_ns() + SENDER_TIMEOUT_NS)
-    robot.says(*pose)
-    assert len(robot.measured()) == 1
+    robot.publish_joints(*pose)
+    assert len(robot.read_measurements()) == 1
     assert robot.said == [
         "refused: joint_states has two publishers: the messages of both are refused until one of them is silent"
     ]
@@ -573,53 +621,58 @@ def test_two_robots_on_one_topic_measure_nothing() -> None:
 
 @given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
 def test_any_request_for_shares_is_taken_or_counted(data: bytes) -> None:
-    refusals, asked, turned = (
-        Refusals(list[str]().append),
-        list[dict[str, float]](),
-        list[list[float]](),
-    )
-    shares_ = DominanceTopic(["m1"], asked.append, ManualClock())
-    refusals.guard("a", shares_.receive)(data, FIRST)
-    shares_.send_request()
-    refusals.guard("b", lambda: turned.append(read_joint_target(NAMES, data)))()
-    assert len(asked) + len(turned) + refusals.counts.total() == 2
-    assert all(
-        map(
-            math.isfinite,
-            [x for one in asked for x in one.values()] + [x for q in turned for x in q],
-        )
-    )
+    """Any bytes either give a request with finite shares or count as one refusal."""
+    refusals = Refusals(lambda _: None)
+    requests: list[dict[str, float]] = []
+    topic = DominanceTopic(["m1"], requests.append, ManualClock())
+    refusals.guard("set_dominance", topic.receive)(data, FIRST)
+    topic.send_request()
+    assert len(requests) + refusals.counts.total() == 1
+    for shares in requests:
+        assert all(map(math.isfinite, shares.values()))
+
+
+@given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
+def test_any_target_of_joints_is_taken_or_counted(data: bytes) -> None:
+    """Any bytes either give finite angles or count as one refusal."""
+    refusals = Refusals(lambda _: None)
+    targets_rad: list[list[float]] = []
+    refusals.guard("target", lambda: targets_rad.append(read_joint_target(NAMES, data)))()
+    assert len(targets_rad) + refusals.counts.total() == 1
+    for target_rad in targets_rad:
+        assert all(map(math.isfinite, target_rad))
 
 
 @given(st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
 def test_any_message_of_a_robot_is_counted_somewhere(data: bytes) -> None:
     robot = Robot()
     robot.take(data, FIRST)
-    assert len(robot.measured()) + robot.refusals.counts.total() <= 1
+    assert len(robot.read_measurements()) + robot.refusals.counts.total() <= 1
 
 
 def test_a_robot_gets_each_torque_once_in_order() -> None:
     robot = Robot()
-    robot.ticks(0, 3.0, 4.0)
-    assert robot.driven() == [[4.0, 3.0]]
-    assert robot.driven() == []
-    robot.ticks(1, 5.0, 6.0)
-    robot.ticks(2, 7.0, 8.0)
-    assert robot.driven(2_000_000) == [[8.0, 7.0]]
+    robot.publish_tick(0, 3.0, 4.0)
+    assert robot.read_commands() == [[4.0, 3.0]]
+    assert robot.read_commands() == []
+    robot.publish_tick(1, 5.0, 6.0)
+    robot.publish_tick(2, 7.0, 8.0)
+    assert robot.read_commands(2_000_000) == [[8.0, 7.0]]
 
 
 def test_a_robot_without_torque_gets_the_safe_command() -> None:
-    robot, safe = Robot(), [[0.5, -0.5]]
-    assert robot.driven() == safe  # the site has made no tick
-    assert robot.driven(SAFE_PERIOD_NS - 1) == []
-    robot.ticks(0, 3.0, 4.0)
-    assert robot.driven(SAFE_PERIOD_NS) == [[4.0, 3.0]]
-    assert robot.driven(FRESH_NS + 1) == safe  # it is silent
-    robot.ticks(200, 3.0, 4.0, mode=Mode.FAULT, since_ns=50 * 10**6)
-    assert robot.driven(SAFE_PERIOD_NS) == safe  # its arm has come to rest
-    robot.ticks(201, 3.0, 4.0)
+    robot = Robot()
+    safe = [[0.5, -0.5]]
+    assert robot.read_commands() == safe  # the site has made no tick
+    assert robot.read_commands(SAFE_PERIOD_NS - 1) == []
+    robot.publish_tick(0, 3.0, 4.0)
+    assert robot.read_commands(SAFE_PERIOD_NS) == [[4.0, 3.0]]
+    assert robot.read_commands(FRESH_NS + 1) == safe  # it is silent
+    robot.publish_tick(200, 3.0, 4.0, mode=Mode.FAULT, since_ns=50 * 10**6)
+    assert robot.read_commands(SAFE_PERIOD_NS) == safe  # its arm has come to rest
+    robot.publish_tick(201, 3.0, 4.0)
     robot.arm.armed = False
-    assert robot.driven(SAFE_PERIOD_NS) == safe
+    assert robot.read_commands(SAFE_PERIOD_NS) == safe
 
 
 @pytest.mark.parametrize(
@@ -636,8 +689,11 @@ class Sites:
     def __init__(
         self, noted: Sequence[Event], scenario: str = "paper", session: str = "t"
     ) -> None:
-        network, self._scenario, self.session = LocalNetwork(), load_scenario(scenario), session
-        bus, self._info = network.join(), b""
+        network = LocalNetwork()
+        bus = network.join()
+        self._scenario = load_scenario(scenario)
+        self.session = session
+        self._info = b""
         past = {
             "channel": "event",
             "first": 0,
@@ -649,71 +705,101 @@ class Sites:
             bus.respond(topics.key(session, site, topics.INFO), lambda _: self._info)
             kept = encode(Backfill(member=site, boot=1, **past))
             bus.respond(topics.key(session, site, topics.PAST), lambda _, kept=kept: kept)
-        self._state, self._event = (
-            bus.publisher(topics.key(session, "s", channel))
-            for channel in (topics.STATE, topics.EVENT)
-        )
-        self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
+        self._state = bus.publisher(topics.key(session, "s", topics.STATE))
+        self._event = bus.publisher(topics.key(session, "s", topics.EVENT))
+        self.graph = Listener()
+        self.is_replaced: list[bool] = []
+        self.said: list[str] = []
         self._ends: Any = BridgeEnds(
             self.graph, network.join(), SystemClock(), session, TopicTable.read("crisp")
         )  # type: ignore[arg-type]
 
     def begin(self, epoch_unix_ns: int) -> None:
-        about = {"running": True, "epoch_unix_ns": epoch_unix_ns}
-        self._info = encode(
-            describe_member("s", 1, SystemClock(), "0", self._scenario.text, **about)
+        """Begins a session at an epoch."""
+        description = describe_member(
+            "s",
+            1,
+            SystemClock(),
+            "0",
+            self._scenario.text,
+            running=True,
+            epoch_unix_ns=epoch_unix_ns,
         )
-        self._event(encode(event("epoch", epoch_unix_ns=epoch_unix_ns)))
+        self._info = encode(description)
+        self._event(encode(make_event("epoch", epoch_unix_ns=epoch_unix_ns)))
 
-    def ticks(self, k: int) -> None:
+    def publish_tick(self, k: int) -> None:
+        """Publishes a record of the slave at rest."""
         zeros = [0.0, 0.0]
-        motion = zeros, zeros, zeros, zeros, zeros, zeros, [0.0] * 5
         peers = self._scenario.peers("s")
-        record = TickRecord(k, k * 10**6, Mode.RUN, *motion, [-1] * len(peers), 0, [], [])
+        record = TickRecord(
+            k,
+            k * 10**6,
+            Mode.RUN,
+            q=zeros,
+            qd=zeros,
+            q_des=zeros,
+            qd_des=zeros,
+            tau=zeros,
+            tau_x=zeros,
+            theta_hat=[0.0] * 5,
+            used=[-1] * len(peers),
+            rx_crc=0,
+            cmd=[],
+            mem=[],
+        )
         self._state(encode_state("s", 1, peers, record, (), 0, 0))
 
     @contextmanager
-    def shown(self, rviz: Path | None = None) -> Iterator[threading.Thread]:
+    def run_bridge(self, rviz: Path | None = None) -> Iterator[threading.Thread]:
+        """Runs a bridge that shows the session, from its first message on."""
         over = threading.Event()
 
         def show() -> None:
-            self.anew.append(
-                publish_session(self._ends, 100.0, over.is_set, self.said.append, rviz)
+            is_replaced = publish_session(
+                self._ends, 100.0, over.is_set, self.said.append, rviz
             )
+            self.is_replaced.append(is_replaced)
 
         bridge = threading.Thread(target=show)
-        self.graph.came.clear()  # before the bridge takes its topics from it
+        self.graph.published.clear()  # before the bridge takes its topics from it
         bridge.start()
-        until(lambda: self.ticks(7) or self.graph.came[f"{self.session}/s/joint_states"])  # type: ignore[func-returns-value]
+        until(self._has_shown_a_tick)
         yield bridge
         over.set()
         bridge.join()
 
-    def seconds(self) -> set[int]:
-        """The stamps that were shown, in seconds."""
+    def _has_shown_a_tick(self) -> bool:
+        """Publishes a record, and returns True if the bridge has published one."""
+        self.publish_tick(7)
+        return bool(self.graph.published[f"{self.session}/s/joint_states"])
+
+    def list_stamps_s(self) -> set[int]:
+        """Returns the stamps that were shown, in seconds."""
         states = [
             ROS.deserialize_cdr(data, "sensor_msgs/msg/JointState")
-            for data in self.graph.came["t/s/joint_states"]
+            for data in self.graph.published["t/s/joint_states"]
         ]
         return {message.header.stamp.sec for message in states}
 
 
-def event(kind: str, **fields: Any) -> Event:
+def make_event(kind: str, **fields: Any) -> Event:
+    """Returns an event of the slave."""
     return Event(member="s", boot=1, kind=kind, text="", **fields)
 
 
 def test_a_new_session_is_shown_with_its_epoch() -> None:
     sites = Sites([])
     sites.begin(10**18)
-    with sites.shown() as bridge:
+    with sites.run_bridge() as bridge:
         sites.begin(10**18)  # another attempt of its own
-        assert sites.seconds() == {10**9}
+        assert sites.list_stamps_s() == {10**9}
         sites.begin(2 * 10**18)
         bridge.join(20.0)
-        assert sites.anew == [True]
-    with sites.shown():
-        assert sites.seconds() == {2 * 10**9}
-    assert sites.anew == [True, False]
+        assert sites.is_replaced == [True]
+    with sites.run_bridge():
+        assert sites.list_stamps_s() == {2 * 10**9}
+    assert sites.is_replaced == [True, False]
     texts = ["waiting for session 't' to begin", "session t is in the graph of ROS 2: /t/..."]
     assert sites.said == texts * 2
 
@@ -721,15 +807,17 @@ def test_a_new_session_is_shown_with_its_epoch() -> None:
 def test_earlier_changes_of_shares_are_shown() -> None:
     change = '{"at_s": 0.001, "dominance": "s", "to": {"m1": 0.75, "m2": 0.25}}'
     sites = Sites(
-        [event("setup"), event("change", command="none"), event("change", command=change)]
+        [
+            make_event("setup"),
+            make_event("change", command="none"),
+            make_event("change", command=change),
+        ]
     )
     sites.begin(10**18)
-    with sites.shown():
-        (ramp,) = until(lambda: sites.graph.came["t/s/dominance"])
-        assert ROS.deserialize_cdr(ramp, "std_msgs/msg/Float64MultiArray").data.tolist() == [
-            0.75,
-            0.25,
-        ]
+    with sites.run_bridge():
+        (data,) = until(lambda: sites.graph.published["t/s/dominance"])
+        message = ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray")
+        assert message.data.tolist() == [0.75, 0.25]
         assert {"t/stop", "t/s/stop", "t/m1/reset", "t/end"} <= set(sites.graph.served)
 
 
@@ -746,10 +834,10 @@ def list_bag(path: Path) -> dict[str, tuple[str, bool]]:
 
 
 def test_bags_have_the_topics_of_live_bridges(tmp_path: Path) -> None:
-    bag = list_bag(made(tmp_path)["bag"])
+    bag = list_bag(write_standard_files(tmp_path)["bag"])
     sites = Sites([], "two_sites", "lab")
     sites.begin(10**18)
-    with sites.shown():
+    with sites.run_bridge():
         live = dict(sites.graph.offered)
     assert bag == live
     assert {
@@ -768,10 +856,11 @@ def test_bags_of_other_scenarios_share_no_topics(
 ) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.02})
     trilat_net.export(log, "ros2", tmp_path / "bag.mcap", names=naming)
-    graph, table = Listener(), TopicTable.read(naming)
+    graph = Listener()
+    table = TopicTable.read(naming)
     ends: Any = BridgeEnds(graph, None, None, name, table)  # type: ignore[arg-type]
     for site in log.sites:
-        SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+        SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
     planned = list_topics(log.scenario, name, table)
     assert {
         topic: offer for topic, offer in graph.offered.items() if topic in planned
@@ -824,7 +913,7 @@ def test_rviz_has_the_topics_of_the_live_bridge(tmp_path: Path, name: str, namin
     graph = Listener()
     ends: Any = BridgeEnds(graph, None, None, name, TopicTable.read(naming))  # type: ignore[arg-type]
     for site in scenario.names:
-        SiteTopics(ends, scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+        SiteTopics(ends, scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
     config = tmp_path / "view.rviz"
     write_session_config(ends, scenario, config)
     types = list_rviz_topics(config)
@@ -860,7 +949,7 @@ def test_the_bridge_writes_the_frames_rviz_shows(tmp_path: Path) -> None:
     config = tmp_path / "view.rviz"
     sites = Sites([], "two_sites", "lab")
     sites.begin(10**18)
-    with sites.shown(config):
+    with sites.run_bridge(config):
         until(config.is_file)
         offered = dict(sites.graph.offered)
     assert list_rviz_topics(config).items() <= offered.items()

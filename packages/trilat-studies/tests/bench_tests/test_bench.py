@@ -12,6 +12,13 @@ import msgspec
 import numpy as np
 import pytest
 from scipy import optimize, stats
+from study_builders import (
+    StopError,
+    make_bench_run,
+    plan_small_suite,
+    stop_after,
+    use_single_runs,
+)
 from trilat_studies.bench import (
     BenchResults,
     bench_plan,
@@ -77,7 +84,6 @@ from trilat_net.scenario import load_scenario
 from trilat_net.scenario.laws import BUILT_IN
 from trilat_net.work.study_folder import encode_csv
 
-LEVEL = {"laws": ["p_d"], "study": "round-trips"}
 WALL_M = 1.3376933693863516
 """Position of the wall of the task with contact."""
 WALL_N_M = 2000.0
@@ -86,14 +92,23 @@ HAND_NM_RAD = 50.0
 """Stiffness with which the user's hand pulls each joint to its target."""
 
 
-def plan_small_suite(**more: Any) -> BenchPlan:
-    """Returns a request for two cells of two sites, one cell with two seeds."""
-    return plan_bench(
-        **{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more}
-    )
+def plan_contact_cell(**gains: float) -> BenchCell:
+    """Returns a cell in which the slave touches a wall over 8 ms, under P+d with these gains."""
+    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
+    return replace_gains(cell, **gains) if gains else cell
 
 
-def files(results: BenchResults) -> list[str]:
+def replace_gains(cell: BenchCell, **gains: float) -> BenchCell:
+    """Returns a cell whose control law has other gains."""
+    return cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
+
+
+def run_cell(cell: BenchCell) -> BenchRun:
+    """Returns the run of a cell with its first seed."""
+    return run_bench_task(BenchRunItem(cell, 1))
+
+
+def encode_files(results: BenchResults) -> list[str]:
     """Returns the page, the table of cells and the table of runs that a benchmark writes."""
     return [
         build_bench_page(results, "trilat bench"),
@@ -115,23 +130,16 @@ def test_an_interrupted_suite_resumes_to_the_same_bytes(
     whole: BenchResults, tmp_path: Path
 ) -> None:
     """The second call computes only the missing run, and all files equal those of one call."""
-    path = tmp_path / "parts"
-    finished_runs = []
+    folder = prepare_bench_folder(plan_small_suite(), tmp_path / "parts")
+    with pytest.raises(StopError):
+        run_bench(folder, jobs=1, progress=stop_after(2))
 
-    def interrupt_after_two(done: int, _total: int) -> None:
-        finished_runs.append(done)
-        if done == 2:
-            raise KeyboardInterrupt
-
-    folder = prepare_bench_folder(plan_small_suite(), path)
-    with pytest.raises(KeyboardInterrupt):
-        run_bench(folder, jobs=1, progress=interrupt_after_two)
-
-    reopened_folder = prepare_bench_folder(plan_small_suite(), path)
-    resumed = run_bench(reopened_folder, jobs=1, progress=interrupt_after_two)
-    assert finished_runs == [1, 2, 3]
+    counts: list[int] = []
+    reopened_folder = prepare_bench_folder(plan_small_suite(), tmp_path / "parts")
+    resumed = run_bench(reopened_folder, jobs=1, progress=lambda done, _: counts.append(done))
+    assert counts == [3]
     assert resumed.runs == whole.runs
-    assert files(resumed) == files(whole)
+    assert encode_files(resumed) == encode_files(whole)
 
 
 @pytest.mark.long
@@ -142,15 +150,17 @@ def test_the_executor_of_the_cells_changes_no_result(
         bench = run_bench(
             prepare_bench_folder(plan_small_suite(), tmp_path / "elsewhere"), on=executor
         )
-    assert files(bench) == files(whole)
+    assert encode_files(bench) == encode_files(whole)
 
 
 def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
-    still, first, second = whole.runs
-    assert (still.random, first.random) == (False, True)
+    """Only the runs over a lossy link are random, and each is a function of its seed."""
+    constant, first, second = whole.runs
+    assert not constant.random
+    assert first.random
     assert first.error_rad != second.error_rad
-    lossy = whole.plan.cells[1]
-    assert run_bench_task(BenchRunItem(lossy, 2)) == second
+    lossy_cell = whole.plan.cells[1]
+    assert run_bench_task(BenchRunItem(lossy_cell, 2)) == second
 
 
 def test_a_cell_equals_the_log_of_its_command(whole: BenchResults) -> None:
@@ -176,14 +186,25 @@ def test_effort_equals_that_of_the_compiled_run(whole: BenchResults) -> None:
     assert whole.runs[0].effort_nm == pytest.approx(run.totals.effort_nm, rel=1e-12)
 
 
-def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
+def place_tip(q: Array) -> tuple[Array, Array]:
+    """Returns the end effector of two links of 1 m, and its Jacobian."""
+    upper_rad = q[0]
+    fore_rad = q[0] + q[1]
+    x_m = np.cos(upper_rad) + np.cos(fore_rad)
+    y_m = np.sin(upper_rad) + np.sin(fore_rad)
+    jacobian = np.array([[-y_m, -np.sin(fore_rad)], [x_m, np.cos(fore_rad)]])
+    return np.array([x_m, y_m]), jacobian
+
+
+def find_rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
     """Returns the pose of the user's arm at rest under P+d, and the torque of the hand on that arm."""
     target_rad = np.array(settings["sites.m1.hands"][0]["to_rad"])
 
     def compute_unbalanced_torque(q_of_both: Array) -> Array:
         """Returns the torques that remain on the user's arm and on the slave, in N m."""
-        user_q, slave_q = q_of_both[:2], q_of_both[2:]
-        tip, jacobian = reach(slave_q)
+        user_q = q_of_both[:2]
+        slave_q = q_of_both[2:]
+        tip, jacobian = place_tip(slave_q)
         wall_force = [-WALL_N_M * max(tip[0] - WALL_M, 0.0), 0.0]
         wall_torque = jacobian.T @ wall_force
         link_torque = K * (user_q - slave_q)
@@ -197,22 +218,20 @@ def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
 
 def test_stiffness_at_the_hand_is_static() -> None:
     """Two springs and the wall under P+d, nearly at rest 2 s after contact."""
-    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
-        q, torque = rest_in_contact(60.0, settings)
-        tip, jacobian = reach(q)
+        q, torque = find_rest_in_contact(60.0, settings)
+        tip, jacobian = place_tip(q)
         ends.append((tip[0], np.linalg.solve(jacobian.T, torque)[0]))
 
     (near_m, near_n), (far_m, far_n) = ends
-    run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=6.0), 1))
+    run = run_cell(plan_contact_cell(K=60.0, d=6.0))
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=5e-2)
 
 
 def test_stiffness_is_measured_two_seconds_after_contact() -> None:
     """Two runs that press differently far give the stiffness, each 1.9 to 2.1 s after contact."""
-    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
-    cell = with_gains(cell, K=60.0, d=6.0)
+    cell = plan_contact_cell(K=60.0, d=6.0)
     experiment = cell.build(1)
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
@@ -225,7 +244,7 @@ def test_stiffness_is_measured_two_seconds_after_contact() -> None:
         touch_s = slave.t_s[slave_m > WALL_M][0]
 
         window = (user.t_s > touch_s + 1.8995) & (user.t_s < touch_s + 2.0995)
-        tips = [reach(q) for q in user.q[window]]
+        tips = [place_tip(q) for q in user.q[window]]
         hand_torques = 0.5 * user.qd[window] - user.tau_x[window]
         forces_n = [
             np.linalg.solve(jacobian.T, torque)[0]
@@ -234,16 +253,16 @@ def test_stiffness_is_measured_two_seconds_after_contact() -> None:
         ends.append((np.mean([tip[0] for tip, _ in tips]), np.mean(forces_n)))
 
     (near_m, near_n), (far_m, far_n) = ends
-    run = run_bench_task(BenchRunItem(cell, 1))
+    run = run_cell(cell)
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-6)
 
 
 def test_free_impedance_is_that_of_coupled_arms() -> None:
     """P+d over 4 ms: D = M s^2 + (d + 0.5) s + K - K e^-sT (M s^2 + d s + K)^-1 K e^-sT."""
-    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
-    K, d = 60.0, 12.0
+    K = 60.0
+    d = 12.0
     s = 2j * np.pi  # at 1 Hz
-    q, _ = rest_in_contact(K, TASKS["contact"].settings)
+    q, _ = find_rest_in_contact(K, TASKS["contact"].settings)
     cosine = np.cos(q[1])
     M = np.array([[3.0 + 2.0 * cosine, 1.0 + cosine], [1.0 + cosine, 1.0]])
     identity = np.eye(2)
@@ -252,31 +271,20 @@ def test_free_impedance_is_that_of_coupled_arms() -> None:
     slave = M * s**2 + (d * s + K) * identity
     user = M * s**2 + ((d + 0.5) * s + K) * identity - coupling**2 * np.linalg.inv(slave)
 
-    jacobian = reach(q)[1]
+    _, jacobian = place_tip(q)
     motion = np.linalg.solve(user + (5.0 * s + 50.0) * identity, jacobian[0])
     force = np.linalg.solve(jacobian.T, user @ motion)
     expected = abs(force[0] / (s * (jacobian @ motion)[0]))
 
-    run = run_bench_task(BenchRunItem(with_gains(cell, K=K, d=d), 1))
+    run = run_cell(plan_contact_cell(K=K, d=d))
     assert run.free_impedance_n_s_m == pytest.approx(expected, rel=2e-2)
     assert run.impedance_n_s_m is not None
 
 
-def reach(q: Array) -> tuple[Array, Array]:
-    """Returns the end effector of two links of 1 m, and its Jacobian."""
-    first, second = q[0], q[0] + q[1]  # angles of the links to the horizontal
-    tip = np.array([np.cos(first) + np.cos(second), np.sin(first) + np.sin(second)])
-    return tip, np.array([[-tip[1], -np.sin(second)], [tip[0], np.cos(second)]])
-
-
-def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
-    """Returns a cell whose control law has other gains."""
-    return cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
-
-
 def test_a_barely_touched_wall_masks_the_numbers() -> None:
-    (cell,) = plan_small_suite(tasks=["contact"], links=["rtt8"]).cells
-    run = run_bench_task(BenchRunItem(with_gains(cell, K=2.0, d=20.0), 1))
+    """A run whose wall force is too small has no stiffness, and its cell no error."""
+    cell = plan_contact_cell(K=2.0, d=20.0)
+    run = run_cell(cell)
     assert run.wall_n is not None
     assert run.wall_n < LEAST_CONTACT_N
     assert run.stiffness_n_m is None
@@ -289,17 +297,14 @@ def test_a_barely_touched_wall_masks_the_numbers() -> None:
 
 def test_a_longer_run_stays_unstable(tmp_path: Path) -> None:
     (cell,) = plan_small_suite(links=["rtt272"]).cells
-    plan = BenchPlan("round-trips", [with_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
+    plan = BenchPlan("round-trips", [replace_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
     (run,) = run_bench(prepare_bench_folder(plan, tmp_path / "suite"), jobs=1).runs
     assert run.stability is Stability.NOT_STABLE
     assert run.behaviour is EndBehaviour.DIVERGED or run.confirmed
-    assert (
-        run_bench_task(BenchRunItem(with_gains(cell, K=10.0, d=4.0), 1)).stability
-        is Stability.STABLE
-    )
+    assert run_cell(replace_gains(cell, K=10.0, d=4.0)).stability is Stability.STABLE
 
 
-def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
+def make_joint_records(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
     """Returns records of one joint."""
     zero = np.zeros((len(t_ns), 1))
     return RecordBatch(
@@ -311,10 +316,10 @@ def test_least_energy_counts_energy_from_outside() -> None:
     """The outside puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
     t_ns = np.arange(3001) * 1_000_000
     power = np.select([t_ns < 1e9, t_ns < 2e9], [3.0, -5.0], 4.0)
-    assert find_least_energy(
-        {"s": batch(t_ns, np.full(3001, 2.0), -power / 2.0)}
-    ) == pytest.approx(-2.0, abs=0.01)
-    assert find_least_energy({"s": batch(t_ns, np.ones(3001), np.zeros(3001))}) == 0.0
+    moved = make_joint_records(t_ns, np.full(3001, 2.0), -power / 2.0)
+    free = make_joint_records(t_ns, np.ones(3001), np.zeros(3001))
+    assert find_least_energy({"s": moved}) == pytest.approx(-2.0, abs=0.01)
+    assert find_least_energy({"s": free}) == 0.0
 
 
 def test_an_interrupted_confirmation_resumes(
@@ -325,7 +330,7 @@ def test_an_interrupted_confirmation_resumes(
 
     def run_bounded(item: BenchRunItem) -> BenchRun:
         lengths_s.append(item.to_s)
-        return make_run(
+        return make_bench_run(
             item.cell,
             item.seed,
             stability=Stability.NOT_STABLE,
@@ -342,8 +347,7 @@ def test_an_interrupted_confirmation_resumes(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(bench_run, "run_bench_task", run_bounded)
-    # If their code exists, lanes would run the cells instead.
-    monkeypatch.setattr(bench_run, "prepare_kinds", lambda _: {})
+    use_single_runs(monkeypatch)
     folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
         run_bench(folder, on=executor, progress=interrupt_first_repetition)
@@ -357,8 +361,8 @@ def test_an_interrupted_confirmation_resumes(
     assert [(run.confirmed, run.length_s) for run in results.runs] == [(True, 60.0)] * 3
 
 
-def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
-    """A run of 20 s of two sites that decays slowly."""
+def make_judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
+    """Returns the judgement of a run of 20 s of two sites that decays slowly."""
     fit = EnvelopeFit(EnvelopeTrend.HARDLY, -0.02)
     facts = {
         "scenario": plan_small_suite(links=["rtt8"]).cells[0].build(1).scenario,
@@ -385,7 +389,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
 def test_run_length_follows_the_slowest_time_constant(
     rate_per_s: float | None, length_s: float, phrase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    judgement = judged_run(rate_per_s)
+    judgement = make_judged_run(rate_per_s)
     monkeypatch.setattr(
         bench_run,
         "judge_bench_run",
@@ -401,7 +405,7 @@ def test_run_length_follows_the_slowest_time_constant(
 def test_a_decided_run_at_rest_is_not_extended() -> None:
     fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
     end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
-    judgement = judged_run(-0.001, end=end, stability=Stability.SETTLED)
+    judgement = make_judged_run(-0.001, end=end, stability=Stability.SETTLED)
     assert lengthen_run(judgement) is judgement
 
 
@@ -413,8 +417,8 @@ def test_a_longer_run_refutes_or_confirms() -> None:
         (Stability.STABLE, False),
         (Stability.NOT_STABLE, True),
     ):
-        first = make_run(cell, 1, stability=Stability.NOT_STABLE, length_s=40.0)
-        longer = make_run(cell, 1, stability=longer_stability, length_s=80.0, to_s=80.0)
+        first = make_bench_run(cell, stability=Stability.NOT_STABLE, length_s=40.0)
+        longer = make_bench_run(cell, stability=longer_stability, length_s=80.0, to_s=80.0)
         results = BenchResults(plan, {(run.cell, 1): run for run in (first, longer)})
         (run,) = results.runs
         assert (run.stability, run.confirmed) == (longer_stability, is_confirmed)
@@ -430,7 +434,7 @@ def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPat
 
     plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
     assert [cell.law for cell in plan.cells] == ["p_d"]
-    run = make_run(plan.cells[0], 1)
+    run = make_bench_run(plan.cells[0])
     page = build_bench_page(BenchResults(plan, {(run.cell, 1): run}), "trilat bench")
     assert "| pd_d (two sites) | no gains |" in page
     with pytest.raises(UsageError, match="no candidate was stable for pd_d"):
@@ -440,7 +444,8 @@ def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPat
 def test_laws_of_equal_torque_run_once() -> None:
     """`six_channel` is `four_channel` with a check of the shares, so both have the same runs."""
     for law, equal in EQUAL_LAWS.items():
-        kind, equal_kind = BUILT_IN[law], BUILT_IN[equal]
+        kind = BUILT_IN[law]
+        equal_kind = BUILT_IN[equal]
         assert (kind.torque, kind.begin) == (equal_kind.torque, equal_kind.begin)
         assert kind.Settings.__struct_fields__ == equal_kind.Settings.__struct_fields__
         with pytest.raises(UsageError, match=f"{law} computes the torque of {equal}"):
@@ -476,65 +481,53 @@ def test_no_user_is_without_friction(base: str) -> None:
 
 
 def test_a_run_lasts_for_forty_round_trips() -> None:
-    assert [
-        build_settings("two", "free", link)["duration_s"]
-        for link in LINKS
-        if "loss" not in link
-    ] == [
-        pytest.approx(max(20.0, 40.0 * trip_s))
-        for trip_s in (0.008, 0.068, 0.136, 0.272, 0.544, 1.088, 0.0, 0.0, 0.6, 0.0)
+    """A run lasts for forty round trips of its link, and at least for 20 s."""
+    links = [link for link in LINKS if "loss" not in link]
+    durations_s = [build_settings("two", "free", link)["duration_s"] for link in links]
+    round_trips_s = (0.008, 0.068, 0.136, 0.272, 0.544, 1.088, 0.0, 0.0, 0.6, 0.0)
+    assert durations_s == [
+        pytest.approx(max(20.0, 40.0 * round_trip_s)) for round_trip_s in round_trips_s
     ]
 
 
 @pytest.mark.long
 def test_sharing_error_counts_dominance_at_that_time() -> None:
-    """After the handover the second user has three quarters; the error refers to the present shares."""
-    plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
-    run = run_bench_task(BenchRunItem(plan.cells[0], 1))
-    log = trilat_net.simulate(plan.cells[0].build(1).scenario)
-    m1, m2, s = (log[name].q for name in ("m1", "m2", "s"))
+    """The error refers to the present shares: after the handover the second user has three quarters."""
+    (cell,) = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"]).cells
+    run = run_cell(cell)
+    log = trilat_net.simulate(cell.build(1).scenario)
     share_of_m1 = np.interp(log["s"].t_s, [7.0, 9.0], [0.75, 0.25])[:, None]
-    error_rad = s - share_of_m1 * m1 - (1.0 - share_of_m1) * m2
+    reference_rad = share_of_m1 * log["m1"].q + (1.0 - share_of_m1) * log["m2"].q
+    error_rad = log["s"].q - reference_rad
     assert run.error_rad == pytest.approx(np.sqrt(np.mean(error_rad**2)), rel=1e-9)
 
 
-def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
-    """Returns a stable run of a cell, with some of its facts replaced."""
-    facts = {
-        "stability": Stability.STABLE,
-        "behaviour": EndBehaviour.CONVERGED,
-        "text": "",
-        **more,
-    }
-    return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
-
-
-def make_cell_result(*errors: float | None) -> BenchCellResult:
+def make_bench_cell_result(*errors_rad: float | None) -> BenchCellResult:
     """Returns the result of a cell with these errors, one for each seed."""
     cell = plan_small_suite().cells[1]
-    return BenchCellResult(
-        cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
-    )
+    runs = [make_bench_run(cell, n, error_rad=error) for n, error in enumerate(errors_rad)]
+    return BenchCellResult(cell, runs)
 
 
 def test_intervals_over_twenty_seeds_equal_scipys() -> None:
+    """The mean error has Student's interval, and the share of stable runs has Wilson's."""
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
-    mean: Any = make_cell_result(*errors).compute_mean("error_rad")
-    low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
-    assert (mean.mean - mean.half, mean.mean + mean.half) == pytest.approx(
-        (low, high), rel=1e-12
-    )
+    result = make_bench_cell_result(*errors)
+    mean: Any = result.compute_mean("error_rad")
+    interval = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
+    assert (mean.mean - mean.half, mean.mean + mean.half) == pytest.approx(interval, rel=1e-12)
 
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
-    assert make_cell_result(*errors).interval == pytest.approx(
-        (share.low, share.high), rel=1e-12
-    )
+    assert result.interval == pytest.approx((share.low, share.high), rel=1e-12)
 
-    assert make_cell_result(*errors[:19]).interval is None
-    assert make_cell_result(*errors[:19]).compute_mean("error_rad") == pytest.approx(
-        np.mean(errors[:19]), rel=1e-12
-    )
-    assert make_cell_result(0.31, None).compute_mean("error_rad") is None
+
+def test_fewer_seeds_have_a_mean_without_interval() -> None:
+    """Fewer than twenty runs have no interval, and a run without a number leaves no mean."""
+    errors = tuple(0.3 + 0.01 * n for n in range(19))
+    result = make_bench_cell_result(*errors)
+    assert result.interval is None
+    assert result.compute_mean("error_rad") == pytest.approx(np.mean(errors), rel=1e-12)
+    assert make_bench_cell_result(0.31, None).compute_mean("error_rad") is None
 
 
 FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
@@ -542,39 +535,38 @@ FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
 
 @pytest.mark.parametrize("cell", FULL.cells, ids=lambda cell: f"{cell.task}/{cell.law}")
 def test_every_law_fits_each_of_its_tasks(cell: BenchCell) -> None:
-    experiment = cell.build(1)
-    assert {
-        site.control.__struct_config__.tag for site in experiment.scenario.sites.values()
-    } == {cell.law}
-    assert len(experiment.scenario.names) == (2 if cell.form == "two" else 3)
-    assert np.allclose(experiment.scenario.alpha.sum(axis=1), 1.0)
+    """The scenario of a cell is valid, and all its sites have the law of the cell."""
+    scenario = cell.build(1).scenario
+    laws = {site.control.__struct_config__.tag for site in scenario.sites.values()}
+    assert laws == {cell.law}
+    assert len(scenario.names) == (2 if cell.form == "two" else 3)
+    assert np.allclose(scenario.alpha.sum(axis=1), 1.0)
 
 
-def test_every_link_fits_both_forms() -> None:
-    for link in LINKS:
-        for form, base in (("three", "_bench_three"), ("two", "_bench_two")):
-            scenario = load_scenario(base, build_settings(form, "outage", link))
-            cut = [
-                name for name, delayed_link in scenario.links.items() if delayed_link.outages_s
-            ]
-            assert sorted(cut) == sorted(
-                name for name in scenario.links if "s" in name.split("->")
-            )
+@pytest.mark.parametrize(("form", "base"), [("three", "_bench_three"), ("two", "_bench_two")])
+def test_every_link_fits_both_forms(form: str, base: str) -> None:
+    """Over every link, the outage of the task cuts exactly the links of the slave."""
+    for name_of_link in LINKS:
+        scenario = load_scenario(base, build_settings(form, "outage", name_of_link))
+        cut = {name for name, link in scenario.links.items() if link.outages_s}
+        assert cut == {name for name in scenario.links if "s" in name.split("->")}
 
 
 def test_all_studies_have_gains_within_their_ranges() -> None:
     gains = read_gains()
-    for study in STUDIES.values():
-        for form, laws in study.laws.items():
-            for law in laws:
-                for round_trip_ms in TUNED_ROUND_TRIPS_MS:
-                    kept = gains[form, law, round_trip_ms].gains
-                    knobs = {knob.name: knob for knob in SEARCH_SPACES[law].knobs}
-                    assert kept.keys() in (knobs.keys(), {}.keys())
-                    assert all(
-                        knobs[key].low <= value <= knobs[key].high
-                        for key, value in kept.items()
-                    )
+    laws = {
+        (form, law)
+        for study in STUDIES.values()
+        for form, laws_of_form in study.laws.items()
+        for law in laws_of_form
+    }
+    for form, law in sorted(laws):
+        knobs = {knob.name: knob for knob in SEARCH_SPACES[law].knobs}
+        for round_trip_ms in TUNED_ROUND_TRIPS_MS:
+            kept = gains[form, law, round_trip_ms].gains
+            assert kept.keys() in (knobs.keys(), {}.keys())
+            for key, value in kept.items():
+                assert knobs[key].low <= value <= knobs[key].high, (form, law, key)
 
 
 @pytest.mark.long
@@ -628,12 +620,13 @@ def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float
 
 def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Gains are stored one by one, and gains that are up to date are not tuned again."""
-    path, tuned_names = tmp_path / "gains.json", []
+    path = tmp_path / "gains.json"
+    tuned_ms: list[int] = []
 
     def tune(form: str, law: str, round_trip_ms: int, *_: Any) -> TunedGains:
-        if len(tuned_names) == 2:
+        if len(tuned_ms) == 2:
             raise KeyboardInterrupt
-        tuned_names.append(round_trip_ms)
+        tuned_ms.append(round_trip_ms)
         mark = fingerprint_tuning(form, law, round_trip_ms)
         return TunedGains(form, law, round_trip_ms, {"K": 1.0}, 1, 1, 0, 0.1, 1.0, mark)
 
@@ -649,9 +642,9 @@ def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path
         tune_and_store()
     assert len(read_gains(path)) == 2
 
-    tuned_names.clear()
+    tuned_ms.clear()
     assert len(tune_and_store()) == 3
-    assert tuned_names == [TUNED_ROUND_TRIPS_MS[-1]]
+    assert tuned_ms == [TUNED_ROUND_TRIPS_MS[-1]]
 
 
 class Damped(BUILT_IN["p_d"]):
@@ -672,27 +665,26 @@ def test_only_another_motion_makes_gains_outdated() -> None:
     assert bench_plan._probe_law(task, other) != bench_plan._probe_law(task, space)
 
 
-def list_shipped_gains() -> Iterator[Any]:
+def iterate_shipped_gains() -> Iterator[Any]:
     """Yields all shipped gains; every ninth is tested on a push."""
-    for place, gains in enumerate(read_gains().values()):
-        yield pytest.param(
-            gains, id=str(gains), marks=() if place % 9 == 0 else pytest.mark.long
-        )
+    for index, gains in enumerate(read_gains().values()):
+        marks = () if index % 9 == 0 else pytest.mark.long
+        yield pytest.param(gains, id=str(gains), marks=marks)
 
 
-@pytest.mark.parametrize("gains", list(list_shipped_gains()))
+@pytest.mark.parametrize("gains", list(iterate_shipped_gains()))
 def test_shipped_gains_are_up_to_date(gains: TunedGains) -> None:
     assert find_stale([gains]) == []
 
 
-def test_gains_come_from_the_next_longer_round_trip() -> None:
-    assert [choose_round_trip(ms) for ms in (0.0, 68.0, 69.0, 600.0, 5000.0)] == [
-        68,
-        68,
-        272,
-        1088,
-        1088,
-    ]
+@pytest.mark.parametrize(
+    ("round_trip_ms", "tuned_ms"),
+    [(0.0, 68), (68.0, 68), (69.0, 272), (600.0, 1088), (5000.0, 1088)],
+)
+def test_gains_come_from_the_next_longer_round_trip(
+    round_trip_ms: float, tuned_ms: int
+) -> None:
+    assert choose_round_trip(round_trip_ms) == tuned_ms
 
 
 def test_gains_of_another_law_or_scenario_are_stale() -> None:
@@ -718,7 +710,7 @@ def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path
     assert extended.runs[0] == first.runs[0]
 
     # a cell with other gains is another cell
-    changed_cell = with_gains(plan_small_suite().cells[0], K=20.0, d=5.0)
+    changed_cell = replace_gains(plan_small_suite().cells[0], K=20.0, d=5.0)
     changed_plan = BenchPlan("round-trips", [changed_cell], [])
     changed = run_bench(prepare_bench_folder(changed_plan, path), jobs=1)
     assert changed.runs[0] != first.runs[0]

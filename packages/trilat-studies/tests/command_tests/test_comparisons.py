@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tuning_tests.experiments import TRIO
+from study_builders import TRIO
 
 import trilat_net as tn
 from tests.cli.running import trilat
@@ -129,8 +129,17 @@ def test_search_reports_time_and_procedure_and_writes_folder(logs: Path) -> None
 def test_a_shipped_law_is_called_by_its_name(tmp_path: Path) -> None:
     """Messages about a shipped law name it, and do not call it a user's own law."""
     for law in ("tdpa", "wave", "adaptive"):
-        how = ["--set", f"control.law={law}", "--set", "scheme=digital", "--duration", "0.5"]
-        trilat("sim", "two_sites", *how, "-o", f"{law}.mcap", cwd=tmp_path).succeeds()
+        settings = ["--set", f"control.law={law}", "--set", "scheme=digital"]
+        trilat(
+            "sim",
+            "two_sites",
+            *settings,
+            "--duration",
+            "0.5",
+            "-o",
+            f"{law}.mcap",
+            cwd=tmp_path,
+        ).succeeds()
 
     text = trilat("compare", "tdpa.mcap", "wave.mcap", "adaptive.mcap", cwd=tmp_path).succeeds()
     assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from sweep_tests.quick import SHORT
+from study_builders import SHORT
 from trilat_studies.sweep_command import parse_seed_count
 
 from tests.cli.running import trilat
@@ -59,8 +59,8 @@ def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
 
 def test_a_finished_sweep_is_not_computed_again(folder: Path) -> None:
     before = (folder / "done" / "results.csv").read_bytes()
-    for how in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
-        text = trilat("sweep", *how, cwd=folder).succeeds()
+    for arguments in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
+        text = trilat("sweep", *arguments, cwd=folder).succeeds()
         assert "12 runs are done already" in text
         assert "nothing was left to run" in text
     assert (folder / "done" / "results.csv").read_bytes() == before

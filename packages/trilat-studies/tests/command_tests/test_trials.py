@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trial_tests.results import QUICK
+from study_builders import QUICK
 from trilat_studies.study_commands import parse_seeds
 
-from tests.cli.running import started, trilat
+from tests.cli.running import start_command, trilat
 from tests.net.waiting import until
 from trilat_net.scenario import list_shipped, load_scenario
 
@@ -96,7 +96,7 @@ def test_seeds_are_read_as_they_are_written(first: int, count: int, others: list
 def test_ctrl_c_exits_130_and_leaves_no_process(folder: Path) -> None:
     """Ctrl-C ends the program and its worker processes without a traceback."""
     (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))
-    process = started("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
+    process = start_command("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
 
     def list_workers() -> list[Path]:
         """Returns the folders in /proc of the program's worker processes."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from trilat_studies.sweep import prepare_sweep_folder, run_sweep
+from study_builders import SHORT, plan_quick_sweep, run_plan
 from trilat_studies.sweep.sweep_cell import classify_decision
 from trilat_studies.sweep.sweep_results import SweepResults, build_reproduce_command
 
@@ -13,8 +13,6 @@ from tests.cli.running import trilat
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import RunEnd
 from trilat_net.log.log_reader import open_log
-
-from .quick import SHORT, plan_quick_sweep
 
 AT_REST_OR_LOST = ("limits.qd_limit_rad_s=6", "link.loss=0.1")
 
@@ -27,7 +25,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     sweep = plan_quick_sweep(
         path, "control.law=p_d", "control.K=40", *AT_REST_OR_LOST, over=over
     )
-    return run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results
+    return run_plan(sweep, path / "o").results
 
 
 def test_command_of_cell_gives_its_numbers_bitwise(

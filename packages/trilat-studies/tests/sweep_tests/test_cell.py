@@ -9,22 +9,15 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import Judge, plan_quick_sweep
 from trilat_studies.sweep import sweep_cell
 from trilat_studies.sweep.sweep_cell import CellClass, apply_diff, diff_lines
 from trilat_studies.sweep.sweep_results import build_sim_command
 from trilat_studies.sweep.sweep_run import CellItem, run_cell
 
-from sweep_tests.quick import Judge, plan_quick_sweep
 from tests.own_laws import CompiledPD
 from trilat_net.app.cli.options import load_chosen_scenario
 from trilat_net.scenario import load_scenario, parse_scenario
-
-
-@pytest.fixture
-def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
-    text_judge = Judge()
-    monkeypatch.setattr(sweep_cell, "classify_cell", text_judge)
-    return text_judge
 
 
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:

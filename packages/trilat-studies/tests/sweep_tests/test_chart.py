@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import MAP_KEYS, make_map_rows
 from trilat_studies.sweep.stability_map import (
     PlaneAxis,
     StabilityCriterion,
@@ -32,8 +33,6 @@ from trilat_net.analysis.theory.linear_edge import GrowthColumn, iterate_linear_
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 
-from .maps import KEYS, rows
-
 OVER = ("link.delay_ms=0:400:100", "control.d=0.2:2.2:0.5")
 
 
@@ -42,7 +41,7 @@ def results(**axes: tuple[object, ...]) -> SweepResults:
         *OVER,
         *(f"{key.replace('__', '.')}={','.join(map(str, some))}" for key, some in axes.items()),
     ]
-    return SweepResults(plan_sweep("p_d_margin", over=over), list(rows(**axes)))
+    return SweepResults(plan_sweep("p_d_margin", over=over), list(make_map_rows(**axes)))
 
 
 def test_every_panel_has_its_own_lines() -> None:
@@ -75,7 +74,7 @@ def test_lines_depend_on_neither_runs_nor_processes() -> None:
 
 def test_short_delays_have_the_condition_as_line() -> None:
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
-    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *KEYS)
+    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *MAP_KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
     scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
@@ -88,7 +87,7 @@ def test_short_delays_have_the_condition_as_line() -> None:
 @pytest.mark.long
 def test_coarse_map_has_the_exact_linear_line() -> None:
     """From 0.6 on another mode is the rightmost; a straight line between 0.2 and 0.7 would pass 0.593."""
-    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *KEYS)
+    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *MAP_KEYS)
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
     scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
@@ -106,7 +105,7 @@ def test_coarse_map_has_the_exact_linear_line() -> None:
 
 def test_a_strip_has_no_lines() -> None:
     plan = plan_sweep("p_d_margin", over=OVER[:1])
-    rows_of_strip = [row for row in rows() if row["control.d"] == 0.7]
+    rows_of_strip = [row for row in make_map_rows() if row["control.d"] == 0.7]
     assert build_stability_map(SweepResults(plan, rows_of_strip), ()).lines == ((),)
 
 
@@ -114,7 +113,7 @@ def test_place_of_panel_is_cell_of_plan() -> None:
     """Lines belong to the scenarios that run: every cell's scenario, with every law."""
     plan = plan_sweep("p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d"))
     rows_by_panel = []
-    for law, row in product(("p_d", "pd_d"), rows(link__playout_ms=(0.0, 400.0))):
+    for law, row in product(("p_d", "pd_d"), make_map_rows(link__playout_ms=(0.0, 400.0))):
         rows_by_panel.append({**row, "law": law})
 
     plane = build_stability_map(SweepResults(plan, rows_by_panel), (), linearly=False).plane
@@ -376,7 +375,7 @@ def test_line_between_few_columns_is_that_of_theory() -> None:
     """Along each row the drawn line of P+d, d = K T / 2, crosses where theory does, for K = 10."""
     over = ("link.delay_ms=0:800:400", "control.d=0.4:3.6:0.4")
     plan = plan_sweep("p_d_margin", over=over)
-    first = next(rows())
+    first = next(make_map_rows())
     cells = [
         {**first, "link.delay_ms": delay, "control.d": damping}
         for delay, damping in product(

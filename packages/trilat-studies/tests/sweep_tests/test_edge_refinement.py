@@ -4,11 +4,13 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
+from study_builders import StopError, make_cell_result, replace_judge, run_plan, stop_after
+from trilat_studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_studies.sweep.edge_refinement import (
     NOT_KNOWN,
     STABLE,
@@ -25,14 +27,13 @@ from trilat_studies.sweep.sweep_run import open_sweep_folder
 
 from trilat_net.scenario import parse_scenario
 
-from .quick import outcome_of
-
 Side = Callable[[float, float], int]
 AXES = ("link.delay_ms=0:160:10", "control.d=0.2:3.4:0.2")
 
 
 @cache
 def small_plan() -> SweepPlan:
+    """Returns the plan of a sweep of 17 delays and 17 dampings."""
     return plan_sweep("p_d_margin", ["duration_s=2"], over=AXES)
 
 
@@ -118,27 +119,18 @@ def judge_by_line(text: str, longest_s: float) -> CellResult:
     delay_ms = scenario.links["m1->s"].delay_ms  # type: ignore[attr-defined]
     d = scenario.sites["s"].control.d[0]  # type: ignore[attr-defined]
     verdict = CellClass.CONVERGED if d > 0.7 + 0.013 * delay_ms else CellClass.BOUNDED
-    outcome = outcome_of(text, longest_s)
-    return CellResult(**{**outcome_fields(outcome), "verdict": verdict, "diverged_s": None})
-
-
-def outcome_fields(outcome: CellResult) -> dict[str, object]:
-    """Returns the fields of a result by name."""
-    return {name: getattr(outcome, name) for name in outcome.__struct_fields__}
-
-
-class _StopError(Exception):
-    pass
+    result = make_cell_result(text, longest_s)
+    return msgspec.structs.replace(result, verdict=verdict, diverged_s=None)
 
 
 def test_an_interrupted_refinement_ends_as_any_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its rows are those of the full sweep, and so are its edges."""
-    monkeypatch.setattr(sweep_cell, "classify_cell", judge_by_line)
+    replace_judge(monkeypatch, judge_by_line)
     plan = small_plan()._replace(refine=2)
-    whole = run_sweep(prepare_sweep_folder(small_plan(), tmp_path / "whole"), 1)
-    refined = run_sweep(prepare_sweep_folder(plan, tmp_path / "refined"), 1)
+    whole = run_plan(small_plan(), tmp_path / "whole")
+    refined = run_plan(plan, tmp_path / "refined")
 
     rows_of_whole = {row["cell"]: row for row in whole.results.rows}
     runs = len(refined.results.rows)
@@ -146,16 +138,11 @@ def test_an_interrupted_refinement_ends_as_any_other(
     assert all(rows_of_whole[row["cell"]] == row for row in refined.results.rows)
 
     folder = prepare_sweep_folder(plan, tmp_path / "parts")
-    for stop in (3, 26, runs - 1):
-
-        def stopped(done: int, _total: int, stop: int = stop) -> None:
-            if done >= stop:
-                raise _StopError
-
-        with pytest.raises(_StopError):
-            run_sweep(folder, 1, stopped)
+    for count in (3, 26, runs - 1):
+        with pytest.raises(StopError):
+            run_sweep(folder, 1, stop_after(count))
         folder = open_sweep_folder(folder.path)
-        assert len(folder.read_done()) == stop
+        assert len(folder.read_done()) == count
     assert run_sweep(folder, 1).runs == 1
     table = (tmp_path / "refined" / RESULTS_FILE).read_bytes()
     assert (folder.path / RESULTS_FILE).read_bytes() == table

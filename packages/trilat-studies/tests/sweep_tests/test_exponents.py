@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_hex
-from trilat_studies.sweep import prepare_sweep_folder, run_sweep
+from study_builders import (
+    MAP_KEYS,
+    P_D,
+    make_exponent_plane,
+    make_map_rows,
+    plan_quick_sweep,
+    run_plan,
+)
+from trilat_studies.sweep import prepare_sweep_folder
 from trilat_studies.sweep.map_page import draw_stability_map, tabulate_edges
 from trilat_studies.sweep.stability_map import (
     StabilityMap,
@@ -21,9 +29,6 @@ from trilat_net.analysis.theory.linear_edge import GrowthColumn
 from trilat_net.errors import UsageError
 from trilat_net.presentation.appearance import FigureSize
 
-from .maps import KEYS, P_D, rows
-from .quick import plan_quick_sweep
-
 DELAYS_MS = (200.0, 250.0)
 DAMPINGS = (0.8, 1.0, 1.2, 1.4)
 NEAR_REST = (
@@ -36,13 +41,11 @@ NEAR_REST = (
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     """P+d near its edge; the arms start so close together that the motion is small."""
-    over = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS}
+    over = {MAP_KEYS[0]: DELAYS_MS, MAP_KEYS[1]: DAMPINGS}
     plan = plan_sweep(
         "p_d_margin", [*NEAR_REST, "duration_s=40", "rate_hz=200"], over=over, judge="twins"
     )
-    folder = prepare_sweep_folder(plan, tmp_path_factory.mktemp("exponents") / "o")
-    run_sweep(folder, 1)
-    return read_results(folder.path)
+    return read_results(run_plan(plan, tmp_path_factory.mktemp("exponents") / "o").folder.path)
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +56,12 @@ def chart(results: SweepResults) -> StabilityMap:
 def test_exponents_are_real_parts_of_rightmost_roots(results: SweepResults) -> None:
     """Within 2 % or 2e-3 /s, whichever is larger; some grow and some do not."""
     for delay_ms in DELAYS_MS:
-        column = [row for row in results.rows if row[KEYS[0]] == delay_ms]
+        column = [row for row in results.rows if row[MAP_KEYS[0]] == delay_ms]
         scenarios = [
             results.plan.scenario(f"link.delay_ms={delay_ms}", f"control.d={d}")
             for d in DAMPINGS
         ]
-        roots = GrowthColumn.compute(scenarios, KEYS[1], DAMPINGS).growth_per_s
+        roots = GrowthColumn.compute(scenarios, MAP_KEYS[1], DAMPINGS).growth_per_s
         assert min(roots) < -0.01
         assert max(roots) > 0.01
         for row, root in zip(column, roots, strict=True):
@@ -88,9 +91,7 @@ def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> N
 
 def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
-    shifted = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
-    plane = build_plane(shifted, KEYS, P_D)
-    figure = draw_stability_map(plane, ((),), FigureSize.for_print(3.5))
+    figure = draw_stability_map(make_exponent_plane(), ((),), FigureSize.for_print(3.5))
     mesh: Any = next(
         collection
         for collection in figure.axes[0].collections
@@ -99,18 +100,19 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
     assert to_hex(mesh.to_rgba(0.0)) == "#ffffff"
     assert mesh.get_clim() == (-1.0, 1.0)
     assert figure.axes[-1].get_yticks().tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0]
-    blue, red = mesh.to_rgba(-0.5), mesh.to_rgba(0.5)
+    blue = mesh.to_rgba(-0.5)
+    red = mesh.to_rgba(0.5)
     assert blue[2] > blue[0]
     assert red[0] > red[2]
 
 
 def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
-    seeded = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
+    seeded = [row | {"exponent_per_s": float(row["seed"])} for row in make_map_rows(seeds=3)]
     seeded[0] |= {"exponent_per_s": None}
-    exponents = build_plane(seeded, KEYS, P_D).panels[0].exponents_per_s
+    exponents = build_plane(seeded, MAP_KEYS, P_D).panels[0].exponents_per_s
     assert np.isnan(exponents[0, 0])
     assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
-    assert not build_plane(list(rows()), KEYS, P_D).has_exponents
+    assert not build_plane(list(make_map_rows()), MAP_KEYS, P_D).has_exponents
 
 
 def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:

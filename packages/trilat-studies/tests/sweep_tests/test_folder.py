@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import DAMPING, SHORT, make_cell_result, plan_quick_sweep
 from trilat_studies import measure_run
 from trilat_studies.sweep.sweep_cell import CellRun
 from trilat_studies.sweep.sweep_run import (
@@ -22,8 +23,6 @@ from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.work import study_folder as folders
 from trilat_net.work.study_folder import RunJournal
-
-from .quick import DAMPING, SHORT, outcome_of, plan_quick_sweep
 
 
 def refused(path: Path, *overrides: str, **settings: Any) -> str:
@@ -138,7 +137,7 @@ def entry(cell: int, seed: int = 1) -> CellRun:
         "p_d",
         "ab" * 32,
         ((0, 4), f"é = {cell}"),
-        outcome_of(str(cell)),
+        make_cell_result(str(cell)),
     )
 
 
@@ -199,7 +198,7 @@ def test_a_cut_file_keeps_whole_lines_and_grows(
     assert kept[:whole] == FIVE[:whole]
     assert len(kept) <= whole + 1  # a line that lacks its line feed alone is whole
     write_journal(path, FIVE)
-    assert sorted(read(path), key=lambda one: one.cell) == FIVE
+    assert sorted(read(path), key=lambda run: run.cell) == FIVE
 
 
 @given(data=st.data())

@@ -51,7 +51,8 @@ def test_verdict_and_numbers_are_those_of_a_log(run: str) -> None:
     stream.seek(0)
     log = open_log(stream)
 
-    result, certificate = judge_result(scenario), certify_run(log)
+    result = judge_result(scenario)
+    certificate = certify_run(log)
     expected = certificate.end
     assert result.motion is expected.behaviour
     assert result.verdict is classify_decision(certificate.stability, expected.behaviour)

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from study_builders import SHORT
 from trilat_studies.sweep.sweep_run import JOURNAL_FILE
 
 from tests.cli.running import COMMAND, PLAIN, trilat
 from tests.net.waiting import until
-
-from .quick import SHORT
 
 AXES = ("--over", "control.Kd=1:4:0.1", "--over", "link.loss=0,0.1")
 OPTIONS = (*AXES, "--seeds", "2", "--longest", "8")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from study_builders import record_lane_times, use_single_runs
 from trilat_studies.side_by_side import describe_runs_alone
 from trilat_studies.sweep import plan_sweep, sweep_run
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
@@ -30,12 +31,16 @@ def find_slow_site(run: FusedRun) -> str:
 def test_table_does_not_depend_on_lanes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    lane_times_s = record_lane_times(monkeypatch)
+    use_single_runs(monkeypatch)
     alone = run_in(tmp_path / "alone")
-    assert not alone.alone
+    assert not lane_times_s
     assert describe_runs_alone(alone.alone, alone.runs) == ""
+
     monkeypatch.setattr(sweep_run, "LANE_SITE_TICKS", 0)
     monkeypatch.setattr(run_groups, "find_obstacle", find_slow_site)
     together = run_in(tmp_path / "together")
+    assert lane_times_s
     assert together.runs == alone.runs == len(together.results.rows)
     table = (tmp_path / "together" / RESULTS_FILE).read_bytes()
     assert table == (tmp_path / "alone" / RESULTS_FILE).read_bytes()

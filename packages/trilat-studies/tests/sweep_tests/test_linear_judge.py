@@ -3,13 +3,8 @@
 from pathlib import Path
 
 import pytest
-from trilat_studies.sweep import (
-    plan_sweep,
-    prepare_sweep_folder,
-    read_results,
-    run_sweep,
-    sweep_cell,
-)
+from study_builders import plan_quick_sweep, replace_judge, run_plan
+from trilat_studies.sweep import plan_sweep, read_results
 from trilat_studies.sweep.stability_map import (
     ZERO_RATE,
     build_stability_map,
@@ -19,8 +14,6 @@ from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 
 from trilat_net.analysis.theory import iterate_linear_edges
 from trilat_net.scenario import load_scenario
-
-from .quick import plan_quick_sweep
 
 AXES = ("link.delay_ms=100,200,300", "control.d=0.4:2.4:0.2")
 
@@ -33,9 +26,9 @@ def test_linear_cells_have_the_known_edge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every column changes its class beside the edge that the linear analysis of a key finds."""
-    monkeypatch.setattr(sweep_cell, "classify_cell", refuse_runs)
+    replace_judge(monkeypatch, refuse_runs)
     plan = plan_sweep("p_d_margin", over=AXES, judge="linear")
-    results = run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results
+    results = run_plan(plan, tmp_path / "o").results
     assert read_results(tmp_path / "o").rows == results.rows
 
     chart = build_stability_map(results, (), 1)
@@ -59,7 +52,7 @@ def test_linear_cells_have_the_known_edge(
 
 def test_sampled_loops_have_floquet_multipliers(tmp_path: Path) -> None:
     plan = plan_sweep("p_d_margin", ["scheme=digital"], over=["control.d=2"], judge="linear")
-    (row,) = run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows
+    (row,) = run_plan(plan, tmp_path / "o").results.rows
     assert row["rests_on"].startswith("Floquet multipliers")
 
 
@@ -71,7 +64,7 @@ def test_cells_without_linear_form_say_so(tmp_path: Path) -> None:
         over=["link.delay_ms=0,20"],
         judge="linear",
     )
-    results = run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results
+    results = run_plan(plan, tmp_path / "o").results
     for row in results.rows:
         assert row["verdict"] == CellClass.UNDECIDED
         assert row["reasons"].startswith("no linear analysis: ")

@@ -6,7 +6,8 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trilat_studies.sweep import margin_search, sweep_cell
+from study_builders import replace_judge
+from trilat_studies.sweep import margin_search
 from trilat_studies.sweep.margin_search import (
     SCAN_POINTS,
     GridPointMargin,
@@ -36,8 +37,8 @@ def plan_margin_sweep(*over: str, **settings: object) -> SweepPlan:
 
 
 @pytest.fixture
-def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stands for the judge: follows the condition of P+d and remembers nothing."""
+def judge_by_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the condition of P+d judge every cell."""
 
     def judge(text: str, _: float) -> CellResult:
         scenario = parse_scenario(text)
@@ -47,7 +48,7 @@ def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
         motion = EndBehaviour.CONVERGED if stable else EndBehaviour.DIVERGED
         return CellResult(verdict, motion, 1.0, 0, 0.0, 0.0, None, None, 0.0, None, None)
 
-    monkeypatch.setattr(sweep_cell, "classify_cell", judge)
+    replace_judge(monkeypatch, judge)
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_, **__: ((), ""))
 
 
-@pytest.mark.usefixtures("by_the_line")
+@pytest.mark.usefixtures("judge_by_line")
 def test_a_place_has_its_edge_beside_theory() -> None:
     (point,) = search_margins(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1)
     assert point.cell.values == (200.0,)
@@ -67,7 +68,7 @@ def test_a_place_has_its_edge_beside_theory() -> None:
     assert point.remark == ""
 
 
-@pytest.mark.usefixtures("by_the_line", "without_roots")
+@pytest.mark.usefixtures("judge_by_line", "without_roots")
 def test_seeds_are_places_where_links_are_random() -> None:
     lossy = search_margins(plan_margin_sweep("link.loss=0,0.1", seeds=2), WITHIN, 1)
     assert [(point.cell.values, point.seed) for point in lossy] == [
@@ -91,7 +92,7 @@ def test_the_number_of_processes_changes_nothing() -> None:
     assert search_margins(plan, within, 1) == search_margins(plan, within, 2)
 
 
-@pytest.mark.usefixtures("by_the_line", "without_roots")
+@pytest.mark.usefixtures("judge_by_line", "without_roots")
 def test_whole_number_keys_are_searched_in_integers() -> None:
     """The judge gives 300 Hz and 50 Hz the same verdict; no value between whole numbers may be run."""
     within = SearchRange("rate_hz", 50.0, 300.0, 0.005)

@@ -1,7 +1,6 @@
 """The page of a map, and its figure: colours are the verdicts, borders lie half way, lines on top."""
 
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -10,6 +9,14 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import rgb_to_hsv, to_hex, to_rgb
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
+from study_builders import (
+    DAMPINGS,
+    DELAYS_MS,
+    SPARE_DAMPING,
+    judge_by_condition,
+    make_gapped_plane,
+    make_map_plane,
+)
 from trilat_studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_studies.sweep.map_page import (
     CLASS_COLOURS,
@@ -25,18 +32,19 @@ from trilat_studies.sweep.sweep_plan import plan_sweep
 
 from trilat_net.presentation.appearance import FigureSize
 
-from .maps import DAMPINGS, DELAYS_MS, judge_by_condition, make_plane, rows
-
-SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
-EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
+EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE_DAMPING, 0)
 HALF = MapLine(
-    "half", "half of it", "half of the condition", SPARE + 2.5e-3 * np.array(DELAYS_MS), 1
+    "half",
+    "half of it",
+    "half of the condition",
+    SPARE_DAMPING + 2.5e-3 * np.array(DELAYS_MS),
+    1,
 )
 
 
 @pytest.fixture
 def chart() -> StabilityMap:
-    plane = make_plane(link__playout_ms=(0.0, 400.0))
+    plane = make_map_plane(link__playout_ms=(0.0, 400.0))
     return StabilityMap(
         plane, ((EXACT, HALF), (EXACT,)), ("a remark",), ("trilat sweep a", "trilat map"), "P+d"
     )
@@ -71,13 +79,13 @@ def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
 
 
 def test_counts_are_of_all_runs() -> None:
-    plane = make_plane(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
+    plane = make_map_plane(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
     assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
 
 
 def test_an_edge_stands_beside_each_lines_difference() -> None:
     """A row has the measured edge, then each line's edge and its distance from the middle."""
-    plane = make_plane()
+    plane = make_map_plane()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
     measured_heads = ("delay (ms)", "edge of d (N m s/rad)", "stable is")
     line_heads = ("d = 5 T", "difference", "half of it", "difference")
@@ -89,13 +97,14 @@ def test_an_edge_stands_beside_each_lines_difference() -> None:
         assert low <= float(row[3]) <= high
         assert row[4] == "within"
 
-        half, middle = 2.5e-3 * float(row[0]), 0.5 * (low + high)
+        half = 2.5e-3 * float(row[0])
+        middle = 0.5 * (low + high)
         expected = "within" if low <= half <= high else f"{100 * (half / middle - 1):+.1f} %"
         assert row[6] == expected
 
 
 def test_a_missing_line_has_no_difference() -> None:
-    plane = make_plane()
+    plane = make_map_plane()
     table = tabulate_edges(
         plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
     )
@@ -103,11 +112,11 @@ def test_a_missing_line_has_no_difference() -> None:
 
 
 def test_a_map_without_an_edge_has_no_table() -> None:
-    plane = make_plane(lambda *_, **__: CellClass.CONVERGED)
+    plane = make_map_plane(lambda *_, **__: CellClass.CONVERGED)
     assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
 
 
-LINE = MapLine("$d$", "d", "", SPARE, 0)
+LINE = MapLine("$d$", "d", "", SPARE_DAMPING, 0)
 
 
 def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = ()) -> Figure:
@@ -127,33 +136,30 @@ def meshes(figure_of_map: Figure) -> list[QuadMesh]:
     ]
 
 
-def every(*point: Any) -> CellClass:
-    """Returns a verdict for each place, so that all verdicts occur."""
-    return CELL_CLASSES[(DELAYS_MS.index(point[0]) + DAMPINGS.index(point[1])) % 4]
+def choose_class(delay_ms: int, damping: float, _seed: int = 1) -> CellClass:
+    """Returns a verdict for each cell, so that all verdicts occur."""
+    return CELL_CLASSES[(DELAYS_MS.index(delay_ms) + DAMPINGS.index(damping)) % 4]
 
 
 def test_every_place_has_the_colour_of_its_verdict() -> None:
-    figure_of_map = figure(make_plane(every))
+    figure_of_map = figure(make_map_plane(choose_class))
     figure_of_map.canvas.draw()
     (mesh,) = meshes(figure_of_map)[:1]
     colours = mesh.get_facecolors().reshape(len(DAMPINGS), len(DELAYS_MS), 4)
     for i, d in enumerate(DAMPINGS):
         for j, delay in enumerate(DELAYS_MS):
-            assert to_hex(colours[i, j]) == CLASS_COLOURS[every(delay, d)]
+            assert to_hex(colours[i, j]) == CLASS_COLOURS[choose_class(delay, d)]
 
 
 def test_a_place_reaches_half_way_to_the_next() -> None:
-    (mesh,) = meshes(figure(make_plane()))[:1]
+    (mesh,) = meshes(figure(make_map_plane()))[:1]
     corners = mesh.get_coordinates()
     assert np.allclose(corners[0, :, 0], [0, 50, 150, 250, 350, 450])
     assert np.allclose(corners[:, 0, 1], [0, 0.45, 0.95, 1.45, 1.95, 2.45])
 
 
 def test_classes_differ_in_lightness() -> None:
-    """Grey print: luminance after Rec.
-
-    709; white stands for undecided, and is hatched besides.
-    """
+    """In grey print the classes differ by their luminance (Rec. 709), and undecided is white."""
     light = [
         float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES
     ]
@@ -164,7 +170,7 @@ def test_classes_differ_in_lightness() -> None:
 def test_lines_are_drawn_where_they_are_and_named() -> None:
     """Two lines along d = 5 T are straight, differ in their style, and are in the legend."""
     figure_of_lines = figure(
-        make_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1))
+        make_map_plane(), lines=(LINE, LINE._replace(label="linear analysis", rank=1))
     )
     first, second = (
         collection
@@ -184,13 +190,13 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
 
 
 def test_the_legend_has_only_occurring_classes() -> None:
-    (legend,) = figure(make_plane(lambda *_, **__: CellClass.UNDECIDED)).legends
+    (legend,) = figure(make_map_plane(lambda *_, **__: CellClass.UNDECIDED)).legends
     assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
 
 
 def test_several_runs_show_their_share_with_a_scale() -> None:
     """A cell has the colour of its share, and a count if its seeds disagree."""
-    plane = make_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4)
+    plane = make_map_plane(lambda x, y, seed: judge_by_condition(x, y - 0.3 * seed), seeds=4)
     figure_of_runs = figure(plane, 7.0)
     share = meshes(figure_of_runs)[0].get_array()
     assert share is not None
@@ -206,7 +212,7 @@ def test_several_runs_show_their_share_with_a_scale() -> None:
 
 @pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
 def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) -> None:
-    plane = make_plane(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
+    plane = make_map_plane(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
     figure_of_panels = figure(plane, width_in, (LINE,))
     assert figure_of_panels.get_figwidth() == width_in
     assert [axes.get_title() for axes in figure_of_panels.axes if axes.collections] == [
@@ -221,23 +227,18 @@ def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) ->
 
 def test_settings_of_matplotlib_stay_unchanged() -> None:
     before = dict(mpl.rcParams)
-    figure(make_plane())
+    figure(make_map_plane())
     assert dict(mpl.rcParams) == before
 
 
 def test_a_place_without_run_is_no_verdict() -> None:
-    from trilat_studies.sweep.stability_map import build_plane
-
-    from .maps import KEYS, P_D
-
-    figure_of_gap = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
-    classes = meshes(figure_of_gap)[0].get_array()
+    classes = meshes(figure(make_gapped_plane()))[0].get_array()
     assert classes is not None
     assert int(np.ma.getmaskarray(classes).sum()) == 1
 
 
 def test_uneven_values_are_named_one_by_one() -> None:
-    plane = make_plane()
+    plane = make_map_plane()
     uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
     figure_of_values = figure(uneven)
     figure_of_values.canvas.draw()
@@ -257,7 +258,7 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 @pytest.mark.parametrize("width_in", [3.5, 7.0])
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
     """The gains below the panels stand apart from every label and inside the figure."""
-    plane = make_plane(link__playout_ms=panels)
+    plane = make_map_plane(link__playout_ms=panels)
     figure = draw_stability_map(
         plane, [()] * len(plane.panels), FigureSize.for_print(width_in), FIXED
     )
@@ -297,5 +298,5 @@ def test_gains_that_were_not_swept_are_named(
 ) -> None:
     gains = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
     assert len(gains) == len(texts)
-    for one, text in zip(gains, texts, strict=True):
-        assert one.startswith(text)
+    for sentence, text in zip(gains, texts, strict=True):
+        assert sentence.startswith(text)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import SHORT, plan_quick_sweep
 from trilat_studies.sweep.sweep_plan import (
     SweepPlan,
     list_axes,
@@ -19,8 +20,6 @@ from trilat_studies.sweep.sweep_plan import (
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-
-from .quick import SHORT, plan_quick_sweep
 
 
 def refused(source: str, *overrides: str, **settings: object) -> str:
@@ -62,10 +61,9 @@ VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
 def test_values_by_key_equal_axes_as_texts(
     delays: list[float], counts: list[int], as_array: bool
 ) -> None:
-    given = [np.array(axes) if as_array else axes for axes in (delays, counts)]
     over = {
-        "link.delay_ms": given[0],
-        "control.d": given[1],
+        "link.delay_ms": np.array(delays) if as_array else delays,
+        "control.d": np.array(counts) if as_array else counts,
         "link.order": ["newest", "in_order"],
     }
     first, second, third = map(parse_axis, list_axes(over))

@@ -6,6 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import (
+    DAMPINGS,
+    DELAYS_MS,
+    MAP_KEYS,
+    P_D,
+    judge_by_condition,
+    make_map_plane,
+    make_map_rows,
+)
 from trilat_studies.sweep.stability_map import (
     CELL_CLASSES,
     PlaneAxis,
@@ -20,15 +29,15 @@ from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.scenario_reader import list_shipped
 
-from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, judge_by_condition, make_plane, rows
-
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
 def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> None:
     """A cell of the map counts the verdicts of its own runs, in any order of the rows."""
     random = np.random.default_rng(chance)
-    shuffled_rows = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
-    plane = build_plane([shuffled_rows[n] for n in order], KEYS, P_D)
+    shuffled_rows = list(
+        make_map_rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2)
+    )
+    plane = build_plane([shuffled_rows[n] for n in order], MAP_KEYS, P_D)
     (panel,) = plane.panels
     assert panel.counts.sum() == 50
     for i, damping in enumerate(DAMPINGS):
@@ -36,7 +45,7 @@ def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> No
             verdicts = [
                 row["verdict"]
                 for row in shuffled_rows
-                if (row[KEYS[0]], row[KEYS[1]]) == (delay_ms, damping)
+                if (row[MAP_KEYS[0]], row[MAP_KEYS[1]]) == (delay_ms, damping)
             ]
             expected = [verdicts.count(verdict.value) for verdict in CELL_CLASSES]
             assert panel.counts[i, j].tolist() == expected
@@ -49,17 +58,17 @@ def test_the_share_is_of_decided_runs() -> None:
         CellClass.UNDECIDED,
         CellClass.CONVERGED,
     )
-    plane = make_plane(lambda *place: verdicts[place[-1] - 1], seeds=4)
+    plane = make_map_plane(lambda *place: verdicts[place[-1] - 1], seeds=4)
     assert np.allclose(plane.panels[0].share, 2.0 / 3.0)
     assert plane.seeds == 4
 
 
 def test_undecided_places_have_no_share() -> None:
-    assert np.isnan(make_plane(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
+    assert np.isnan(make_map_plane(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
 
 
 def test_words_and_further_axes_make_panels() -> None:
-    plane = make_plane(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
+    plane = make_map_plane(link__order=("newest", "in_order"), link__playout_ms=(0.0, 400.0))
     assert [panel.title for panel in plane.panels] == [
         "newest, playout 0 ms",
         "newest, playout 400 ms",
@@ -73,22 +82,22 @@ def test_words_and_further_axes_make_panels() -> None:
 
 
 def test_an_axis_of_words_is_never_drawn() -> None:
-    ordered_rows = list(rows(link__order=("newest", "in_order")))
-    plane = build_plane(ordered_rows, ["link.order", *KEYS], P_D)
-    assert (plane.x.key, plane.y.key) == KEYS
+    ordered_rows = list(make_map_rows(link__order=("newest", "in_order")))
+    plane = build_plane(ordered_rows, ["link.order", *MAP_KEYS], P_D)
+    assert (plane.x.key, plane.y.key) == MAP_KEYS
     assert len(plane.panels) == 2
 
 
 def test_a_single_axis_is_a_strip() -> None:
     plane = build_plane(
-        [row for row in rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D
+        [row for row in make_map_rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D
     )
     assert (plane.y.key, plane.y.values) == ("", (0.0,))
     assert plane.panels[0].counts.shape == (1, 5, 4)
 
 
 def test_whole_numbers_stay_whole() -> None:
-    assert all(isinstance(value, int) for value in make_plane().x.values)
+    assert all(isinstance(value, int) for value in make_map_plane().x.values)
 
 
 @pytest.mark.parametrize(
@@ -102,11 +111,13 @@ def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool
 
 def test_no_runs_numbers_or_panels_are_refused() -> None:
     with pytest.raises(UsageError, match="no cell has run"):
-        build_plane([], KEYS, P_D)
+        build_plane([], MAP_KEYS, P_D)
     with pytest.raises(UsageError, match=r"needs a numeric axis, .* not numbers: link\.order"):
-        build_plane(list(rows(link__order=("newest", "in_order"))), ["link.order"], P_D)
+        build_plane(
+            list(make_map_rows(link__order=("newest", "in_order"))), ["link.order"], P_D
+        )
     with pytest.raises(UsageError, match=r"at most 12 panels, but rate_hz would give 13"):
-        make_plane(rate_hz=tuple(range(13)))
+        make_map_plane(rate_hz=tuple(range(13)))
 
 
 YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
@@ -114,12 +125,12 @@ YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 def list_column_edges(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
     """Returns the edges of the first column of a map whose columns are alike."""
-    plane = make_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
+    plane = make_map_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
     return [edge for x, edge in find_map_edges(plane, plane.panels[0]) if x == DELAYS_MS[0]]
 
 
 def test_the_condition_lies_in_its_own_edges() -> None:
-    plane = make_plane()
+    plane = make_map_plane()
     measured = find_map_edges(plane, plane.panels[0])
     assert [x for x, _ in measured] == [100, 200, 300, 400]
     for x, edge in measured:
@@ -150,13 +161,13 @@ def test_undecided_places_widen_an_edge() -> None:
 
 def test_majorities_of_runs_decide_and_draws_do_not() -> None:
     """Per place seeds 1 and 2 follow the line, and seed 3 contradicts: a majority of two of three."""
-    three = make_plane(
+    three = make_map_plane(
         lambda x, y, seed: judge_by_condition(x, y) if seed < 3 else YES, seeds=3
     )
     assert find_map_edges(three, three.panels[0]) == find_map_edges(
-        make_plane(), make_plane().panels[0]
+        make_map_plane(), make_map_plane().panels[0]
     )
-    draw = make_plane(
+    draw = make_map_plane(
         lambda x, y, seed: judge_by_condition(x, y) if seed < 2 or y > 1.0 else YES, seeds=2
     )
     assert all(

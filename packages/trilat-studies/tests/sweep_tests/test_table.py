@@ -9,12 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from study_builders import (
+    DELAYS,
+    Judge,
+    make_cell_result,
+    plan_quick_sweep,
+    replace_judge,
+    run_plan,
+)
 from trilat_studies.sweep import (
     prepare_sweep_folder,
     read_results,
     result_table,
-    run_sweep,
-    sweep_cell,
 )
 from trilat_studies.sweep.result_table import ResultTable
 from trilat_studies.sweep.sweep_cell import RUN_CLASSES, CellRun, diff_lines
@@ -31,8 +37,6 @@ from trilat_studies.sweep.sweep_results import (
 
 from trilat_net.errors import UsageError
 from trilat_net.work.intervals import wilson_interval
-
-from .quick import DELAYS, Judge, outcome_of, plan_quick_sweep
 
 ORDERS = "link.order=newest,in_order"
 
@@ -55,9 +59,11 @@ def finished_sweep(
     sweep = plan_quick_sweep(
         path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2
     )
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(sweep_cell, "classify_cell", judge := Judge())
-        return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
+    judge = Judge()
+    with pytest.MonkeyPatch.context() as patch:
+        replace_judge(patch, judge)
+        results = run_plan(sweep, path / "o").results
+    return path / "o", results, judge
 
 
 def test_the_read_runs_are_the_written_ones(
@@ -166,23 +172,20 @@ def test_the_request_stands_beside_the_table(
     assert set(facts["versions"]) == {"version_trilat-net", "version_numba", "version_numpy"}
 
 
+@pytest.mark.usefixtures("judge")
 def test_a_sweep_needs_no_optional_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("pandas", "polars", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    plan = plan_quick_sweep(tmp_path, over=[DELAYS], seeds=2)
-    run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1)
+    run_plan(plan_quick_sweep(tmp_path, over=[DELAYS], seeds=2), tmp_path / "o")
     assert len(read_results(tmp_path / "o").rows) == 3
 
 
-def test_a_very_long_scenario_is_read_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+@pytest.mark.usefixtures("judge")
+def test_a_very_long_scenario_is_read_back(tmp_path: Path) -> None:
     plan = plan_quick_sweep(tmp_path, over=[DELAYS])
-    rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
+    rows = list(run_plan(plan, tmp_path / "o").results.rows)
     rows[1] = {**rows[1], "scenario": '# "letters", and\r\n' + "x" * 300_000}
     (tmp_path / "o" / "results.csv").write_text(
         "".join(ResultTable(plan).encode(rows)), newline=""
@@ -202,7 +205,7 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
         text = text.replace("1.1", f"{damping}")
         digest = f"{number:064x}"
         parts = diff_lines(text, base)
-        entries.append(CellRun(number, 1, False, "p_d", digest, parts, outcome_of(text)))
+        entries.append(CellRun(number, 1, False, "p_d", digest, parts, make_cell_result(text)))
 
     table = encode_runs(sweep, entries)
     assert len(entries) == 10_000
@@ -215,7 +218,7 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
 
 def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
     sweep = plan_quick_sweep(tmp_path, over=[DELAYS])
-    outcomes = [outcome_of(str(n)) for n in range(100)]
+    outcomes = [make_cell_result(str(n)) for n in range(100)]
     for outcome in outcomes:
         duration_s = reproduction_duration_s(sweep, outcome)
         if outcome.diverged_s is None:
@@ -238,6 +241,7 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
     refused(tmp_path / "other.csv", "contains no results of a sweep", "plan.json")
 
 
+@pytest.mark.usefixtures("judge")
 @pytest.mark.parametrize(
     ("damage", "word"),
     [
@@ -250,12 +254,9 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_table_is_refused(
-    damage: Callable[[str], str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    damage: Callable[[str], str], word: str, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    folder = run_sweep(
-        prepare_sweep_folder(plan_quick_sweep(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
-    ).folder.path
+    folder = run_plan(plan_quick_sweep(tmp_path, over=[DELAYS]), tmp_path / "o").folder.path
     table = folder / "results.csv"
     table.write_text(damage(table.read_text()))
     with pytest.raises(UsageError, match=word) as error:
@@ -264,13 +265,12 @@ def test_a_damaged_table_is_refused(
 
 
 @pytest.fixture
-def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
+def points(tmp_path: Path, judge: Judge) -> list[GridPoint]:
     """The grid points of a sweep in which twelve seeds of random cells are judged by chance."""
-    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
-    return collect_grid_points(
-        run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
-    )
+    results = run_plan(sweep, tmp_path / "o").results
+    assert len(judge.texts) == 3 + 15 * 12
+    return collect_grid_points(results)
 
 
 def test_every_run_is_counted_once(points: list[GridPoint]) -> None:

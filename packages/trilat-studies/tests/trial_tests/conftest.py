@@ -1,8 +1,7 @@
 from pathlib import Path
 
 import pytest
-
-from .results import QUICK
+from study_builders import QUICK
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import CALM, make_run_metrics
 from trilat_studies.measure_run import (
     ExpectationResult,
     Range,
@@ -15,8 +16,6 @@ from trilat_studies.measure_run import (
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.expect import ExpectWindow
-
-from .results import CALM, figures
 
 READINGS: dict[str, float] = {
     "synchronised_by_s": 11.0,
@@ -39,9 +38,9 @@ OTHERS: dict[str, Any] = {"stable": True, "end_pose_rad": {"s": (0.1, 0.2)}, "no
 TOLERANCES = {"synchronised_rad", "end_pose_within_rad"}
 
 
-def only(expect: Expect, **changes: Any) -> ExpectationResult:
-    """Returns the single outcome, for the calm run with some facts replaced."""
-    outcomes = evaluate_expectations(expect, figures(**changes))
+def evaluate_single(expect: Expect, **changes: Any) -> ExpectationResult:
+    """Returns the single outcome for the calm run with some metrics replaced."""
+    outcomes = evaluate_expectations(expect, make_run_metrics(**changes))
     assert len(outcomes) == 1
     return outcomes[0]
 
@@ -53,7 +52,7 @@ def test_every_asked_key_is_answered_and_no_other() -> None:
     )
     assert evaluate_expectations(Expect(), CALM) == []
     for key, value in {**READINGS, **OTHERS}.items():
-        assert only(Expect(**{key: value})).key.split(".")[0] == key
+        assert evaluate_single(Expect(**{key: value})).key.split(".")[0] == key
 
 
 @pytest.mark.parametrize("key", READINGS)
@@ -61,7 +60,7 @@ def test_every_asked_key_is_answered_and_no_other() -> None:
 def test_a_limit_holds_exactly_within_the_figure(key: str, limit: float) -> None:
     if key == "late_samples_max":
         limit = int(limit)
-    outcome = only(Expect(**{key: limit}))
+    outcome = evaluate_single(Expect(**{key: limit}))
     measured = READINGS[key]
     assert outcome.held == (measured >= limit if "_min_" in key else measured <= limit)
     if limit:
@@ -73,7 +72,7 @@ def test_a_limit_holds_exactly_within_the_figure(key: str, limit: float) -> None
 
 @pytest.mark.parametrize("key", READINGS)
 def test_a_limit_itself_still_holds(key: str) -> None:
-    outcome = only(Expect(**{key: READINGS[key]}))
+    outcome = evaluate_single(Expect(**{key: READINGS[key]}))
     assert outcome.held
     assert outcome.margin == 0.0
 
@@ -83,7 +82,7 @@ def test_a_limit_itself_still_holds(key: str) -> None:
     [("synchronised_by_s", "synchronised_at_s"), ("end_spread_max_rad", "end_spread_rad")],
 )
 def test_unmeasured_quantities_do_not_hold(key: str, field: str) -> None:
-    outcome = only(Expect(**{key: 1e9}), **{field: None})
+    outcome = evaluate_single(Expect(**{key: 1e9}), **{field: None})
     assert not outcome.held
     assert outcome.measured == "never"
 
@@ -91,8 +90,8 @@ def test_unmeasured_quantities_do_not_hold(key: str, field: str) -> None:
 def test_links_without_samples_meet_no_age_limit() -> None:
     ages = {**CALM.ages, "m1->m2": type(CALM.ages["m1->s"])(None, None)}
     for key in ("age_max_ms", "mean_age_max_ms"):
-        assert not only(Expect(**{key: 1e9}), ages=ages).held
-    assert not only(Expect(mean_age_min_ms=0.0), ages=ages).held
+        assert not evaluate_single(Expect(**{key: 1e9}), ages=ages).held
+    assert not evaluate_single(Expect(mean_age_min_ms=0.0), ages=ages).held
 
 
 @pytest.mark.parametrize("stable", [True, False])
@@ -108,11 +107,11 @@ def test_stable_needs_the_judgement_and_open_fails(
     behaviour: EndBehaviour, stability: Stability, stable: bool
 ) -> None:
     end = CALM.end._replace(behaviour=behaviour)
-    outcome = only(Expect(stable=stable), end=end)
+    outcome = evaluate_single(Expect(stable=stable), end=end)
     wanted = Stability.SETTLED if stable else Stability.NOT_STABLE
     assert outcome.held is (stability is wanted)
     assert outcome.measured == f"{stability}: {end.text}"
-    assert only(
+    assert evaluate_single(
         Expect(stable=True), end=CALM.end._replace(reasons=("a reason",))
     ).measured.startswith("open: ")
 
@@ -120,7 +119,7 @@ def test_stable_needs_the_judgement_and_open_fails(
 @pytest.mark.parametrize("stable", [None, True, False])
 def test_diverged_runs_fail_unless_divergence_was_expected(stable: bool | None) -> None:
     end = CALM.end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=3.25)
-    outcome = only(Expect(stable=stable), end=end)
+    outcome = evaluate_single(Expect(stable=stable), end=end)
     assert outcome.held == (stable is False)
     assert "3.25 s" in outcome.measured
 
@@ -129,7 +128,9 @@ def test_diverged_runs_fail_unless_divergence_was_expected(stable: bool | None) 
 def test_pose_must_match_each_joint_within_tolerance(off: float, within: float) -> None:
     """An expectation of a pose holds if no joint is farther away than the tolerance."""
     for wanted in ((0.1 + off, 0.2), (0.1, 0.2 - off)):
-        outcome = only(Expect(end_pose_rad={"s": wanted}, end_pose_within_rad=within))
+        outcome = evaluate_single(
+            Expect(end_pose_rad={"s": wanted}, end_pose_within_rad=within)
+        )
         assert outcome.margin is not None
         assert outcome.held == (outcome.margin >= 0.0)
         if abs(abs(off) - within) > 1e-9:
@@ -144,12 +145,12 @@ def test_sites_with_poses_have_outcomes_of_their_own() -> None:
         ("end_pose_rad.m1", True),
         ("end_pose_rad.s", False),
     ]
-    assert not only(Expect(end_pose_rad={"s": (0.1, 0.2)}), end_pose_rad={}).held
+    assert not evaluate_single(Expect(end_pose_rad={"s": (0.1, 0.2)}), end_pose_rad={}).held
 
 
 def test_gaps_are_counted() -> None:
-    assert not only(Expect(no_gaps=True)).held
-    assert only(Expect(no_gaps=True), missing=0).held
+    assert not evaluate_single(Expect(no_gaps=True)).held
+    assert evaluate_single(Expect(no_gaps=True), missing=0).held
     assert evaluate_expectations(Expect(no_gaps=False), CALM) == []
 
 
@@ -160,7 +161,7 @@ SPANS = {
 }
 
 
-def window(**limits: Any) -> Expect:
+def expect_window(**limits: Any) -> Expect:
     """Returns an expectation on the slave from 9 to 15.5 s."""
     return Expect(windows=(ExpectWindow(from_s=9.0, to_s=15.5, site="s", **limits),))
 
@@ -170,7 +171,7 @@ def test_window_quantities_must_hold_throughout(least: float, width: float) -> N
     """An expectation of a window holds if the whole range is within the limits."""
     most = least + width
     for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
-        outcome = only(window(**{key: (least, most)}), windows=(SPANS,))
+        outcome = evaluate_single(expect_window(**{key: (least, most)}), windows=(SPANS,))
         assert outcome.key == f"{key} s 9-15.5 s"
         assert outcome.held == (least <= low and high <= most)
         if most > least:
@@ -179,16 +180,18 @@ def test_window_quantities_must_hold_throughout(least: float, width: float) -> N
 
 
 def test_an_unreached_window_does_not_hold() -> None:
-    outcome = only(window(error_peak_rad=(0.0, 1e9)), windows=({},))
-    assert (outcome.held, outcome.measured, outcome.limit) == (False, "never", "0 to 1e+09 rad")
+    outcome = evaluate_single(expect_window(error_peak_rad=(0.0, 1e9)), windows=({},))
+    assert not outcome.held
+    assert outcome.measured == "never"
+    assert outcome.limit == "0 to 1e+09 rad"
 
 
 def test_a_window_names_units_and_all_sites() -> None:
-    expect_window = ExpectWindow(
+    window = ExpectWindow(
         from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
     )
     outcomes = evaluate_expectations(
-        Expect(windows=(expect_window,)), figures(windows=(SPANS,))
+        Expect(windows=(window,)), make_run_metrics(windows=(SPANS,))
     )
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
     assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]
@@ -210,8 +213,8 @@ s = { m = 1.0 }
 """
 
 
-def is_stable(three: bool, d: float, stable: bool, **link: object) -> bool:
-    """True if `stable` holds for 40 s of free motion at 200 Hz, over links of 200 ms unless given."""
+def meets_stable(three: bool, d: float, stable: bool, **link: object) -> bool:
+    """Returns True if `stable` holds for 40 s of free motion at 200 Hz, over links of 200 ms unless given."""
     changes = {
         "rate_hz": 200,
         "duration_s": 40.0,
@@ -235,15 +238,16 @@ def is_stable(three: bool, d: float, stable: bool, **link: object) -> bool:
 def test_the_verdict_changes_at_the_margin_of_theory(
     three: bool, below: float, above: float
 ) -> None:
-    assert is_stable(three, below, stable=False)
-    assert not is_stable(three, below, stable=True)
-    assert is_stable(three, above, stable=True)
-    assert not is_stable(three, above, stable=False)
+    """Below the margin `stable = false` holds, above it `stable = true`, and never both."""
+    assert meets_stable(three, below, stable=False)
+    assert not meets_stable(three, below, stable=True)
+    assert meets_stable(three, above, stable=True)
+    assert not meets_stable(three, above, stable=False)
 
 
 @pytest.mark.long
 def test_jitter_decays_where_constant_delay_grows() -> None:
     jitter = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}
-    assert is_stable(True, 0.6, stable=True, **jitter)
-    assert is_stable(True, 0.6, stable=False, delay_ms=200.0)
-    assert is_stable(True, 0.6, stable=False, **jitter, playout_ms=400.0)
+    assert meets_stable(True, 0.6, stable=True, **jitter)
+    assert meets_stable(True, 0.6, stable=False, delay_ms=200.0)
+    assert meets_stable(True, 0.6, stable=False, **jitter, playout_ms=400.0)

@@ -4,11 +4,10 @@ from typing import Any
 
 import msgspec
 import pytest
+from study_builders import record_lane_times, use_lanes, use_single_runs
 from trilat_studies.measure_run import measure_virtual_run, measure_virtual_runs
 from trilat_studies.trials import Trial, run_trials, trials
 
-from trilat_net.execution.lanes import run_groups
-from trilat_net.execution.lanes.lane_run import LaneRun
 from trilat_net.scenario import Scenario, load_scenario, reseed_scenario
 
 RANDOM = {
@@ -35,6 +34,7 @@ def list_runs() -> list[Scenario]:
 
 
 def test_metrics_do_not_depend_on_lanes() -> None:
+    """The metrics of runs that are measured together are those of each run alone."""
     runs = list_runs()
     reasons = {}
     together = {}
@@ -55,31 +55,26 @@ def list_facts(batch: list[Trial]) -> list[Any]:
 
 
 def test_lanes_do_not_change_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    advance_to = LaneRun.advance_to
-
-    def count_calls(lanes: LaneRun, until_s: float) -> None:
-        calls.append(until_s)
-        advance_to(lanes, until_s)
-
-    monkeypatch.setattr(LaneRun, "advance_to", count_calls)
+    """A batch of trials has the same report whether or not the trials run in lanes."""
     batch = [
         *trials("free", range(1, 6), RANDOM),
         *trials("free", [7], {**RANDOM, "duration_s": 1.3}),
     ]
-    facts = []
-    for has_code in (True, False):
-        monkeypatch.setattr(run_groups, "has_lane_code", lambda _, has=has_code: has)
-        calls.clear()
-        facts.append(list_facts(batch))
-        assert bool(calls) is has_code
-    assert facts[0] == facts[1]
-    assert len({str(row) for row in facts[0]}) == len(batch)
+    lane_times_s = record_lane_times(monkeypatch)
+    use_single_runs(monkeypatch)
+    single = list_facts(batch)
+    assert not lane_times_s
+
+    use_lanes(monkeypatch)
+    together = list_facts(batch)
+    assert lane_times_s
+    assert together == single
+    assert len({str(row) for row in single}) == len(batch)
 
 
 def test_report_names_trials_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trials with a law in plain Python run one by one beside trials that run in lanes."""
-    monkeypatch.setattr(run_groups, "has_lane_code", lambda _: True)
+    use_lanes(monkeypatch)
     plain = {**RANDOM, **PLAIN, "expect": {"mean_age_max_ms": 20.5}}
     batch = [*trials("free", range(1, 6), RANDOM), *trials("free", [3, 4], plain)]
     assert run_trials(batch, jobs=1).remarks()[-1] == (

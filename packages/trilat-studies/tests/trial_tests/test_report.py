@@ -6,6 +6,7 @@ import xml.etree.ElementTree as Xml
 
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import make_trial_result
 from trilat_studies.measure_run import ExpectationResult
 from trilat_studies.trials import (
     MAX_FAILURES_SHOWN,
@@ -13,8 +14,6 @@ from trilat_studies.trials import (
     encode_junit_xml,
     format_margin,
 )
-
-from .results import result
 
 
 def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
@@ -25,7 +24,7 @@ def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
 
 def test_row_shows_worst_run_and_passed_count() -> None:
     report = TrialReport(
-        [result(n, outcome(m)) for n, m in enumerate((0.5, -0.2, 0.1, -0.1))], 4.0
+        [make_trial_result(n, outcome(m)) for n, m in enumerate((0.5, -0.2, 0.1, -0.1))], 4.0
     )
     (row,) = report.rows()
     assert (row.worst.margin, row.held, row.runs) == (-0.2, 2, 4)
@@ -44,14 +43,18 @@ def test_row_shows_worst_run_and_passed_count() -> None:
 def test_failures_precede_the_smallest_margin() -> None:
     failed = ExpectationResult("stable", False, "grows", "true")
     (row,) = TrialReport(
-        [result(1, ExpectationResult("stable", True, "decays", "true")), result(2, failed)], 1.0
+        [
+            make_trial_result(1, ExpectationResult("stable", True, "decays", "true")),
+            make_trial_result(2, failed),
+        ],
+        1.0,
     ).rows()
     assert row.worst is failed
 
 
 def test_failed_runs_are_named_first_with_commands() -> None:
     report = TrialReport(
-        [result(n, outcome(-0.1)) for n in range(1, MAX_FAILURES_SHOWN + 4)], 1.0
+        [make_trial_result(n, outcome(-0.1)) for n in range(1, MAX_FAILURES_SHOWN + 4)], 1.0
     )
     lines = report.failures()
     for seed in range(1, MAX_FAILURES_SHOWN + 1):
@@ -65,7 +68,11 @@ def test_failed_runs_are_named_first_with_commands() -> None:
 
 def test_runs_without_result_fail_with_a_reason() -> None:
     report = TrialReport(
-        [result(1, outcome(0.5)), result(2, error="its process ended with code -9")], 1.0
+        [
+            make_trial_result(1, outcome(0.5)),
+            make_trial_result(2, error="its process ended with code -9"),
+        ],
+        1.0,
     )
     assert not report.held
     assert [(row.key, row.held, row.runs) for row in report.rows()] == [
@@ -76,7 +83,9 @@ def test_runs_without_result_fail_with_a_reason() -> None:
 
 
 def test_passed_results_are_reported_without_failures() -> None:
-    report = TrialReport([result(1, outcome(0.5)), result(2, outcome(0.25))], 4.0)
+    report = TrialReport(
+        [make_trial_result(1, outcome(0.5)), make_trial_result(2, outcome(0.25))], 4.0
+    )
     assert report.held
     assert report.failures() == []
     assert report.remarks() == ["2 runs, 40 s simulated in 4.0 s: 10x"]
@@ -84,13 +93,16 @@ def test_passed_results_are_reported_without_failures() -> None:
 
 def test_scenarios_of_one_name_are_distinguished() -> None:
     report = TrialReport(
-        [result(1, outcome(0.5), source=name) for name in ("a.toml", "b/a.toml")], 1.0
+        [make_trial_result(1, outcome(0.5), source=name) for name in ("a.toml", "b/a.toml")],
+        1.0,
     )
     assert [row.scenario for row in report.rows()] == ["a.toml", "b/a.toml"]
 
 
 def test_the_lines_of_a_table_are_aligned() -> None:
-    report = TrialReport([result(1, outcome(0.5), outcome(-123.0, "end_error_max_rad"))], 1.0)
+    report = TrialReport(
+        [make_trial_result(1, outcome(0.5), outcome(-123.0, "end_error_max_rad"))], 1.0
+    )
     heads, *rows = report.table()
     assert all(len(row) == len(heads) for row in rows)
     assert all(row.index("≤") == heads.index("limit") for row in rows)
@@ -134,10 +146,10 @@ def document(report: TrialReport) -> Xml.Element:
 def mixed() -> TrialReport:
     return TrialReport(
         [
-            result(1, GOOD, BAD),
-            result(2, GOOD),
-            result(3, error="lost"),
-            result(1, GOOD, source="b.toml"),
+            make_trial_result(1, GOOD, BAD),
+            make_trial_result(2, GOOD),
+            make_trial_result(3, error="lost"),
+            make_trial_result(1, GOOD, source="b.toml"),
         ],
         2.0,
     )
@@ -188,6 +200,6 @@ def test_properties_describe_the_run() -> None:
 def test_any_text_is_escaped_or_replaced(text: str) -> None:
     failed = ExpectationResult("stable", False, text, text)
     root = document(
-        TrialReport([result(1, failed, error=text or "x", source=text or "x")], 1.0)
+        TrialReport([make_trial_result(1, failed, error=text or "x", source=text or "x")], 1.0)
     )
     assert len(list(root.iter("testcase"))) == 1

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 import trilat_studies.trials
+from study_builders import UNMET_LIMIT, make_quick_scenario
 from trilat_studies.trials import TrialResult, run_trials
 
 import trilat_net
 from trilat_net.scenario import list_shipped, load_scenario
-
-from .results import TOO_MUCH, quick
 
 
 def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], float]]:
@@ -27,7 +26,7 @@ def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], 
 
 @pytest.mark.long
 def test_two_processes_give_equal_results_in_order() -> None:
-    batch = trilat_net.trials(quick(), [5, 2, 9, 4])
+    batch = trilat_net.trials(make_quick_scenario(), [5, 2, 9, 4])
     results: list[TrialResult] = []
     report = run_trials(batch, 2, results.append)
     assert facts(report.results) == facts(run_trials(batch, 1).results)
@@ -39,7 +38,7 @@ def test_two_processes_give_equal_results_in_order() -> None:
 def test_check_returns_results_or_reports_all_failures(quick_file: Path) -> None:
     assert trilat_net.check(quick_file, [1, 2], jobs=1).held
     with pytest.raises(AssertionError) as failed:
-        trilat_net.check(quick_file, [1, 2], TOO_MUCH, jobs=1)
+        trilat_net.check(quick_file, [1, 2], UNMET_LIMIT, jobs=1)
     text = str(failed.value)
     assert "FAIL" in text
     assert "0/2" in text

@@ -18,7 +18,8 @@ class Piece(NamedTuple):
 def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
     """Returns the URDF of a chain; `payload` is the text of a body at its end."""
     parts = ['<robot name="odd"><link name="base"/>']
-    before, end = "base", "0 0 0"
+    parent = "base"
+    end = "0 0 0"
     for n, piece in enumerate(pieces, 1):
         across = piece.mass * piece.length**2 / 12.0  # inertia of a rod about its middle
         limits = "-0.4 0.4" if piece.kind == "prismatic" else "-2 2"
@@ -26,15 +27,16 @@ def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
         parts.append(f"""
 <link name="l{n}"><inertial><origin xyz="{0.5 * piece.length} 0 0"/><mass value="{piece.mass}"/>
 <inertia ixx="{0.2 * across}" ixy="0" ixz="0" iyy="{across}" iyz="0" izz="{across}"/></inertial></link>
-<joint name="j{n}" type="{piece.kind}"><parent link="{before}"/><child link="l{n}"/>
+<joint name="j{n}" type="{piece.kind}"><parent link="{parent}"/><child link="l{n}"/>
 <origin xyz="{piece.offset or end}"/><axis xyz="{piece.axis}"/>
 <limit lower="{low}" upper="{high}" effort="50" velocity="5"/>
 <dynamics damping="0.3" friction="0.2"/></joint>""")
-        before, end = f"l{n}", f"{piece.length} 0 0"
+        parent = f"l{n}"
+        end = f"{piece.length} 0 0"
     if payload:
         parts.append(f'<link name="tool">{payload}</link><joint name="fixed" type="fixed">')
         parts.append(
-            f'<parent link="{before}"/><child link="tool"/><origin xyz="{end}"/></joint>'
+            f'<parent link="{parent}"/><child link="tool"/><origin xyz="{end}"/></joint>'
         )
     return "\n".join([*parts, "</robot>"])
 
@@ -48,7 +50,8 @@ def body(mass: float, place: str) -> str:
     )
 
 
-SHOULDER, ELBOW = Piece("0 0 1", 3.0), Piece("0 1 0", 2.0, 0.4)
+SHOULDER = Piece("0 0 1", 3.0)
+ELBOW = Piece("0 1 0", 2.0, 0.4)
 SLIDE = Piece("1 0 0", 2.0, 0.3, "prismatic")
 ODD_ARMS = {
     "one joint": write_arm([SHOULDER]),

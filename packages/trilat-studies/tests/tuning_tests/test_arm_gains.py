@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from trilat_studies.arm_gains import SHARES, ArmGains, tune_arm
 
 import trilat_net as tn
-from tests.chains import robot_files
 from tests.cli.running import trilat
+from tests.scenario.builders import find_robot_files
 from tests.sites.visits import ping_sites
 from trilat_net.errors import TrilatError
 from tuning_tests.mode_count import count_growing
@@ -54,14 +54,15 @@ def write_jitter(
 
 def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
     """Returns the gains of a user's own arm, of a shipped arm, or of a maker's arm."""
-    arm, tip = Path(name), ""
+    arm = Path(name)
+    tip = ""
     if name in ODD_ARMS:
         arm = folder / "odd.urdf"
         arm.write_text(ODD_ARMS[name], encoding="utf-8")
     if name in MAKERS:
         pytest.importorskip("pinocchio", reason="robots are not installed: make test-long")
         file, tip = MAKERS[name]
-        arm = robot_files()[file]
+        arm = find_robot_files()[file]
 
     delay_text = str(write_jitter(folder / "jitter.csv")) if delay == "jitter" else delay
     return tune_arm(arm, delay_text, tip=tip, **more)  # type: ignore[arg-type]
@@ -171,9 +172,10 @@ def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
 
 
 def test_at_high_rates_only_delay_limits_gains(one_joint: Path) -> None:
-    slow, fast, faster = (
-        tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000)
-    )
+    """From 500 Hz on the rate does not bound the gains of a loop with 50 ms; at 20 Hz it does."""
+    slow = tune_arm(one_joint, "50ms", poses=1, rate_hz=20)
+    fast = tune_arm(one_joint, "50ms", poses=1, rate_hz=500)
+    faster = tune_arm(one_joint, "50ms", poses=1, rate_hz=2000)
     assert fast.edge["bound"] == faster.edge["bound"] == "delay"
     assert gains(faster, "K") == pytest.approx(gains(fast, "K"), rel=1e-2)
     assert slow.edge["bound"] == "tick rate"
@@ -182,9 +184,8 @@ def test_at_high_rates_only_delay_limits_gains(one_joint: Path) -> None:
 @pytest.mark.long
 def test_with_enough_damping_no_delay_bounds_the_stiffness(one_joint: Path) -> None:
     """No root of one joint crosses at any delay where d^2 >= 2 K M."""
-    bounded, free = (
-        tune_arm(one_joint, "50ms", poses=1, damping=ratio) for ratio in (0.95, 1.05)
-    )
+    bounded = tune_arm(one_joint, "50ms", poses=1, damping=0.95)
+    free = tune_arm(one_joint, "50ms", poses=1, damping=1.05)
     assert bounded.edge["bound"] == "delay"
     assert free.edge["continuous_per_s2"] is None
     assert free.edge["bound"] == "tick rate"
@@ -206,7 +207,8 @@ def test_damping_keeps_the_margin_to_its_limit(margin: float, tmp_path: Path) ->
 @pytest.mark.long
 def test_the_longest_delays_lower_the_gains(one_joint: Path, tmp_path: Path) -> None:
     jitter = write_jitter(tmp_path / "jitter.csv")
-    largest, median = (tune_arm(one_joint, jitter, poses=1, quantile=q) for q in (1.0, 0.5))
+    largest = tune_arm(one_joint, jitter, poses=1, quantile=1.0)
+    median = tune_arm(one_joint, jitter, poses=1, quantile=0.5)
     assert largest.age_ms > median.age_ms
     assert largest.edge["k_per_s2"] == pytest.approx(median.edge["k_per_s2"], rel=1e-2)
     assert (gains(largest, "K") < gains(median, "K")).all()

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from study_builders import FIRM_GAINS, make_trio_scenario
 from trilat_studies.tuning.candidate import (
     CandidateClass,
     CandidateScore,
@@ -17,17 +18,15 @@ from trilat_studies.tuning.candidate import (
     measure_candidate,
 )
 
-from tests.virtual_runs import trajectories
+from tests.execution.builders import make_trajectories
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import Scenario, load_scenario, parse_scenario
-
-from .experiments import trio
+from trilat_net.scenario import Scenario, load_scenario
 
 PULSE = 'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 0.8, peak_nm = [3.0, 0.0]}]'
 WALL = 'sites.s.environment=[{kind = "wall", point_m = [1.5, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 99.0}]'
 
 
-def hand(
+def write_spring(
     site: str,
     to: tuple[float, float],
     K: tuple[float, float],
@@ -41,23 +40,23 @@ def hand(
     )
 
 
-def at_end(scenario: Scenario) -> np.ndarray:
+def find_final_pose(scenario: Scenario) -> np.ndarray:
     """Returns the pose at which the arms should rest at the end of a scenario."""
     return compute_consensus_pose(scenario, np.array([0.0, scenario.duration_s]))[-1]
 
 
 @given(a=st.floats(0.05, 0.95), b=st.floats(0.05, 0.95), c=st.floats(0.05, 0.95))
 def test_without_hands_the_goal_is_linear_consensus(a: float, b: float, c: float) -> None:
-    """X' = (alpha - I) x, by the matrix exponential."""
-    rows = [
-        f"dominance={{m1 = {{m2 = {a!r}, s = {1 - a!r}}}, m2 = {{m1 = {b!r}, s = {1 - b!r}}}, "
-        f"s = {{m1 = {c!r}, m2 = {1 - c!r}}}}}"
-    ]
-    scenario = trio(*rows)
+    """The arms rest at the limit of x' = (alpha - I) x, by the matrix exponential."""
+    scenario = make_trio_scenario(
+        f"dominance.m1={{m2 = {a!r}, s = {1 - a!r}}}",
+        f"dominance.m2={{m1 = {b!r}, s = {1 - b!r}}}",
+        f"dominance.s={{m1 = {c!r}, m2 = {1 - c!r}}}",
+    )
     start = np.array([spec.q0_rad for spec in scenario.sites.values()])
     rest = expm((scenario.alpha - np.eye(3)) * 1e4) @ start
-    assert at_end(scenario) == pytest.approx(rest[0], abs=1e-9)
-    assert at_end(scenario) == pytest.approx(rest[2], abs=1e-9)
+    assert find_final_pose(scenario) == pytest.approx(rest[0], abs=1e-9)
+    assert find_final_pose(scenario) == pytest.approx(rest[2], abs=1e-9)
 
 
 @settings(max_examples=20)
@@ -65,17 +64,22 @@ def test_without_hands_the_goal_is_linear_consensus(a: float, b: float, c: float
 def test_hands_put_the_goal_where_stiff_arms_rest(K1: float, K2: float, x: float) -> None:
     """K_i (x_i - q_i) = k (q_i - sum_j alpha_ij q_j) with k far above K, solved directly."""
     # alike enough to be no conflict
-    scenario = trio(hand("m1", (x, 0.0), (K1, K1)), hand("m2", (x + 0.01, 0.0), (K2, K2)))
+    scenario = make_trio_scenario(
+        write_spring("m1", (x, 0.0), (K1, K1)), write_spring("m2", (x + 0.01, 0.0), (K2, K2))
+    )
     K = np.diag([K1, K2, 0.0])
     matrix = K + 1e7 * (np.eye(3) - scenario.alpha)
     rest = np.linalg.solve(matrix, K @ [x, x + 0.01, 0.0])
-    assert at_end(scenario)[0] == pytest.approx(rest.mean(), abs=1e-4)
+    assert find_final_pose(scenario)[0] == pytest.approx(rest.mean(), abs=1e-4)
 
 
 def test_a_joint_without_hand_stays() -> None:
-    scenario = trio(hand("m1", (0.5, 0.7), (100.0, 0.0), start=0.5, end=1.0))
+    """A spring moves the goal of its joint while it acts and after, and not that of the other."""
+    scenario = make_trio_scenario(
+        write_spring("m1", (0.5, 0.7), (100.0, 0.0), start=0.5, end=1.0)
+    )
     before, held, after = compute_consensus_pose(scenario, np.array([0.2, 0.7, 1.9]))
-    free = compute_consensus_pose(trio(), np.array([0.0]))[0]
+    free = compute_consensus_pose(make_trio_scenario(), np.array([0.0]))[0]
     assert before == pytest.approx(free)
     assert held == pytest.approx([0.5, free[1]])
     assert after == pytest.approx([0.5, free[1]])
@@ -83,7 +87,7 @@ def test_a_joint_without_hand_stays() -> None:
 
 def test_hands_move_goals_along_minimum_jerk_paths() -> None:
     """Half way in the middle; the spring's target in `box`-like moves is checked in the core."""
-    scenario = trio(
+    scenario = make_trio_scenario(
         'sites.m1.hands=[{kind = "spring", from_rad = [0.0, 0.0], to_rad = [1.0, 2.0], '
         "move_start_s = 0.5, move_end_s = 1.5, stiffness_nm_rad = 50.0}]".replace(
             "50.0", "[50.0, 50.0]"
@@ -96,12 +100,12 @@ def test_hands_move_goals_along_minimum_jerk_paths() -> None:
 
 
 def test_twins_have_no_torque_and_no_wall() -> None:
-    assert build_twin(trio()) is None
-    assert build_twin(trio(hand("m1", (0.3, -0.2), (9.0, 9.0)))) is None
+    assert build_twin(make_trio_scenario()) is None
+    assert build_twin(make_trio_scenario(write_spring("m1", (0.3, -0.2), (9.0, 9.0)))) is None
     for setting in (PULSE, WALL):
-        alone = build_twin(trio(setting))
-        assert alone is not None
-        assert alone.sites == trio().sites
+        twin = build_twin(make_trio_scenario(setting))
+        assert twin is not None
+        assert twin.sites == make_trio_scenario().sites
 
 
 def test_contradicting_hands_are_refused_with_their_site() -> None:
@@ -138,48 +142,42 @@ def test_a_scenario_without_common_angles_is_refused(setting: str, word: str) ->
 
 
 def test_two_closed_groups_have_no_common_pose() -> None:
-    text = "\n".join(
-        [
-            'name = "pairs"',
-            "[link]",
-            "delay_ms = 9.0",
-            *(f'[sites.{n}]\nrole = "master"' for n in "abcd"),
-            "[dominance]",
-        ]
-        + [f"{i} = {{ {j} = 1.0 }}" for i, j in ("ab", "ba", "cd", "dc")]
-    )
+    pairs = {
+        "name": "pairs",
+        "link": {"delay_ms": 9.0},
+        "sites": {name: {"role": "master"} for name in "abcd"},
+        "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}, "c": {"d": 1.0}, "d": {"c": 1.0}},
+    }
     with pytest.raises(ScenarioError, match="a, b and c, d"):
-        check_comparable(parse_scenario(text))
+        check_comparable(load_scenario(pairs))
 
 
-FIRM = (
-    "control.law=pd_d",
-    "control.K=20.0",
-    "control.d=9.0",
-    "control.Kd=0.5",
-    "duration_s=4.0",
-)
+FIRM = (*FIRM_GAINS, "duration_s=4.0")
 
 
-def scored(scenario: Scenario, alone: Scenario | None = None) -> CandidateScore:
+def measure_score(scenario: Scenario, twin: Scenario | None = None) -> CandidateScore:
     """Returns the score of a scenario, compared with its copy without disturbances if given."""
-    return measure_candidate(scenario.text, None if alone is None else alone.text)
+    return measure_candidate(scenario.text, None if twin is None else twin.text)
 
 
 def test_error_and_effort_are_the_documented_sums() -> None:
     """Errors refer to the weighted mean of the starts, and the effort leaves out gravity."""
-    scenario = trio(*FIRM)
-    score = scored(scenario)
-    run = trajectories(scenario)
-    q, tau = run.stack("q"), run.stack("tau")
+    scenario = make_trio_scenario(*FIRM)
+    score = measure_score(scenario)
+    run = make_trajectories(scenario)
+    q = run.stack("q")
+    tau = run.stack("tau")
 
-    # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
-    a, b, c = 0.2, 0.5, 0.6
+    # the share of its first peer at each site; beta has the paper's minors
+    a = 0.2
+    b = 0.5
+    c = 0.6
     beta = np.array([1.0 - (1.0 - b) * (1.0 - c), 1.0 - (1.0 - a) * c, 1.0 - a * b])
     pose = beta @ q[:, 0] / beta.sum()
 
-    inner, outer = 2.0 * 9.81 * np.cos(q[..., 0]), 9.81 * np.cos(q[..., 0] + q[..., 1])
-    gravity = np.stack([inner + outer, outer], axis=-1)
+    upper_nm = 2.0 * 9.81 * np.cos(q[..., 0])
+    fore_nm = 9.81 * np.cos(q[..., 0] + q[..., 1])
+    gravity = np.stack([upper_nm + fore_nm, fore_nm], axis=-1)
 
     assert score.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
     assert score.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
@@ -192,10 +190,10 @@ def test_error_and_effort_are_the_documented_sums() -> None:
 
 
 def test_arms_that_start_at_the_goal_do_nothing() -> None:
-    still = trio(
+    still = make_trio_scenario(
         "control.law=p_d", *(f"sites.{name}.q0_rad=[0.2, 0.3]" for name in ("m1", "m2", "s"))
     )
-    score = scored(still)
+    score = measure_score(still)
     assert score.outcome is CandidateClass.SETTLED
     assert score.error_rad == pytest.approx(0.0, abs=1e-12)
     assert score.effort_nm == pytest.approx(0.0, abs=1e-12)
@@ -204,8 +202,8 @@ def test_arms_that_start_at_the_goal_do_nothing() -> None:
 
 def test_hanging_arms_are_scored_by_their_fall() -> None:
     """The arms end in step with e = 0 and no torque at all, which must not improve their score."""
-    hanging = scored(trio(*FIRM, "control.gravity=0.0", "duration_s=20.0"))
-    standing = scored(trio(*FIRM, "duration_s=20.0"))
+    hanging = measure_score(make_trio_scenario(*FIRM, "control.gravity=0.0", "duration_s=20.0"))
+    standing = measure_score(make_trio_scenario(*FIRM, "duration_s=20.0"))
     assert hanging.settled_s is not None  # all that e says
     assert hanging.outcome is CandidateClass.STRAYED
     assert standing.outcome is CandidateClass.SETTLED
@@ -222,13 +220,13 @@ def test_arms_that_sink_slowly_drift_before_they_hang() -> None:
         "control.K=400.0",
         "control.gravity=0.95",
     )
-    score = scored(trio(*sinking, "duration_s=15.0"))
+    score = measure_score(make_trio_scenario(*sinking, "duration_s=15.0"))
     assert 0.02 < (score.pose_rad or 0.0) < 0.15
     assert score.outcome is CandidateClass.OSCILLATED
 
 
 def test_diverged_runs_have_no_error() -> None:
-    score = scored(trio(*FIRM, "limits.qd_limit_rad_s=0.2"))
+    score = measure_score(make_trio_scenario(*FIRM, "limits.qd_limit_rad_s=0.2"))
     assert score.outcome is CandidateClass.DIVERGED
     assert score.error_rad is None
     assert score.effort_nm is None
@@ -237,9 +235,8 @@ def test_diverged_runs_have_no_error() -> None:
 
 def test_sites_of_different_rates_are_compared_simultaneously() -> None:
     """A slave at a quarter of the rate changes the score only by its coarser steps."""
-    alike, mixed = (
-        scored(trio(*FIRM, "rate_hz=400", *more)) for more in ((), ("sites.s.rate_hz=100",))
-    )
+    alike = measure_score(make_trio_scenario(*FIRM, "rate_hz=400"))
+    mixed = measure_score(make_trio_scenario(*FIRM, "rate_hz=400", "sites.s.rate_hz=100"))
     assert mixed.spread_rad == pytest.approx(alike.spread_rad, rel=0.1)
     assert mixed.effort_nm == pytest.approx(alike.effort_nm, rel=0.2)
 
@@ -249,10 +246,11 @@ def test_with_a_twin_the_goal_is_its_pose() -> None:
     push = (
         'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 1.2, peak_nm = [20.0, 0.0]}]'
     )
-    pushed, alone = trio(*FIRM, push), trio(*FIRM)
-    both = scored(pushed, alone)
-    assert both.pose_rad == scored(alone).pose_rad
-    assert both.spread_rad == scored(pushed).spread_rad
-    assert both.error_rad == pytest.approx(
-        np.hypot(both.spread_rad or 0.0, both.pose_rad or 0.0)
+    pushed = make_trio_scenario(*FIRM, push)
+    twin = make_trio_scenario(*FIRM)
+    score = measure_score(pushed, twin)
+    assert score.pose_rad == measure_score(twin).pose_rad
+    assert score.spread_rad == measure_score(pushed).spread_rad
+    assert score.error_rad == pytest.approx(
+        np.hypot(score.spread_rad or 0.0, score.pose_rad or 0.0)
     )

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from study_builders import FIRM_GAINS, make_run_end, make_trio_scenario
 from trilat_studies.tuning.candidate import (
     CLASS_MEANINGS,
     CandidateClass,
@@ -12,19 +13,11 @@ from trilat_studies.tuning.candidate import (
 )
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
-from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.app.api import simulate
 from trilat_net.execution.virtual import record_virtual
 from trilat_net.log.log_reader import open_log
 
-from .experiments import trio
-
-FIT = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
-CALM = RunEnd(EndBehaviour.CONVERGED, FIT, FIT, 0.0, 0.0)
-
-
-def make_run_end(behaviour: EndBehaviour, **more: object) -> RunEnd:
-    return CALM._replace(behaviour=behaviour, **more)  # type: ignore[arg-type]
+CALM = make_run_end()
 
 
 @pytest.mark.parametrize(
@@ -53,34 +46,30 @@ def test_class_combines_judgement_and_pose(
 
 
 def test_judgements_that_decide_a_class_name_it() -> None:
-    words = {outcome: outcome.word for outcome in CandidateClass}
-    assert words[CandidateClass.SETTLED] == Stability.STABLE
-    assert words[CandidateClass.OSCILLATED] == Stability.NOT_STABLE
-    assert words[CandidateClass.OPEN] == Stability.OPEN
-    assert len(set(words.values())) == len(words)
+    assert CandidateClass.SETTLED.word == Stability.STABLE
+    assert CandidateClass.OSCILLATED.word == Stability.NOT_STABLE
+    assert CandidateClass.OPEN.word == Stability.OPEN
+    assert len({outcome.word for outcome in CandidateClass}) == len(CandidateClass)
 
 
 def test_every_outcome_has_a_meaning() -> None:
     assert list(CLASS_MEANINGS) == list(CandidateClass)
 
 
-FIRM = ("control.law=pd_d", "control.K=20.0", "control.d=9.0", "control.Kd=0.5")
-
-
 def test_standing_arms_get_no_warning() -> None:
-    assert check_final_posture(simulate(trio(*FIRM))) == []
+    assert check_final_posture(simulate(make_trio_scenario(*FIRM_GAINS))) == []
 
 
 def test_hanging_arms_are_named() -> None:
     (line,) = check_final_posture(
-        simulate(trio(*FIRM, "control.gravity=0.0", "duration_s=15.0"))
+        simulate(make_trio_scenario(*FIRM_GAINS, "control.gravity=0.0", "duration_s=15.0"))
     )
     assert line.startswith("m1, m2, s hang at the end")
 
 
 def test_sunken_arms_are_named_with_their_distance() -> None:
     (line,) = check_final_posture(
-        simulate(trio(*FIRM, "control.gravity=0.8", "duration_s=2.0"))
+        simulate(make_trio_scenario(*FIRM_GAINS, "control.gravity=0.8", "duration_s=2.0"))
     )
     assert "from where a weightless consensus would stand: they sank, or drifted" in line
 
@@ -89,17 +78,19 @@ def test_pushed_arms_count_as_not_sunken() -> None:
     push = (
         'sites.m1.hands=[{kind = "pulse", start_s = 0.1, end_s = 1.5, peak_nm = [40.0, 0.0]}]'
     )
-    assert check_final_posture(simulate(trio(*FIRM, push))) == []
+    assert check_final_posture(simulate(make_trio_scenario(*FIRM_GAINS, push))) == []
 
 
 def test_a_diverged_site_is_named() -> None:
-    (line,) = check_final_posture(simulate(trio(*FIRM, "limits.qd_limit_rad_s=0.1")))
+    (line,) = check_final_posture(
+        simulate(make_trio_scenario(*FIRM_GAINS, "limits.qd_limit_rad_s=0.1"))
+    )
     assert "diverged: its figures end there" in line
 
 
 def test_arms_that_start_hanging_did_not_fall() -> None:
     down = (-1.5707963, 0.0)
-    scenario = trio(*FIRM)
+    scenario = make_trio_scenario(*FIRM_GAINS)
     sites = {
         name: msgspec.structs.replace(spec, q0_rad=down)
         for name, spec in scenario.sites.items()
@@ -109,7 +100,7 @@ def test_arms_that_start_hanging_did_not_fall() -> None:
 
 def test_a_truncated_log_names_its_end(tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
-    assert record_virtual(trio(*FIRM, "duration_s=40.0"), path)
+    assert record_virtual(make_trio_scenario(*FIRM_GAINS, "duration_s=40.0"), path)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) * 3 // 5])
     (line,) = check_final_posture(open_log(path))

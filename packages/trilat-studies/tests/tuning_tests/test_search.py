@@ -1,11 +1,13 @@
 """The search that every law gets, and its front."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from study_builders import dominates, make_candidate_score
 from trilat_studies.tuning.candidate import CandidateClass, CandidateScore
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 from trilat_studies.tuning.tuning_plan import (
@@ -15,39 +17,47 @@ from trilat_studies.tuning.tuning_plan import (
     find_pareto_front,
 )
 
-from .experiments import dominates
-
 BUDGETS = st.integers(1, 40)
 SEEDS = st.integers(0, 2**63 - 1)
 LAWS = st.sampled_from(sorted(SEARCH_SPACES))
 
 
-def bowl(gains: dict[str, float]) -> CandidateScore:
-    """Returns a score with the least error at the middle of every range; effort rises with the gains."""
-    log = sum(math.log(value) ** 2 for value in gains.values())
-    return CandidateScore(CandidateClass.SETTLED, log, log, 0.0, sum(gains.values()), log, 0.0)
+def score_distance_to_one(gains: dict[str, float]) -> CandidateScore:
+    """Returns a score whose error is least at gains of 1, and whose effort is the sum of the gains."""
+    error = sum(math.log(value) ** 2 for value in gains.values())
+    return make_candidate_score(error_rad=error, effort_nm=sum(gains.values()))
 
 
-def lost(_: dict[str, float]) -> CandidateScore:
+def score_divergence(_: dict[str, float]) -> CandidateScore:
     """Returns the score of a run that diverged."""
-    return CandidateScore(CandidateClass.DIVERGED, None, None, None, None, None, 0.0, 0.1)
+    return make_candidate_score(
+        CandidateClass.DIVERGED, None, None, pose_rad=None, diverged_s=0.1
+    )
 
 
-def searched(law: str, budget: int, seed: int, score: object = bowl) -> CandidateSearch:
+def run_search(
+    law: str,
+    budget: int,
+    seed: int,
+    score: Callable[[dict[str, float]], CandidateScore] = score_distance_to_one,
+) -> CandidateSearch:
     """Returns a finished search in which a function gives the scores of all candidates."""
     search = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR)
     for number in range(len(search.rounds)):
         candidates = search.propose_candidates(number)
-        search.record_scores(candidates, [score(gains) for gains in candidates])  # type: ignore[operator]
+        search.record_scores(candidates, [score(gains) for gains in candidates])
     return search
 
 
+SCORE_FUNCTIONS = st.sampled_from([score_distance_to_one, score_divergence])
+
+
 @settings(max_examples=40)
-@given(law=LAWS, budget=BUDGETS, seed=SEEDS, score=st.sampled_from([bowl, lost]))
+@given(law=LAWS, budget=BUDGETS, seed=SEEDS, score=SCORE_FUNCTIONS)
 def test_every_law_gets_its_budget_within_its_ranges(
-    law: str, budget: int, seed: int, score: object
+    law: str, budget: int, seed: int, score: Callable[[dict[str, float]], CandidateScore]
 ) -> None:
-    search = searched(law, budget, seed, score)
+    search = run_search(law, budget, seed, score)
     assert len(search.tried) == len(search.scores) == budget
     for gains in search.tried:
         assert list(gains) == [knob.name for knob in SEARCH_SPACES[law].knobs]
@@ -59,8 +69,8 @@ def test_every_law_gets_its_budget_within_its_ranges(
 @settings(max_examples=20)
 @given(law=LAWS, budget=BUDGETS, seed=SEEDS)
 def test_the_seed_decides_all(law: str, budget: int, seed: int) -> None:
-    assert searched(law, budget, seed).tried == searched(law, budget, seed).tried
-    assert searched(law, budget, seed).tried != searched(law, budget, seed ^ 1).tried
+    assert run_search(law, budget, seed).tried == run_search(law, budget, seed).tried
+    assert run_search(law, budget, seed).tried != run_search(law, budget, seed ^ 1).tried
 
 
 @settings(max_examples=20)
@@ -79,22 +89,22 @@ def test_first_half_samples_every_slice_of_ranges(law: str, budget: int, seed: i
 
 
 def test_laws_with_equal_gains_begin_at_equal_places() -> None:
-    firsts = [
+    adaptive, boxed = (
         CandidateSearch(SEARCH_SPACES[law], 16, 3, Objective.ERROR).propose_candidates(0)
         for law in ("adaptive", "adaptive_box")
-    ]
-    assert firsts[0] == firsts[1]
+    )
+    assert adaptive == boxed
 
 
 @pytest.mark.parametrize("law", ["p_d", "adaptive"])
 def test_refinement_beats_the_hypercube(law: str) -> None:
     """Refinement comes closer to a known minimum, at gains of 1, than twice as many samples."""
     refined = [
-        min(s.error_rad or 0.0 for s in searched(law, 64, seed).scores) for seed in range(10)
+        min(s.error_rad or 0.0 for s in run_search(law, 64, seed).scores) for seed in range(10)
     ]
     spread = [
         min(
-            bowl(gains).error_rad or 0.0
+            score_distance_to_one(gains).error_rad or 0.0
             for gains in CandidateSearch(
                 SEARCH_SPACES[law], 128, seed, Objective.ERROR
             ).propose_candidates(0)
@@ -108,13 +118,9 @@ NUMBERS = st.floats(0.0, 10.0).map(lambda x: round(x, 1))
 POINTS = st.lists(st.none() | st.tuples(NUMBERS, NUMBERS), max_size=30)
 
 
-def score(outcome: CandidateClass, error_rad: float, effort_nm: float) -> CandidateScore:
-    """Returns a score with this outcome, error and effort."""
-    return CandidateScore(outcome, error_rad, error_rad, 0.0, effort_nm, error_rad, 0.0)
-
-
 SCORES = st.lists(
-    st.builds(score, st.sampled_from(list(CandidateClass)), NUMBERS, NUMBERS), max_size=30
+    st.builds(make_candidate_score, st.sampled_from(list(CandidateClass)), NUMBERS, NUMBERS),
+    max_size=30,
 )
 
 
@@ -153,7 +159,7 @@ def test_front_is_ordered_by_effort_against_objective(
 def test_only_settled_runs_compete(scores: list[CandidateScore]) -> None:
     """Hanging arms have strayed: whatever their error and effort, they dominate nothing."""
     for objective in Objective:
-        for n in find_pareto_front([objective.point(one) for one in scores]):
+        for n in find_pareto_front([objective.point(score) for score in scores]):
             assert scores[n].outcome is CandidateClass.SETTLED
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_builders import make_trio_scenario
 from trilat_studies.run_commands import format_toml_value
 from trilat_studies.tuning.candidate import TuningScenario, load_tuning_scenario
 from trilat_studies.tuning.search_space import (
@@ -18,8 +19,6 @@ from trilat_studies.tuning.search_space import (
 from tests.core.chain_references import ChainState, chain_references
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-
-from .experiments import trio
 
 MIDDLE = {
     law: {knob.name: (knob.low * knob.high) ** 0.5 for knob in space.knobs}
@@ -88,7 +87,7 @@ def test_equal_quantities_have_equal_ranges_in_laws() -> None:
     assert ranges["d"] == {("N m s/rad", *next(iter(ranges["Kp"]))[1:])}
 
 
-def six(state: ChainState, **overrides: object) -> TuningScenario:
+def load_six_joints(state: ChainState, **overrides: object) -> TuningScenario:
     """Returns `six_joints` with two equal start poses."""
     start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
     settings = {"arm.stops": False, **start, **overrides}
@@ -102,11 +101,13 @@ def test_joints_share_gains_by_inertia_from_pinocchio() -> None:
     armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     for state in chain_references()["arm6"].states:
         inertia = 1.0 / np.diag(np.linalg.inv(state.inertia + np.diag(armature)))
-        weights = weigh_joints(six(state).scenario)
+        weights = weigh_joints(load_six_joints(state).scenario)
         assert weights == pytest.approx(inertia / inertia.max(), rel=0.05)  # two digits
 
         gains = {"Lambda": 2.0, "Kp": 30.0, "Kd": 4.0, "Gamma": 0.5}
-        candidate = six(state).with_gains(SEARCH_SPACES["adaptive"], ModelInformation(), gains)
+        candidate = load_six_joints(state).with_gains(
+            SEARCH_SPACES["adaptive"], ModelInformation(), gains
+        )
         control = candidate.scenario.sites["m1"].control
         assert control.Kp == pytest.approx(30.0 * np.array(weights))
         assert control.Kd == pytest.approx(4.0 * np.array(weights))
@@ -120,7 +121,7 @@ def test_joints_share_gains_by_inertia_from_pinocchio() -> None:
 def test_every_choice_within_ranges_is_a_valid_arm(armature_kg_m2: float, scheme: str) -> None:
     state, *_ = chain_references()["arm6"].states
     small = {"law": "p_d", "K": 1.0, "d": 1e-3}
-    experiment = six(
+    experiment = load_six_joints(
         state, scheme=scheme, control=small, **{"arm.armature_kg_m2": armature_kg_m2}
     )
     others = ("p_f", "sync", "adaptive_kinematics", "lee_spong")
@@ -131,7 +132,9 @@ def test_every_choice_within_ranges_is_a_valid_arm(armature_kg_m2: float, scheme
 
 
 def test_the_usual_laws_take_any_number_of_sites() -> None:
-    assert [space.law for space in select_search_spaces((), trio())] == list(DEFAULT_LAWS)
+    assert [space.law for space in select_search_spaces((), make_trio_scenario())] == list(
+        DEFAULT_LAWS
+    )
 
 
 @pytest.mark.parametrize(
@@ -152,7 +155,7 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
 )
 def test_untunable_settings_are_refused(law: str, facts: list[str]) -> None:
     with pytest.raises(UsageError) as refused:
-        select_search_spaces([law], trio())
+        select_search_spaces([law], make_trio_scenario())
     assert all(fact in str(refused.value) for fact in facts)
 
 
@@ -172,19 +175,17 @@ SHARES = st.floats(50.0, 150.0)
 
 @given(percent=SHARES)
 def test_ranges_hold_the_true_parameters_strictly_inside(percent: float) -> None:
-    """Otherwise V' <= 0 does not hold, and the search would include settings in which the law
-    cannot work.
-    """
-    scenario, knowledge = trio(), build_model_information(percent)
+    """The true parameters lie inside the ranges, as V' <= 0 needs; else the law cannot work."""
+    scenario = make_trio_scenario()
     truth = scenario.arms["s"].theta
-    low, high = knowledge.box_sides(scenario, "s")
+    low, high = build_model_information(percent).box_sides(scenario, "s")
     assert (np.array(low) < truth).all()
     assert (np.array(high) > truth).all()
 
 
 @given(percent=SHARES)
 def test_candidates_know_equal_gravity_and_no_inertia(percent: float) -> None:
-    scenario = trio()
+    scenario = make_trio_scenario()
     prior = np.array(build_model_information(percent).prior(scenario, "m1"))
     # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)
     truth = np.array([2.0, 1.0])

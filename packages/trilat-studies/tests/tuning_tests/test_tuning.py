@@ -6,10 +6,10 @@ import shlex
 from pathlib import Path
 
 import pytest
+from study_builders import dominates, make_candidate_score, plan_quick_tuning
 from trilat_studies.tuning import TuningResult
 from trilat_studies.tuning.candidate import (
     CandidateClass,
-    CandidateScore,
     measure_candidate,
 )
 from trilat_studies.tuning.search_space import SEARCH_SPACES
@@ -17,8 +17,6 @@ from trilat_studies.tuning.tuning_plan import CandidateSearch, Objective, find_p
 from trilat_studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
 
 from trilat_net.scenario import load_scenario
-
-from .experiments import dominates, plan_quick_tuning
 
 LAWS = ("adaptive", "p_d", "known")
 
@@ -62,8 +60,8 @@ def test_candidates_differ_only_in_their_law(tuning_result: TuningResult) -> Non
             settings_of_candidates.add(
                 (limits, starts, scenario.seed, scenario.duration_s, repr(scenario.links))
             )
-    assert len(settings_of_candidates) == 1
-    assert next(iter(settings_of_candidates))[0][0].tau_limit_nm == 60.0
+    ((limits, *_),) = settings_of_candidates
+    assert limits[0].tau_limit_nm == 60.0
 
 
 def test_a_front_is_dominated_by_no_law(tuning_result: TuningResult) -> None:
@@ -99,14 +97,17 @@ def test_the_command_of_a_point_repeats_its_run(tuning_result: TuningResult) -> 
 
 
 def test_printed_gains_are_measured_and_never_searched(tuning_result: TuningResult) -> None:
-    informed, untold = tuning_result.printed
-    assert [informed.name, untold.name] == ["as printed", "as printed, told nothing"]
-    controls = [
-        one.candidate.scenario.sites["s"].control.gains(None) for one in (informed, untold)
-    ]  # type: ignore[arg-type]
-    assert [tuple(c.Lambda) for c in controls] == [(1.0, 1.0)] * 2
-    assert [tuple(c.theta_hat0) for c in controls] == [(0.0, 0.0, 0.0, 2.0, 1.0), (0.0,) * 5]
-    tried_gains = {tuple(gains.values()) for one in tuning_result.found for gains in one.tried}
+    """The printed gains are measured with and without knowledge, and no search proposes them."""
+    informed, uninformed = tuning_result.printed
+    assert informed.name == "as printed"
+    assert uninformed.name == "as printed, told nothing"
+    for result, estimate in ((informed, (0.0, 0.0, 0.0, 2.0, 1.0)), (uninformed, (0.0,) * 5)):
+        control = result.candidate.scenario.sites["s"].control.gains(None)  # type: ignore[arg-type]
+        assert tuple(control.Lambda) == (1.0, 1.0)
+        assert tuple(control.theta_hat0) == estimate
+    tried_gains = {
+        tuple(gains.values()) for search in tuning_result.found for gains in search.tried
+    }
     assert (1.0, 1.0, 3.0, 1.0) not in tried_gains
 
 
@@ -130,28 +131,32 @@ def test_hanging_arms_never_reach_a_real_front(tmp_path: Path) -> None:
     result = plan_quick_tuning(
         tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0
     ).run(jobs=1)
-    learns, knows = result.found
-    assert knows.front == []
-    assert knows.outcomes[CandidateClass.STRAYED] >= 1
-    assert knows.outcomes[CandidateClass.SETTLED] == 0
-    for place in learns.front:
-        assert learns.scores[place].outcome is CandidateClass.SETTLED
+    learning, fixed = result.found
+    assert fixed.front == []
+    assert fixed.outcomes[CandidateClass.STRAYED] >= 1
+    assert fixed.outcomes[CandidateClass.SETTLED] == 0
+    for index in learning.front:
+        assert learning.scores[index].outcome is CandidateClass.SETTLED
 
 
 def test_time_is_estimated_beforehand_in_right_order(tmp_path: Path) -> None:
-    few = plan_quick_tuning(tmp_path, laws=["p_d"], budget=8)
-    assert 0.0 < few.estimate_s(1) < 600.0
-    assert few.runs == 10
-    assert plan_quick_tuning(tmp_path, 'sites.s.environment=[{kind = "wall", point_m = [9.0, 0.0], normal = [-1.0, 0.0], '
-                 "stiffness_n_m = 1.0}]", laws=["p_d"], budget=8).runs == 20  # fmt: skip
+    """The runs of a plan are counted; a wall gives each candidate a second run without it."""
+    plan = plan_quick_tuning(tmp_path, laws=["p_d"], budget=8)
+    assert 0.0 < plan.estimate_s(1) < 600.0
+    assert plan.runs == 10
+
+    wall = 'kind = "wall", point_m = [9.0, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 1.0'
+    environment = f"sites.s.environment=[{{{wall}}}]"
+    with_wall = plan_quick_tuning(tmp_path, environment, laws=["p_d"], budget=8)
+    assert with_wall.runs == 20
 
 
-def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearch:
-    """A search with `count` candidates of equal gains on the front, and the others not."""
+def make_search(law: str, gains: dict[str, float], points: int) -> CandidateSearch:
+    """Returns a search of six candidates of equal gains, of which some are on the front."""
     search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
     outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
     scores = [
-        CandidateScore(outcome, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
+        make_candidate_score(outcome, error_rad=1.0 / n, effort_nm=float(n))
         for n, outcome in enumerate(outcomes, 1)
     ]
     search.record_scores([gains] * 6, scores)
@@ -160,9 +165,8 @@ def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearc
 
 def test_tables_name_the_edge_of_the_searched_ranges(tuning_result: TuningResult) -> None:
     knob = SEARCH_SPACES["p_d"].knobs[0]
-    assert tuning_result.list_edge_gains(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == [
-        "K"
-    ]
+    search = make_search("p_d", {"K": knob.high, "d": 10.0}, points=1)
+    assert tuning_result.list_edge_gains(search) == ["K"]
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +214,7 @@ def test_the_page_shows_procedure_search_and_commands(
     assert "torques clamped at 60 N m" in text
     assert "| p_d | K | N m/rad | 1 | 1000 | gravity |" in text
     assert "AND inertia exactly: more than the others" in text
-    assert text.count("trilat sim ") == sum(len(one.front) for one in tuning_result.found) + 2
+    assert text.count("trilat sim ") == sum(len(law.front) for law in tuning_result.found) + 2
     assert "as printed, told nothing" in text
 
 
@@ -222,13 +226,12 @@ def test_the_table_of_laws_counts_every_run(tuning_result: TuningResult) -> None
 
 
 def test_long_fronts_are_shortened_between_both_ends(tuning_result: TuningResult) -> None:
-    one = with_front("adaptive", tuning_result.found[0].tried[0], 5)
-    shown_places = [row[0].rstrip("*") for row in tabulate_front(tuning_result, one, 3).rows]
-    assert shown_places == ["adaptive 1", "adaptive 3", "adaptive 5"]
-    assert len(tabulate_front(tuning_result, one).rows) == 5
-    assert (
-        tabulate_front(
-            tuning_result, with_front("adaptive", tuning_result.found[0].tried[0], 0), 3
-        ).rows
-        == []
-    )
+    """A table of three points has the first, the middle and the last point of the front."""
+    gains = tuning_result.found[0].tried[0]
+    search = make_search("adaptive", gains, points=5)
+    rows = tabulate_front(tuning_result, search, 3).rows
+    assert [row[0].rstrip("*") for row in rows] == ["adaptive 1", "adaptive 3", "adaptive 5"]
+    assert len(tabulate_front(tuning_result, search).rows) == 5
+
+    empty_search = make_search("adaptive", gains, points=0)
+    assert tabulate_front(tuning_result, empty_search, 3).rows == []

@@ -1,4 +1,4 @@
-"""The messages of a log dealt out to several files, each of which opens on its own."""
+"""Logs whose messages are distributed over several files, each of which opens by itself."""
 
 import io
 from collections.abc import Collection, Sequence
@@ -9,7 +9,7 @@ import msgpack
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tests.log_editing import opened, recorded
+from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.log.accounting import Account
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_reader import McapReader
@@ -24,7 +24,7 @@ class Message(NamedTuple):
     sequence: int
 
 
-def messages(data: bytes) -> list[Message]:
+def read_messages(data: bytes) -> list[Message]:
     reader = make_reader(io.BytesIO(data), validate_crcs=True)
     return [
         Message(channel.topic, m.data, m.log_time, m.publish_time, m.sequence)
@@ -32,14 +32,14 @@ def messages(data: bytes) -> list[Message]:
     ]
 
 
-def changed(message: Message, **fields: object) -> Message:
+def change_message(message: Message, **fields: object) -> Message:
     return message._replace(
         payload=msgpack.packb({**msgpack.unpackb(message.payload), **fields})
     )
 
 
-def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
-    """A file of another program, with these messages on one channel."""
+def make_foreign_bytes(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
+    """Returns a file of another program, with the given messages on one channel."""
     stream = io.BytesIO()
     writer = Writer(stream, **options)
     writer.start()
@@ -52,7 +52,7 @@ def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def a_file(
+def make_bytes_of_messages(
     data: bytes,
     chosen: Sequence[Message],
     *,
@@ -101,19 +101,21 @@ def a_file(
     return stream.getvalue()
 
 
-def dealt(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
-    """The parts of a log: file n has the messages whose places are in hand n, in their order."""
-    every = messages(data)
+def make_parts(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
+    """Returns the parts of a log: file n has the messages whose indices are in `hands[n]`, in their order."""
+    every = read_messages(data)
     return [
-        a_file(data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs)  # type: ignore[arg-type]
+        make_bytes_of_messages(
+            data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs
+        )  # type: ignore[arg-type]
         for n, hand in enumerate(hands)
     ]
 
 
-def split(folder: Path, *, refilled: range) -> list[Path]:
-    """A log in three parts, into which some records of `s` came later than others, out of its memory."""
-    data = recorded("paper")
-    scenario = opened(data).scenario
+def write_late_parts(folder: Path, *, refilled: range) -> list[Path]:
+    """Writes a log in three parts, in which some records of `s` were requested later from the site's memory."""
+    data = make_log_bytes("paper")
+    scenario = open_bytes(data).scenario
     items = [item for item in McapReader(io.BytesIO(data), "log").messages() if item.topic]
     kept_back = [
         i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled
@@ -122,7 +124,7 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
     items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
     accounts = {item.topic: Account() for item in items}
 
-    def told() -> dict[str, str]:
+    def describe_accounts() -> dict[str, str]:
         return {topic: account.describe() for topic, account in accounts.items()}
 
     place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
@@ -133,11 +135,11 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
             stream, scenario, "paper", "virtual", 0, collect_provenance(), part=part
         ),
     ) as log:
-        log.current_accounts = told
+        log.current_accounts = describe_accounts
         for item in items:
             now_ns = max(now_ns, item.log_time_ns)
             number = item.sequence // 100 if item.topic.endswith("/link") else item.sequence
             accounts[item.topic].receive(number)
             log.add(item.topic[1:], item.payload, item.publish_time_ns, now_ns, item.sequence)
-        log.finish(told())
+        log.finish(describe_accounts())
     return sorted(folder.glob("run-*.mcap"))

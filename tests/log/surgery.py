@@ -1,4 +1,4 @@
-"""A log taken apart into its records and put together again, byte for byte unless something is changed."""
+"""A log as a list of its records, from which the same bytes can be written again."""
 
 import io
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ class Stored(NamedTuple):
 
 @dataclass
 class Pieces:
-    """What a file holds: its header, all that describes, and its messages in order."""
+    """The content of a file: its header, its descriptions, and its messages in order."""
 
     library: str = ""
     about: list[Any] = field(default_factory=list)
@@ -48,7 +48,7 @@ class Pieces:
         return {entry.id: entry.topic for entry in self.about if hasattr(entry, "topic")}
 
     def without_chain(self) -> "Pieces":
-        """The same as an older program wrote it."""
+        """Removes the digest chain, which older programs did not write, and returns the pieces."""
         self.about = [
             entry for entry in self.about if getattr(entry, "name", "") != "trilat.chain"
         ]
@@ -65,18 +65,18 @@ class Pieces:
         ]
         for entry in self.about:
             if entry not in late:
-                _write(writer, entry)
+                _write_entry(writer, entry)
         for channel, sequence, log_ns, publish_ns, payload in self.messages:
             writer.add_message(channel, log_ns, payload, publish_ns, sequence)
         for entry in late:
             if entry.name == "trilat.chain":
                 writer.flush()
-            _write(writer, entry)
+            _write_entry(writer, entry)
         writer.finish()
         return stream.getvalue()
 
 
-def _write(writer: McapWriter, entry: Any) -> None:
+def _write_entry(writer: McapWriter, entry: Any) -> None:
     match type(entry).__name__:
         case "Metadata":
             writer.add_metadata(entry.name, entry.metadata)
@@ -92,8 +92,9 @@ def _write(writer: McapWriter, entry: Any) -> None:
             )
 
 
-def taken_apart(data: bytes) -> Pieces:
-    pieces, scanner = Pieces(), RecordScanner(io.BytesIO(data))
+def take_apart(data: bytes) -> Pieces:
+    pieces = Pieces()
+    scanner = RecordScanner(io.BytesIO(data))
     for frame in scanner.frames():
         if frame.opcode == Opcode.DATA_END:
             break
@@ -111,7 +112,7 @@ def taken_apart(data: bytes) -> Pieces:
     return pieces
 
 
-def repacked(message: Stored, **fields: object) -> Stored:
-    """A message with other entries; its number in the file follows its tick."""
+def repack_message(message: Stored, **fields: object) -> Stored:
+    """Returns a message with other entries, whose number in the file follows its tick."""
     record = {**msgpack.unpackb(message.payload), **fields}
     return message._replace(payload=msgpack.packb(record), sequence=record["tick"] & 0xFFFFFFFF)

@@ -1,14 +1,16 @@
-"""The words of a figure: their places, and words that are cut off or overlap."""
+"""The content of a figure: its curves, and its words that are cut off or overlap."""
 
 from itertools import combinations
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 SLACK_PT = 1.0
-"""By so much boxes may touch: they have room above small letters."""
+"""The permitted overlap of boxes, which have room above small letters."""
 
 
 def list_drawn_texts(figure: Figure) -> list[tuple[str, Bbox]]:
@@ -36,7 +38,12 @@ def list_drawn_texts(figure: Figure) -> list[tuple[str, Bbox]]:
     return texts
 
 
-def misplaced(figure: Figure) -> list[str]:
+def list_curves(axes: Axes) -> list[Line2D]:
+    """Returns the lines over time of a panel, without lines that span the panel or mark a change."""
+    return [line for line in axes.lines if line.get_transform() == axes.transData]
+
+
+def list_misplaced(figure: Figure) -> list[str]:
     """Returns words that are not wholly in the figure, and pairs of words that overlap."""
     width, height = figure.get_size_inches() * 72.0
     texts = list_drawn_texts(figure)
@@ -49,8 +56,8 @@ def misplaced(figure: Figure) -> list[str]:
         or box.y1 > height + SLACK_PT
     ]
     on_each_other = [
-        f"{one!r} lies on {other!r}"
-        for (one, a), (other, b) in combinations(texts, 2)
+        f"{text!r} lies on {other!r}"
+        for (text, a), (other, b) in combinations(texts, 2)
         if min(a.x1, b.x1) - max(a.x0, b.x0) > SLACK_PT
         and min(a.y1, b.y1) - max(a.y0, b.y0) > SLACK_PT
     ]
