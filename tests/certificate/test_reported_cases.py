@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from trilat_net.analysis.certificate.stability_certificate import Certificate
+from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.execution.fused import FusedRun
@@ -361,7 +361,12 @@ def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     assert list_effective_commands(log) == []
     certificate = tn.certify(log)
     assert_roots_decide(certificate, case.rate_per_s)
-    assert tn.certify(tn.simulate(scenario)).decision == certificate.decision
+    planned = tn.certify(tn.simulate(scenario)).decision
+    assert planned.stability is certificate.stability
+    assert (planned.rests_on, planned.reasons) == (
+        certificate.decision.rests_on,
+        certificate.reasons,
+    )
 
 
 def test_effective_commands_decide_by_later_roots() -> None:

@@ -9,10 +9,11 @@ import pytest
 
 from tests.analysis import logs
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, TwinGrowth
 from trilat_net.execution.twins import Push
@@ -148,7 +149,7 @@ def judge_end(behaviour: EndBehaviour, evidence: str, speed_rad_s: float) -> Cer
     certificate = certify(LOGS["p_d"]())
     verdict, pushes = EVIDENCE[evidence]
     end = certificate.end._replace(
-        behaviour=behaviour, reasons=(), operator_acts=False, end_speed_rad_s=speed_rad_s
+        behaviour=behaviour, doubts=(), operator_acts=False, end_speed_rad_s=speed_rad_s
     )
     roots = LoopRoots(verdict, None, bool(verdict), "this rest")
     return replace(certificate, end=end, roots=roots, twins=TwinGrowth("", 10.0, 20.0, pushes))
@@ -224,7 +225,7 @@ def test_sentences_about_a_record_fit_its_length() -> None:
 def test_short_runs_state_their_length_once() -> None:
     slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
     certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
-    end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
+    end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, doubts=())
     short = replace(certificate, end=end, roots=slow)
     needed_s = 8.0 * np.log(2.0) / 0.25 + end.quiet_from_s
     assert describe_judgement(short) == (

@@ -12,14 +12,15 @@ import pytest
 from tests.analysis import logs
 from tests.analysis.certificate import runs
 from tests.log_editing import edited, recorded
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.run_view import RunView
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
@@ -48,7 +49,7 @@ def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certif
     """Returns a certificate of a run with a proof, with the given behaviour and error at its end."""
     certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     end = certificate.end._replace(
-        behaviour=behaviour, end_error_rad=error_rad, reasons=(), operator_acts=False
+        behaviour=behaviour, end_error_rad=error_rad, doubts=(), operator_acts=False
     )
     return replace(certificate, **{"end": end, "roots": STABLE_ROOTS, **fields})
 

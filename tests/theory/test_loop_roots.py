@@ -188,7 +188,9 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     assert list_effective_commands(log) == []
     assert RunEnd.of_log(log) == RunEnd.of_log(plain)
     assert find_log_roots(log) == find_log_roots(plain)
-    assert certify_run(log).decision == certify_run(plain).decision
+    commanded, planned = certify_run(log).decision, certify_run(plain).decision
+    assert commanded.stability is planned.stability
+    assert (commanded.rests_on, commanded.reasons) == (planned.rests_on, planned.reasons)
 
 
 def test_roots_follow_the_last_command() -> None:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 import trilat_net
+from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
     SiteEnergy,
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.scenario import load_scenario, parse_scenario
 
 ROWS = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}

@@ -15,11 +15,7 @@ from trilat_studies.tuning.tuning_report import list_energy_notes
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
 from tests.log_editing import edited, opened, recorded
 from tests.unit_arm import hand, unit_scenario
-from trilat_net.analysis.certificate.observed_energy import (
-    NEGATIVE_ENERGY_MEANING,
-    ObservedEnergy,
-    ObservedFinding,
-)
+from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, ObservedFinding
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_end import Stability
 from trilat_net.errors import LogError
@@ -28,6 +24,7 @@ from trilat_net.files import find_page
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.figures.registry import figure
+from trilat_net.presentation.observed_text import NEGATIVE_ENERGY_MEANING
 from trilat_net.scenario import load_scenario
 
 B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0

@@ -15,17 +15,13 @@ import trilat_net
 from tests.analysis import logs
 from tests.log_editing import edited, opened, recorded, without
 from tests.log_surgery import taken_apart
-from trilat_net.analysis.certificate.stability_certificate import (
-    Certificate,
-    certify,
-    find_unsupplied_growth,
-)
+from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, Stability
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
-from trilat_net.presentation.verdict_text import describe_growth
 from trilat_net.scenario import parse_scenario
 
 from . import runs
@@ -269,7 +265,7 @@ def test_v_that_rises_at_the_end_is_named() -> None:
         changed = replace(
             balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
         )
-        return [describe_growth(one) for one in find_unsupplied_growth(changed, 1e-3)]
+        return [growth.text for growth in changed.find_unsupplied_growth(1e-3)]
 
     assert growth(np.zeros(len(V))) == []
     assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []

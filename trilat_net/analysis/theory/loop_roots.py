@@ -38,10 +38,10 @@ from ...own_code import ImportedLaw
 from ...records import NS_PER_S
 from ...scenario import ConstantDelay, LinkBase, Scenario, draw_used_samples
 from ..blas_threads import limit_blas_threads
+from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
-from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
