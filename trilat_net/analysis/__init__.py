@@ -18,7 +18,6 @@ __all__ = [
     "NO_BUCKETS",
     "THROWN_RAD",
     "EndBehaviour",
-    "LoopRoots",
     "RunEnd",
     "RunTrace",
     "Stability",
@@ -27,6 +26,7 @@ __all__ = [
     "find_hanging_sites",
     "judge_virtual_run",
     "reduce_to_buckets",
+    "run_remarks",
     # The certificate
     "KEPT_S",
     "ZERO_ENERGY_J",
@@ -132,7 +132,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from . import decision_facts, link_summary, site_signals
+    from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools, align_records
     from .arm_rows import (
         EndEffectorRows,
@@ -149,7 +149,6 @@ if TYPE_CHECKING:
     from .certificate.premises import find_missing_functionals, find_unjudged_spans
     from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
     from .certificate.stability_certificate import certify
-    from .decision_facts import LoopRoots
     from .dominance_history import (
         find_closed_groups,
         find_program,
@@ -249,7 +248,7 @@ else:
             "certificate.running_energy": "EnergyCourse KEPT_S RecordWindow RunningEnergy",
             "certificate.stability_certificate": "certify",
             "certificate.verdict_facts": "verdict_facts",
-            "decision_facts": "LoopRoots decision_facts",
+            "decision_facts": "decision_facts",
             "dominance_history": (
                 "find_closed_groups find_program find_user_shares find_users "
                 "left_perron_vector list_ramps plan_dominance trace_dominance"
@@ -268,6 +267,7 @@ else:
                 "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
                 "find_hanging_sites reduce_to_buckets"
             ),
+            "run_remarks": "run_remarks",
             "run_view": "RunView",
             "site_signals": (
                 "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "

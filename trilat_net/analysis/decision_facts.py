@@ -243,7 +243,7 @@ class StabilityDecision(NamedTuple):
 
         The package `presentation` writes them.
         """
-        return tuple(find_hook("list the reasons of a finding")(self))
+        return tuple(find_hook("list the sentences of a finding")(self))
 
     @property
     def rests_on_roots_alone(self) -> bool:

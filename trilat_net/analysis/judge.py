@@ -28,7 +28,7 @@ from .certificate.stability_certificate import certify
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability
-from .run_remarks import list_remarks
+from .run_remarks import RunCircumstances
 from .stability_decision import decide_stability, is_decided_by_roots
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from .theory.operating_point import has_lasting_delays
@@ -101,7 +101,7 @@ def certify_run(
         law_proofs=tuple(list_law_proofs(final_scenario)),
         law_conditions=tuple(conditions),
         has_lasting_delays=has_lasting_delays(final_scenario),
-        remarks=list_remarks(log),
+        circumstances=RunCircumstances.of_log(log),
     )
 
 

@@ -239,7 +239,7 @@ class RunEnd(NamedTuple):
 
         Empty if it is decided. The package `presentation` writes the sentences.
         """
-        return tuple(find_hook("list the reasons of a finding")(self))
+        return tuple(find_hook("list the sentences of a finding")(self))
 
     @classmethod
     def of_log(cls, log: Log) -> "RunEnd":

@@ -115,7 +115,7 @@ register_hooks(
         "head a certificate": "certificate_text:compose_headline",
         "describe a push": "twin_text:describe_push",
         "describe a finding": "finding_text:describe_finding",
-        "list the reasons of a finding": "finding_text:list_finding_reasons",
+        "list the sentences of a finding": "finding_text:list_finding_sentences",
         "describe a premise": "premise_text:describe_quantities",
         "describe missing functionals": "premise_text:describe_missing_functionals",
         "describe closed groups": "premise_text:describe_closed_groups",

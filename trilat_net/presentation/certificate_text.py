@@ -25,11 +25,11 @@ from ..analysis import (
     EndBehaviour,
     EnergyBalance,
     EnvelopeTrend,
-    LoopRoots,
     ObservedFinding,
     PushedTwins,
     Stability,
     TwinGrowth,
+    decision_facts,
     premise_quantities,
     verdict_facts,
 )
@@ -334,7 +334,9 @@ def describe_theorem(certificate: Certificate) -> list[str]:
     return [f"stability theorem of the paper (V: its energy function): {text}"]
 
 
-def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[CertificateLine]:
+def _compare_rates(
+    roots: decision_facts.LoopRoots | None, twins: TwinGrowth
+) -> list[CertificateLine]:
     """Returns a remark why two measured rates of decay differ, if their printed numbers do.
 
     A certificate states the rate of the characteristic roots, and the rate at which small

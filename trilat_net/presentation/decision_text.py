@@ -8,9 +8,10 @@ Invariant:
       in `OBSTACLES`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
-from ..analysis import EndBehaviour, LoopRoots, decision_facts
+from ..analysis import EndBehaviour, decision_facts
 from ..errors import count_nouns
 from .verdict_text import THEOREM
 
@@ -33,7 +34,7 @@ def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
     return reasons
 
 
-def _describe_root_basis(roots: LoopRoots) -> str:
+def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
     """Returns the phrase after "rests on:" if the roots of the loop decide.
 
     For example "exact roots, slowest -0.832 /s": the mode that decays most slowly has the rate
@@ -176,7 +177,9 @@ OBSTACLES: dict[decision_facts.Obstacle, Callable[[decision_facts.RunFindings], 
 one on a short record.
 """
 
-DESCRIBERS = {decision_facts.StabilityDecision: _state_basis}
+DESCRIBERS: dict[type, Callable[[Any], str]] = {decision_facts.StabilityDecision: _state_basis}
 """The function that describes a decision, by its class."""
-REASON_LISTERS = {decision_facts.StabilityDecision: _list_reasons}
+SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
+    decision_facts.StabilityDecision: _list_reasons
+}
 """The function that lists the reasons of a decision, by its class."""

@@ -7,6 +7,9 @@ Invariant:
     - Each name of a doubt has one template here, in `END_DOUBTS`.
 """
 
+from collections.abc import Callable, Iterable
+from typing import Any
+
 from ..analysis import SETTLED_ERROR_RAD, EndBehaviour, EnvelopeTrend, RunEnd
 
 _LASTING_ERRORS = "at rest, with errors that stay"
@@ -115,7 +118,7 @@ def _format_rate(trend: EnvelopeTrend, rate_per_s: float) -> str:
     return f"{rate_per_s:+.3g}/s"
 
 
-DESCRIBERS = {RunEnd: _describe_end}
+DESCRIBERS: dict[type, Callable[[Any], str]] = {RunEnd: _describe_end}
 """The functions that describe the findings of this module, by the class of the finding."""
-REASON_LISTERS = {RunEnd: _list_doubts}
-"""The functions that list the reasons of a finding, by its class."""
+SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {RunEnd: _list_doubts}
+"""The functions that list the sentences of a finding, by its class."""

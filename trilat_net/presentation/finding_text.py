@@ -1,17 +1,24 @@
 """Describes the findings of the analysis in sentences, by the class of the finding.
 
-The classes of `analysis` contain names and numbers, and their properties `text` and `reasons`
-call the two functions of this module through hooks.
+The classes of `analysis` contain names and numbers, and their properties `text`, `reasons` and
+`remarks` call the two functions of this module through hooks.
 
 Invariant:
-    - Each class has its functions in one module, whose tables `DESCRIBERS` and `REASON_LISTERS`
-      name them.
+    - Each class has its functions in one module, in the tables `DESCRIBERS` and
+      `SENTENCE_LISTERS`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from . import decision_text, end_text, observed_text, twin_text, verdict_text
+from . import (
+    decision_text,
+    end_text,
+    observed_text,
+    remark_text,
+    twin_text,
+    verdict_text,
+)
 
 _DESCRIBERS: dict[type, Callable[[Any], str]] = {
     **decision_text.DESCRIBERS,
@@ -20,10 +27,11 @@ _DESCRIBERS: dict[type, Callable[[Any], str]] = {
     **twin_text.DESCRIBERS,
     **verdict_text.DESCRIBERS,
 }
-_REASON_LISTERS: dict[type, Callable[[Any], list[str]]] = {
-    **decision_text.REASON_LISTERS,
-    **end_text.REASON_LISTERS,
-    **verdict_text.REASON_LISTERS,
+_SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
+    **decision_text.SENTENCE_LISTERS,
+    **end_text.SENTENCE_LISTERS,
+    **remark_text.SENTENCE_LISTERS,
+    **verdict_text.SENTENCE_LISTERS,
 }
 
 
@@ -36,13 +44,15 @@ def describe_finding(finding: Any) -> str:
     return _DESCRIBERS[type(finding)](finding)
 
 
-def list_finding_reasons(finding: Any) -> list[str]:
-    """Returns sentences that say why a finding does not show that a run is stable.
+def list_finding_sentences(finding: Any) -> list[str]:
+    """Returns the sentences on a finding that consists of several, one for each of its parts.
+
+    They say for example why the end of a run leaves its stability open.
 
     Args:
         finding: The finding, with the numbers that show it.
 
     Returns:
-        The sentences. Empty if nothing speaks against a stable run.
+        The sentences. Empty if the finding has no parts.
     """
-    return _REASON_LISTERS[type(finding)](finding)
+    return list(_SENTENCE_LISTERS[type(finding)](finding))

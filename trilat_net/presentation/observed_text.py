@@ -4,6 +4,9 @@
 names and numbers.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 from ..analysis import ObservedEnergy, ObservedFinding
 from ..errors import count_nouns
 
@@ -53,5 +56,8 @@ def _explain_finding(finding: ObservedFinding) -> str:
     return NEGATIVE_ENERGY_MEANING if finding is ObservedFinding.NEGATIVE else ""
 
 
-DESCRIBERS = {ObservedEnergy: _describe_observed, ObservedFinding: _explain_finding}
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    ObservedEnergy: _describe_observed,
+    ObservedFinding: _explain_finding,
+}
 """The functions that describe the findings of this module, by the class of the finding."""

@@ -5,6 +5,8 @@ example, this module writes that every push dies away, and which of them does so
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 from ..analysis import EnvelopeTrend, PushedTwins, PushGrowth, TwinGrowth
 from ..errors import count_nouns
@@ -112,5 +114,8 @@ def _describe_linear_sizes(twins: PushedTwins) -> str:
     return f"{text}; a push of {beyond.size:g} {outcome}: {ratio}"
 
 
-DESCRIBERS = {TwinGrowth: _describe_growth, PushedTwins: _describe_worst_push}
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    TwinGrowth: _describe_growth,
+    PushedTwins: _describe_worst_push,
+}
 """The functions that describe the findings of this module, by the class of the finding."""

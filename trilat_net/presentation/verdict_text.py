@@ -10,7 +10,7 @@ Invariant:
     - The theorem is named with its own premises of continuous time, which no log can show.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from ..analysis import verdict_facts as facts
@@ -198,12 +198,12 @@ def _describe_lack(doubt: facts.EvidenceDoubt) -> str:
     return f"{' and '.join(evidence.unmet)}, as recorded, did not react to this run"
 
 
-DESCRIBERS = {
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
     facts.StabilityVerdict: _describe_verdict,
     facts.UnsuppliedGrowth: _describe_growth,
     facts.Evidence: _describe_evidence,
     facts.EvidenceDoubt: _describe_lack,
 }
 """The functions that describe the findings of this module, by the class of the finding."""
-REASON_LISTERS = {facts.Evidence: _list_lacks}
-"""The functions that list the reasons of a finding, by its class."""
+SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {facts.Evidence: _list_lacks}
+"""The functions that list the sentences of a finding, by its class."""

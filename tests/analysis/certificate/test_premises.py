@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis import decision_facts, run_end, stability_decision
+from trilat_net.analysis import decision_facts, run_end, run_remarks, stability_decision
 from trilat_net.analysis.certificate import (
     certificate_result,
     energy_balance,
@@ -172,6 +172,7 @@ def list_clauses(module: ModuleType) -> set[str]:
         premise_quantities,
         premises_module,
         run_end,
+        run_remarks,
         stability_certificate,
         stability_decision,
         verdict_facts,

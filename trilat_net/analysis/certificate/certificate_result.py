@@ -20,6 +20,7 @@ from ...hooks import find_hook
 from ...results import JsonObject, Result, finite_or_none
 from ..decision_facts import Doubt, LoopRoots, RunFindings, StabilityDecision
 from ..run_end import EndBehaviour, RunEnd, Stability
+from ..run_remarks import RunCircumstances
 from ..stability_decision import decide_stability
 from ..twins.twin_growth import TwinGrowth
 from .energy_balance import EnergyBalance, SiteEnergy
@@ -57,8 +58,8 @@ class Certificate(Result):
             every site and prove that small motions die away. Empty if there are none.
         law_conditions: Sentences on the stability conditions of the control laws of the run.
         has_lasting_delays: True if delays that are constant in the run stay so after it.
-        remarks: Conditions that readers of the judgement should know, such as a motor at its
-            torque limit. See `run_remarks`.
+        circumstances: What readers of the judgement should know, such as a motor at its torque
+            limit. Empty if it was not examined.
     """
 
     premises: list[Premise]
@@ -75,7 +76,7 @@ class Certificate(Result):
     law_proofs: tuple[str, ...] = ()
     law_conditions: tuple[str, ...] = ()
     has_lasting_delays: bool = True
-    remarks: tuple[str, ...] = ()
+    circumstances: RunCircumstances = field(default_factory=RunCircumstances)
 
     @property
     def has_functional(self) -> bool:
@@ -204,6 +205,14 @@ class Certificate(Result):
         that control laws declare, and the completeness of the log. Empty for a stable run.
         """
         return self.decision.reasons
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on circumstances that readers of the judgement should know.
+
+        For example, a motor was at its torque limit. See `run_remarks`.
+        """
+        return self.circumstances.remarks
 
     @property
     def stability(self) -> Stability:

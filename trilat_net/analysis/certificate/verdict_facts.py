@@ -280,7 +280,7 @@ class Evidence(NamedTuple):
 
         There is one for each doubt. The package `presentation` writes them.
         """
-        return list(find_hook("list the reasons of a finding")(self))
+        return list(find_hook("list the sentences of a finding")(self))
 
     @property
     def text(self) -> str:
