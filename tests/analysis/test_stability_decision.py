@@ -15,9 +15,9 @@ from trilat_net.presentation.verdict_text import THEOREM
 from trilat_net.scenario import load_scenario
 
 PUSHES = Push.choose(load_scenario("two_sites"))
-STABLE_ROOTS = LoopRoots("stable", -0.163, True, "this rest: stable, -0.163 /s")
-UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True, "this rest: unstable, +0.0424 /s")
-NO_ROOTS = LoopRoots("", None, False, "this rest: no roots: its code may not run")
+STABLE_ROOTS = LoopRoots("stable", -0.163, True)
+UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True)
+NO_ROOTS = LoopRoots("", None, False, reason="its code may not run")
 
 
 def end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> RunEnd:
@@ -194,7 +194,7 @@ def test_a_slow_numerical_decay_stays_open(
     for share in (0.01, 0.5, 0.99, 1.01, 3.0, 100.0):
         rate_per_s = -share * math.log(2.0) / judged_s
         roots = LoopRoots(
-            "stable", rate_per_s, False, "", is_numerical=True, swing_rate_per_s=rate_per_s
+            "stable", rate_per_s, False, is_numerical=True, swing_rate_per_s=rate_per_s
         )
         slow = decide(end=lasting, twins=pushes, roots=roots)
         assert slow.stability is (Stability.OPEN if share <= 1.0 else Stability.NOT_STABLE)
@@ -215,7 +215,7 @@ def test_a_slow_numerical_decay_stays_open(
 )
 def test_only_slow_numerical_swings_excuse_oscillations(changes: dict[str, object]) -> None:
     """A slow root that does not oscillate explains no oscillation."""
-    roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
+    roots = LoopRoots("stable", -0.001, False, is_numerical=True, swing_rate_per_s=-0.001)
     lasting = end(EndBehaviour.BOUNDED, lasts_s=40.0)
     assert decide(end=lasting, roots=roots).stability is Stability.OPEN
     changed = roots._replace(**changes)  # type: ignore[arg-type]
@@ -223,7 +223,7 @@ def test_only_slow_numerical_swings_excuse_oscillations(changes: dict[str, objec
 
 
 def test_growing_motion_is_not_excused_by_roots() -> None:
-    roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
+    roots = LoopRoots("stable", -0.001, False, is_numerical=True, swing_rate_per_s=-0.001)
     growing = EnvelopeFit(EnvelopeTrend.GROWS, 0.01, False)
     for run_end in (
         end(EndBehaviour.GROWS, lasts_s=40.0),

@@ -107,7 +107,7 @@ def test_the_first_line_agrees_with_its_judgement(
 ) -> None:
     certificate = certify(LOGS[name]())
     word = "stable" if root_per_s < 0.0 else "unstable"
-    roots = LoopRoots(word, root_per_s, True, f"this rest: {word}, {root_per_s} /s")
+    roots = LoopRoots(word, root_per_s, True)
     judged = replace(
         certificate, end=certificate.end._replace(behaviour=behaviour), roots=roots
     )
@@ -151,7 +151,7 @@ def judge_end(behaviour: EndBehaviour, evidence: str, speed_rad_s: float) -> Cer
     end = certificate.end._replace(
         behaviour=behaviour, doubts=(), operator_acts=False, end_speed_rad_s=speed_rad_s
     )
-    roots = LoopRoots(verdict, None, bool(verdict), "this rest")
+    roots = LoopRoots(verdict, None, bool(verdict))
     return replace(certificate, end=end, roots=roots, twins=TwinGrowth("", 10.0, 20.0, pushes))
 
 
@@ -223,7 +223,7 @@ def test_sentences_about_a_record_fit_its_length() -> None:
 
 
 def test_short_runs_state_their_length_once() -> None:
-    slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
+    slow = LoopRoots("stable", -0.25, True)
     certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, doubts=())
     short = replace(certificate, end=end, roots=slow)
@@ -240,7 +240,7 @@ def test_pace_follows_the_slowest_root() -> None:
     certificate = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     for rate_per_s, verb in ((-0.5, "halves"), (0.5, "doubles")):
         verdict = "stable" if rate_per_s < 0.0 else "unstable"
-        roots = LoopRoots(verdict, rate_per_s, True, f"this rest: {verdict}")
+        roots = LoopRoots(verdict, rate_per_s, True)
         judged = replace(certificate, roots=roots)
         assert describe_pace(judged) == f"a small disturbance {verb} every 1.4 s"
         assert describe_pace(replace(judged, roots=roots._replace(exact=False))) == ""

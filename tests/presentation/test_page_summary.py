@@ -34,7 +34,7 @@ from trilat_net.presentation.page_summary import (
 )
 from trilat_net.presentation.result_text import compose
 
-STABLE_ROOTS = LoopRoots("stable", -0.5, True, "this rest: stable, -0.5 /s")
+STABLE_ROOTS = LoopRoots("stable", -0.5, True)
 PASSED = Finding("records", "8/8 in the file; judged all 8 ticks")
 EXACT = Finding("executed again", "8/8 records identical (whole runs, bit for bit)")
 WRONG = Finding("executed again", "7/8 records identical; 1 differs", passed=False)
@@ -87,7 +87,7 @@ def test_pushing_hands_are_named() -> None:
 
 
 def test_calm_end_of_unstable_loop_is_explained() -> None:
-    growing = LoopRoots("unstable", 0.1, True, "this rest: unstable, +0.1 /s")
+    growing = LoopRoots("unstable", 0.1, True)
     html = verdict_text(judge(EndBehaviour.CONVERGED, 0.0, roots=growing))
     assert "Not stable" in html
     assert "This motion is small, but grows from small disturbances." in html

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from ..hooks import find_hook
+from ..results import JsonObject
 from .certificate.observed_energy import ObservedEnergy
 from .certificate.verdict_facts import EvidenceDoubt, StabilityVerdict, UnsuppliedGrowth
 from .run_end import EndBehaviour, RunEnd, Stability
@@ -84,7 +85,6 @@ class LoopRoots(NamedTuple):
             of the structure of the loop. None if there is no such root.
         exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
             the roots may cast doubt on a run, but prove nothing.
-        text: The pose and its roots, or the reason why there are no roots.
         distance_rad: Largest difference between the last angle of a joint and its angle at the
             pose at rest to which the roots belong, in rad.
         leaves_out: What the linearised loop leaves out, as a phrase, for example "how the
@@ -93,16 +93,45 @@ class LoopRoots(NamedTuple):
             roots can refute a run, but not prove it stable.
         swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. None
             if no computed root oscillates.
+        omega_rad_s: Angular frequency of the root with the largest real part, in rad/s.
+        drifting: Number of motions that keep their speed, because of the structure of the loop.
+        span: Phrase for the ticks and delays over which the roots were computed, such as ", in
+            continuous time". Empty if every tick has the same delays.
+        reason: The reason why there are no roots. Empty if the loop was linearised.
     """
 
     verdict: str
     rate_per_s: float | None
     exact: bool
-    text: str
     distance_rad: float = 0.0
     leaves_out: str = ""
     is_numerical: bool = False
     swing_rate_per_s: float | None = None
+    omega_rad_s: float = 0.0
+    drifting: int = 0
+    span: str = ""
+    reason: str = ""
+
+    @property
+    def text(self) -> str:
+        """A sentence on the roots, or on the reason why there are none, for the user.
+
+        The package `presentation` writes it.
+        """
+        return str(find_hook("describe a finding")(self))
+
+    def to_json(self) -> JsonObject:
+        """Returns the roots as values for JSON, with the sentence about them."""
+        return {
+            "verdict": self.verdict,
+            "rate_per_s": self.rate_per_s,
+            "exact": self.exact,
+            "text": self.text,
+            "distance_rad": self.distance_rad,
+            "leaves_out": self.leaves_out,
+            "is_numerical": self.is_numerical,
+            "swing_rate_per_s": self.swing_rate_per_s,
+        }
 
     @property
     def proven(self) -> str:

@@ -34,6 +34,21 @@ def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
     return reasons
 
 
+def _describe_roots(roots: decision_facts.LoopRoots) -> str:
+    """Returns a sentence on the roots at the end of a run, or why there are none."""
+    if not roots.verdict:
+        return f"this rest: no roots: {roots.reason}"
+    if roots.rate_per_s is None:
+        return f"this rest: {roots.verdict}, without roots"
+
+    omega = f" at {roots.omega_rad_s:.4g} rad/s" if roots.omega_rad_s else ""
+    drift = ""
+    if roots.drifting:
+        drift = f"{roots.drifting} of its motions keep their speed, the others "
+    rate = f"{drift}{roots.rate_per_s:+.3g} /s"
+    return f"this rest: {roots.verdict}, {rate}{omega}{roots.span}"
+
+
 def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
     """Returns the phrase after "rests on:" if the roots of the loop decide.
 
@@ -177,8 +192,11 @@ OBSTACLES: dict[decision_facts.Obstacle, Callable[[decision_facts.RunFindings], 
 one on a short record.
 """
 
-DESCRIBERS: dict[type, Callable[[Any], str]] = {decision_facts.StabilityDecision: _state_basis}
-"""The function that describes a decision, by its class."""
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    decision_facts.StabilityDecision: _state_basis,
+    decision_facts.LoopRoots: _describe_roots,
+}
+"""The functions that describe the findings of this module, by the class of the finding."""
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
     decision_facts.StabilityDecision: _list_reasons
 }

@@ -246,7 +246,7 @@ def test_a_broken_balance_is_never_accepted() -> None:
 
 
 def test_an_unstable_rest_never_passes_a_run() -> None:
-    roots = LoopRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
+    roots = LoopRoots("unstable", 0.012, True)
     refuted = replace(still(), roots=roots)
     assert refuted.stability is Stability.NOT_STABLE
     assert refuted.headline().endswith("rests on: exact roots, fastest growing +0.012 /s")

@@ -272,7 +272,7 @@ class Certificate(Result):
                 "end_speed_where": end.end_speed_where or None,
             },
             "evidence": self.evidence.to_json(),
-            "roots": None if self.roots is None else self.roots._asdict(),
+            "roots": None if self.roots is None else self.roots.to_json(),
             "observed": None if self.observed is None else self.observed.to_json(),
             "twins": None if self.twins is None else self.twins.to_json(),
             "functional": None if balance is None else _functional_to_json(self, balance),

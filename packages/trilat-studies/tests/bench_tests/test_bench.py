@@ -365,7 +365,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
         "records": {},
         "end": RunEnd(EndBehaviour.HARDLY, fit, fit, 0.1, 0.1),
         "twins": TwinGrowth(""),
-        "roots": LoopRoots("stable" if rate_per_s else "", rate_per_s, True, ""),
+        "roots": LoopRoots("stable" if rate_per_s else "", rate_per_s, True),
         "stability": Stability.OPEN,
         "text": "open",
         **more,
