@@ -53,7 +53,7 @@ NUMBERS = {
     "int64",
 }
 NUMBERS |= {"tuple", "list", "dict", "Sequence", "Mapping", "Iterator", "slice", "Rows"}
-CERTIFICATE = house.ROOT / "trilat_net/analysis/certificate/stability_certificate.py"
+CERTIFICATE = house.ROOT / "trilat_net/analysis/certificate"
 SCENARIO = house.ROOT / "trilat_net/scenario"
 TABLE_MODULES = [
     SCENARIO / f"{name}.py"
@@ -391,7 +391,10 @@ def walk(*starts: Place) -> Walk:
 
 def walk_to_judgement() -> Walk:
     """Returns the walk from a log to the exit code of `trilat certify`."""
-    return walk(Place(CERTIFICATE, "certify"), Place(CERTIFICATE, "Certificate.accepts"))
+    return walk(
+        Place(CERTIFICATE / "stability_certificate.py", "certify"),
+        Place(CERTIFICATE / "certificate_result.py", "Certificate.accepts"),
+    )
 
 
 def walk_to_scenario() -> Walk:

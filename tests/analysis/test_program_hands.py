@@ -8,7 +8,7 @@ import trilat_net as tn
 from tests.execution.builders import run_fused
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.run_end import Stability
-from trilat_net.analysis.run_remarks import list_remarks
+from trilat_net.analysis.run_remarks import RunCircumstances
 from trilat_net.analysis.theory.loop_roots import find_log_roots, find_run_roots
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.page_timeline import list_moments
@@ -48,7 +48,8 @@ def test_a_remark_counts_the_programs() -> None:
         f"sites.{site}.hands": [{"kind": "own", "class": "tests.own_code:Follower"}]
         for site in ("m1", "m2")
     }
-    (remark,) = list_remarks(tn.simulate("free", hands, duration_s=1.0))
+    log = tn.simulate("free", hands, duration_s=1.0)
+    (remark,) = RunCircumstances.of_log(log).remarks
     assert remark.startswith("programs move m1 and m2;")
     assert "how the arms and these programs act on each other" in remark
 

@@ -5,7 +5,7 @@ import pytest
 from tests.analysis.builders import make_short_log
 from tests.log.builders import replace_fields, rewrite_log
 from trilat_net import simulate
-from trilat_net.analysis.run_remarks import LARGE_PUSH_SHARE, list_remarks
+from trilat_net.analysis.run_remarks import LARGE_PUSH_SHARE, RunCircumstances
 from trilat_net.net.messages import State
 
 
@@ -19,7 +19,7 @@ def test_ticks_at_the_torque_limit_are_counted(ticks: int) -> None:
             return row
         return replace_fields(row, tau=[0.0, limits_nm[row.site]])
 
-    remarks = list_remarks(rewrite_log(log, change=saturate))
+    remarks = RunCircumstances.of_log(rewrite_log(log, change=saturate)).remarks
     times = f"{ticks / 200:.3g} s and {2 * ticks / 200:.3g} s"
     assert remarks == (f"m1 and m2 were at their torque limit for {times}",)
 
@@ -37,7 +37,7 @@ def test_pushes_above_half_the_limit_are_named(share: float) -> None:
     )
     limit = f"(torque limit {limit_nm:g} N m)"
     remark = f"hands or walls pushed m2 joint 1 with up to {push_nm:.3g} N m {limit}"
-    assert list_remarks(pushed) == ((remark,) if share > 1.0 else ())
+    assert RunCircumstances.of_log(pushed).remarks == ((remark,) if share > 1.0 else ())
 
 
 def test_late_ticks_are_counted() -> None:
@@ -48,15 +48,16 @@ def test_late_ticks_are_counted() -> None:
         keep=lambda row: row.site != "m2",
         driver="live",
     )
-    assert list_remarks(late) == (
+    assert RunCircumstances.of_log(late).remarks == (
         "2 ticks of m1 and 2 ticks of s began late, by a period or more",
     )
 
 
 def test_calm_and_empty_logs_have_no_remarks() -> None:
     log = make_short_log("paper")
-    assert list_remarks(log) == ()
-    assert list_remarks(rewrite_log(log, lambda _: False)) == ()
+    assert RunCircumstances.of_log(log).remarks == ()
+    empty = rewrite_log(log, lambda _: False)
+    assert RunCircumstances.of_log(empty) == RunCircumstances()
 
 
 @pytest.mark.parametrize("half_width_ms", [0.0, 2.0, 50.0, 200.0])
@@ -68,7 +69,9 @@ def test_ages_unlike_the_stated_delay_are_named(half_width_ms: float, order: str
     part = log["s"]
     has_sample = part.used["m"] >= 0
     mean_ms = float((part.tick - part.used["m"])[has_sample].mean()) * 1e3 / part.rate_hz
-    remarks = [text for text in list_remarks(log) if "samples in use" in text]
+    remarks = [
+        text for text in RunCircumstances.of_log(log).remarks if "samples in use" in text
+    ]
     differs = abs(mean_ms - 200.0) > 10.0
     assert differs == (half_width_ms >= 50.0)
     assert bool(remarks) == differs

@@ -4,23 +4,20 @@ import math
 
 import pytest
 
-from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
-from trilat_net.analysis.stability_decision import (
-    LoopRoots,
-    RunFindings,
-    StabilityDecision,
-    decide_stability,
-)
+from trilat_net.analysis.certificate.verdict_facts import UnsuppliedGrowth
+from trilat_net.analysis.decision_facts import LoopRoots, RunFindings, StabilityDecision
+from trilat_net.analysis.run_end import EndBehaviour, EndDoubt, RunEnd, Stability
+from trilat_net.analysis.stability_decision import decide_stability
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, RestDeparture, TwinGrowth
 from trilat_net.execution.twins import Push
+from trilat_net.presentation.verdict_text import THEOREM
 from trilat_net.scenario import load_scenario
 
 PUSHES = Push.choose(load_scenario("two_sites"))
-STABLE_ROOTS = LoopRoots("stable", -0.163, True, "this rest: stable, -0.163 /s")
-UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True, "this rest: unstable, +0.0424 /s")
-NO_ROOTS = LoopRoots("", None, False, "this rest: no roots: its code may not run")
-THEOREM = "the theorem (continuous time; every premise checked here holds)"
+STABLE_ROOTS = LoopRoots("stable", -0.163, True)
+UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True)
+NO_ROOTS = LoopRoots("", None, False, reason="its code may not run")
 
 
 def make_run_end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> RunEnd:
@@ -56,13 +53,13 @@ def test_stable_needs_a_proof() -> None:
     assert decide(twins=make_twin_growth()).stability is Stability.SETTLED
     assert decide(twins=make_twin_growth(), roots=NO_ROOTS).stability is Stability.SETTLED
     assert decide(twins=make_twin_growth(), roots=STABLE_ROOTS).stability is Stability.STABLE
-    assert decide(twins=make_twin_growth(), proofs=[THEOREM]).stability is Stability.STABLE
-    assert decide(proofs=[THEOREM]).stability is Stability.STABLE
+    assert decide(twins=make_twin_growth(), is_covered=True).stability is Stability.STABLE
+    assert decide(is_covered=True).stability is Stability.STABLE
 
 
 def test_the_decision_names_its_basis() -> None:
     assert decide(roots=STABLE_ROOTS).rests_on == "exact roots, slowest -0.163 /s"
-    both = decide(roots=STABLE_ROOTS, proofs=[THEOREM])
+    both = decide(roots=STABLE_ROOTS, is_covered=True)
     assert both.rests_on == f"{THEOREM}; exact roots, slowest -0.163 /s"
     settled = decide(twins=make_twin_growth(), roots=NO_ROOTS)
     expected = f"{len(PUSHES)} pushes over 20 s, all of which died away; {NO_ROOTS.text}"
@@ -110,7 +107,7 @@ def test_unstable_roots_of_distant_rest_raise_doubt() -> None:
 def test_a_diverged_run_is_never_stable() -> None:
     diverged = make_run_end(EndBehaviour.DIVERGED, diverged_at_s=3.0)
     decision = decide(
-        end=diverged, twins=make_twin_growth(), roots=STABLE_ROOTS, proofs=[THEOREM]
+        end=diverged, twins=make_twin_growth(), roots=STABLE_ROOTS, is_covered=True
     )
     assert decision.stability is Stability.NOT_STABLE
 
@@ -142,7 +139,7 @@ def test_few_loss_bursts_need_growing_pushes() -> None:
 
 
 def test_an_acting_operator_leaves_a_run_open() -> None:
-    acting = make_run_end(operator_acts=True, reasons=("an operator acts",))
+    acting = make_run_end(operator_acts=True, doubts=(EndDoubt("operator acts", until_s=9.0),))
     for roots in (None, STABLE_ROOTS, UNSTABLE_ROOTS):
         assert decide(end=acting, twins=GROWING, roots=roots).stability is Stability.OPEN
 
@@ -166,11 +163,14 @@ def test_departure_from_rest_needs_proof_for_stable() -> None:
 
 
 def test_doubts_and_hidden_periods_leave_a_run_open() -> None:
-    doubt = ["V rises at the end"]
-    decision = decide(twins=make_twin_growth(), roots=STABLE_ROOTS, doubts=doubt)
-    assert (decision.stability, decision.reasons) == (Stability.OPEN, tuple(doubt))
+    doubt = UnsuppliedGrowth(2.0, from_s=3.0)
+    decision = decide(twins=make_twin_growth(), roots=STABLE_ROOTS, doubts=[doubt])
+    assert decision.stability is Stability.OPEN
+    assert decision.reasons == (doubt.text,)
     hidden = make_twin_growth(delay_period_s=145.2)
-    assert decide(twins=hidden).stability is Stability.OPEN
+    open_run = decide(twins=hidden)
+    assert open_run.stability is Stability.OPEN
+    assert "the delays repeat after 145.2 s" in open_run.reasons[0]
     assert decide(twins=hidden, roots=STABLE_ROOTS).stability is Stability.STABLE
 
 
@@ -201,7 +201,7 @@ def test_a_slow_numerical_decay_stays_open(
     for share in (0.01, 0.5, 0.99, 1.01, 3.0, 100.0):
         rate_per_s = -share * math.log(2.0) / judged_s
         roots = LoopRoots(
-            "stable", rate_per_s, False, "", is_numerical=True, swing_rate_per_s=rate_per_s
+            "stable", rate_per_s, False, is_numerical=True, swing_rate_per_s=rate_per_s
         )
         slow = decide(end=lasting, twins=pushes, roots=roots)
         assert slow.stability is (Stability.OPEN if share <= 1.0 else Stability.NOT_STABLE)
@@ -222,7 +222,7 @@ def test_a_slow_numerical_decay_stays_open(
 )
 def test_only_slow_numerical_swings_excuse_oscillations(changes: dict[str, object]) -> None:
     """A slow root that does not oscillate explains no oscillation."""
-    roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
+    roots = LoopRoots("stable", -0.001, False, is_numerical=True, swing_rate_per_s=-0.001)
     lasting = make_run_end(EndBehaviour.BOUNDED, lasts_s=40.0)
     assert decide(end=lasting, roots=roots).stability is Stability.OPEN
     changed = roots._replace(**changes)  # type: ignore[arg-type]
@@ -230,7 +230,7 @@ def test_only_slow_numerical_swings_excuse_oscillations(changes: dict[str, objec
 
 
 def test_growing_motion_is_not_excused_by_roots() -> None:
-    roots = LoopRoots("stable", -0.001, False, "", is_numerical=True, swing_rate_per_s=-0.001)
+    roots = LoopRoots("stable", -0.001, False, is_numerical=True, swing_rate_per_s=-0.001)
     growing = EnvelopeFit(EnvelopeTrend.GROWS, 0.01, False)
     for run_end in (
         make_run_end(EndBehaviour.GROWS, lasts_s=40.0),

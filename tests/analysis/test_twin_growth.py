@@ -1,6 +1,7 @@
 """The description of a difference matches its construction: rate, factor and place."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -10,14 +11,15 @@ from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import (
     CLEAR_GROWTH,
     PushedTwins,
+    PushGrowth,
     TwinGrowth,
-    estimate_miss_probability,
     judge_twins,
 )
 from trilat_net.execution.twins import Push, TwinPath, Twins
 from trilat_net.scenario import load_scenario
 
 TWO = load_scenario("two_sites")
+WITHOUT_ESTIMATES = load_scenario("p_d_margin_two")
 JOINTS = ("m joint 1", "m joint 2", "s joint 1", "s joint 2")
 
 
@@ -119,7 +121,21 @@ def test_part_of_a_period_has_no_trend() -> None:
     growth = judge_twins(load_scenario("two_sites", sines), make_twins(-0.5), 0.0, math.inf)
     assert growth.delay_period_s == pytest.approx(145.2)
     assert growth.hides_period
-    assert "145.2 s" in growth.period_text
+
+
+def with_pushes(pushes: Sequence[Push]) -> TwinGrowth:
+    decays = [
+        PushGrowth(push, EnvelopeTrend.DECAYS, -1.0, 0.1, "m joint 1", 0, 0.0)
+        for push in pushes
+    ]
+    return TwinGrowth("", pushes=tuple(decays))
+
+
+def miss_probability(directions: int) -> float:
+    chance = with_pushes(Push.choose(WITHOUT_ESTIMATES, directions)).miss_chance
+    assert chance is not None
+    assert chance.directions == directions
+    return chance.probability
 
 
 def test_random_directions_rarely_miss_a_growing_mode() -> None:
@@ -129,8 +145,10 @@ def test_random_directions_rarely_miss_a_growing_mode() -> None:
     directions = generator.uniform(-1.0, 1.0, (200_000, 30))
     shares = np.abs(directions @ mode) / (np.linalg.norm(mode) / math.sqrt(3.0))
     missed = float(np.mean(shares < 1.0 / CLEAR_GROWTH))
-    assert estimate_miss_probability(1) == pytest.approx(missed, rel=0.1)
-    assert estimate_miss_probability(3) == pytest.approx(estimate_miss_probability(1) ** 3)
+    assert miss_probability(1) == pytest.approx(missed, rel=0.1)
+    assert miss_probability(3) == pytest.approx(miss_probability(1) ** 3)
+    single_joints = with_pushes(Push.choose(TWO))
+    assert single_joints.miss_chance is None
 
 
 @pytest.mark.long
@@ -143,6 +161,6 @@ def test_twins_separate_linear_and_nonlinear_motion() -> None:
     assert 1e-4 <= twin_report.linear.largest <= 0.1
     assert (
         f"; a push of {10 * twin_report.linear.largest:g} goes another way: x "
-        in twin_report.linear.text
+        in twin_report.headline()
     )
     assert len(twin_report.to_frame()) == 9

@@ -23,7 +23,7 @@ from tests.certificate.sampled_loops import (
     make_sine_delay,
 )
 from tests.execution.builders import make_log_with_commands, run_fused
-from trilat_net.analysis.certificate.stability_certificate import Certificate
+from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.own_code.code_consent import allow_own_code
@@ -373,7 +373,12 @@ def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     assert list_effective_commands(log) == []
     certificate = tn.certify(log)
     assert_roots_decide(certificate, case.rate_per_s)
-    assert tn.certify(tn.simulate(scenario)).decision == certificate.decision
+    planned = tn.certify(tn.simulate(scenario)).decision
+    assert planned.stability is certificate.stability
+    assert (planned.rests_on, planned.reasons) == (
+        certificate.decision.rests_on,
+        certificate.reasons,
+    )
 
 
 def test_effective_commands_decide_by_later_roots() -> None:

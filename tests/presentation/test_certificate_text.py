@@ -16,10 +16,11 @@ from tests.analysis.builders import (
     make_short_log,
 )
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, TwinGrowth
 from trilat_net.execution.twins import Push
@@ -113,7 +114,7 @@ def test_the_first_line_agrees_with_its_judgement(
 ) -> None:
     certificate = certify(LOGS[name]())
     word = "stable" if root_per_s < 0.0 else "unstable"
-    roots = LoopRoots(word, root_per_s, True, f"this rest: {word}, {root_per_s} /s")
+    roots = LoopRoots(word, root_per_s, True)
     judged = replace(
         certificate, end=certificate.end._replace(behaviour=behaviour), roots=roots
     )
@@ -155,9 +156,9 @@ def judge_end(behaviour: EndBehaviour, evidence: str, speed_rad_s: float) -> Cer
     certificate = certify(LOGS["p_d"]())
     verdict, pushes = EVIDENCE[evidence]
     end = certificate.end._replace(
-        behaviour=behaviour, reasons=(), operator_acts=False, end_speed_rad_s=speed_rad_s
+        behaviour=behaviour, doubts=(), operator_acts=False, end_speed_rad_s=speed_rad_s
     )
-    roots = LoopRoots(verdict, None, bool(verdict), "this rest")
+    roots = LoopRoots(verdict, None, bool(verdict))
     return replace(certificate, end=end, roots=roots, twins=TwinGrowth("", 10.0, 20.0, pushes))
 
 
@@ -229,9 +230,9 @@ def test_sentences_about_a_record_fit_its_length() -> None:
 
 
 def test_short_runs_state_their_length_once() -> None:
-    slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
+    slow = LoopRoots("stable", -0.25, True)
     certificate = make_run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
-    end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
+    end = certificate.end._replace(behaviour=EndBehaviour.UNDECIDED, doubts=())
     short = replace(certificate, end=end, roots=slow)
     needed_s = 8.0 * np.log(2.0) / 0.25 + end.quiet_from_s
     assert describe_judgement(short) == (
@@ -246,7 +247,7 @@ def test_pace_follows_the_slowest_root() -> None:
     certificate = make_run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     for rate_per_s, verb in ((-0.5, "halves"), (0.5, "doubles")):
         verdict = "stable" if rate_per_s < 0.0 else "unstable"
-        roots = LoopRoots(verdict, rate_per_s, True, f"this rest: {verdict}")
+        roots = LoopRoots(verdict, rate_per_s, True)
         judged = replace(certificate, roots=roots)
         assert describe_pace(judged) == f"a small disturbance {verb} every 1.4 s"
         assert describe_pace(replace(judged, roots=roots._replace(exact=False))) == ""

@@ -17,14 +17,15 @@ from tests.log.builders import (
     rewrite_log,
     write_log,
 )
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.run_view import RunView
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
@@ -38,7 +39,7 @@ from trilat_net.presentation.page_summary import (
 )
 from trilat_net.presentation.result_text import compose
 
-STABLE_ROOTS = LoopRoots("stable", -0.5, True, "this rest: stable, -0.5 /s")
+STABLE_ROOTS = LoopRoots("stable", -0.5, True)
 PASSED = Finding("records", "8/8 in the file; judged all 8 ticks")
 EXACT = Finding("executed again", "8/8 records identical (whole runs, bit for bit)")
 WRONG = Finding("executed again", "7/8 records identical; 1 differs", passed=False)
@@ -93,7 +94,7 @@ def test_pushing_hands_are_named() -> None:
 
 
 def test_calm_end_of_unstable_loop_is_explained() -> None:
-    growing = LoopRoots("unstable", 0.1, True, "this rest: unstable, +0.1 /s")
+    growing = LoopRoots("unstable", 0.1, True)
     html = verdict_text(make_certificate(EndBehaviour.CONVERGED, 0.0, roots=growing))
     assert "Not stable" in html
     assert "This motion is small, but grows from small disturbances." in html

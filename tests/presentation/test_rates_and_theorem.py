@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from tests.analysis.builders import make_run
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.presentation.certificate_text import describe_certificate, describe_theorem
 
 
@@ -21,7 +21,7 @@ def test_rates_printing_differently_are_explained(
     assert certificate.twins is not None
     assert certificate.twins.worst is not None
     rate_per_s = factor * certificate.twins.worst.rate_per_s
-    roots = LoopRoots("stable", rate_per_s, exact, "this rest: stable")
+    roots = LoopRoots("stable", rate_per_s, exact)
     lines = describe_certificate(replace(certificate, roots=roots))
     lines_on_rates = [line for line in lines if line.text.startswith("of the two rates")]
     assert [line.mark for line in lines_on_rates] == ["note"] * remarks

@@ -185,26 +185,27 @@ LOSSY = {"model": "uniform", "delay_ms": 60.0, "half_width_ms": 30.0, "loss": 0.
 )
 def test_changed_random_links_have_the_logs_roots(links: dict[str, Any]) -> None:
     """The samples in use are drawn with the outages and changes, also beyond the duration."""
-    scenario = pair(**{"link": JITTER, "duration_s": 4.0, **links})
-    run = FusedRun(scenario)
+    scenario = make_pair_scenario(**{"link": JITTER, "duration_s": 4.0, **links})
+    run = run_fused(scenario, 0.0)
     for until_s in (4.0, 5.0):
         run.advance_to(until_s)
-        log = tn.simulate(pair(**{"link": JITTER, "duration_s": until_s, **links}))
+        log = tn.simulate(
+            make_pair_scenario(**{"link": JITTER, "duration_s": until_s, **links})
+        )
         roots = find_run_roots(scenario, run)
         assert roots.verdict
         assert roots == find_log_roots(log)
 
 
 def test_arms_that_hold_have_no_roots() -> None:
-    scenario = pair(
+    scenario = make_pair_scenario(
         **{
             "duration_s": 3.0,
             "links.m->s": {"model": "constant", "delay_ms": 30.0, "outages_s": [[2.0, 9.0]]},
             "sites.s.on_stale": {"action": "hold", "age_ms": 300.0},
         }
     )
-    run = FusedRun(scenario)
-    run.advance_to(3.0)
+    run = run_fused(scenario)
     roots = find_run_roots(scenario, run)
     assert roots == find_log_roots(tn.simulate(scenario))
     assert "s ends in the mode 'hold'" in roots.text
@@ -224,7 +225,9 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     assert list_effective_commands(log) == []
     assert RunEnd.of_log(log) == RunEnd.of_log(plain)
     assert find_log_roots(log) == find_log_roots(plain)
-    assert certify_run(log).decision == certify_run(plain).decision
+    commanded, planned = certify_run(log).decision, certify_run(plain).decision
+    assert commanded.stability is planned.stability
+    assert (commanded.rests_on, commanded.reasons) == (planned.rests_on, planned.reasons)
 
 
 def test_roots_follow_the_last_command() -> None:

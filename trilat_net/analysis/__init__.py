@@ -18,17 +18,17 @@ __all__ = [
     "NO_BUCKETS",
     "THROWN_RAD",
     "EndBehaviour",
-    "LoopRoots",
     "RunEnd",
     "RunTrace",
     "Stability",
     "certify_run",
+    "decision_facts",
     "find_hanging_sites",
     "judge_virtual_run",
     "reduce_to_buckets",
+    "run_remarks",
     # The certificate
     "KEPT_S",
-    "NEGATIVE_ENERGY_MEANING",
     "ZERO_ENERGY_J",
     "Certificate",
     "EnergyBalance",
@@ -132,7 +132,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from . import link_summary, site_signals
+    from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools, align_records
     from .arm_rows import (
         EndEffectorRows,
@@ -143,15 +143,12 @@ if TYPE_CHECKING:
     )
     from .body_turns import BodyTurns
     from .certificate import premise_quantities, verdict_facts
+    from .certificate.certificate_result import Certificate
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
-    from .certificate.observed_energy import (
-        NEGATIVE_ENERGY_MEANING,
-        ObservedEnergy,
-        ObservedFinding,
-    )
+    from .certificate.observed_energy import ObservedEnergy, ObservedFinding
     from .certificate.premises import find_missing_functionals, find_unjudged_spans
     from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
-    from .certificate.stability_certificate import Certificate, certify
+    from .certificate.stability_certificate import certify
     from .dominance_history import (
         find_closed_groups,
         find_program,
@@ -192,7 +189,6 @@ if TYPE_CHECKING:
         largest_magnitude,
         settling_time_of_all_s,
     )
-    from .stability_decision import LoopRoots
     from .theory.characteristic_roots import CharacteristicRoot, Complex, Spectrum
     from .theory.delay_margin import MAX_COMMON_DELAY_S
     from .theory.floquet import find_samples_in_use
@@ -244,15 +240,15 @@ else:
                 "EndEffectorRows PlacedArm build_arm_rows joint_positions_m upright_axes"
             ),
             "body_turns": "BodyTurns",
+            "certificate.certificate_result": "Certificate",
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
-            "certificate.observed_energy": (
-                "NEGATIVE_ENERGY_MEANING ObservedEnergy ObservedFinding"
-            ),
+            "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
             "certificate.premises": "find_missing_functionals find_unjudged_spans",
             "certificate.running_energy": "EnergyCourse KEPT_S RecordWindow RunningEnergy",
-            "certificate.stability_certificate": "Certificate certify",
+            "certificate.stability_certificate": "certify",
             "certificate.verdict_facts": "verdict_facts",
+            "decision_facts": "decision_facts",
             "dominance_history": (
                 "find_closed_groups find_program find_user_shares find_users "
                 "left_perron_vector list_ramps plan_dominance trace_dominance"
@@ -271,12 +267,12 @@ else:
                 "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
                 "find_hanging_sites reduce_to_buckets"
             ),
+            "run_remarks": "run_remarks",
             "run_view": "RunView",
             "site_signals": (
                 "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "
                 "site_signals"
             ),
-            "stability_decision": "LoopRoots",
             "theory.characteristic_roots": "CharacteristicRoot Complex Spectrum",
             "theory.delay_margin": "MAX_COMMON_DELAY_S",
             "theory.floquet": "find_samples_in_use",

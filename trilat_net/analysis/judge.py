@@ -21,19 +21,15 @@ from ..execution import FusedRun, simulate_columns, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .blas_threads import limit_blas_threads
+from .certificate.certificate_result import Certificate
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import find_missing_functionals
-from .certificate.stability_certificate import Certificate, certify
+from .certificate.stability_certificate import certify
+from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability
-from .run_remarks import list_remarks
-from .stability_decision import (
-    LoopRoots,
-    RunFindings,
-    StabilityDecision,
-    decide_stability,
-    is_decided_by_roots,
-)
+from .run_remarks import RunCircumstances
+from .stability_decision import decide_stability, is_decided_by_roots
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from .theory.operating_point import has_lasting_delays
 from .twins.twin_growth import TwinGrowth
@@ -105,7 +101,7 @@ def certify_run(
         law_proofs=tuple(list_law_proofs(final_scenario)),
         law_conditions=tuple(conditions),
         has_lasting_delays=has_lasting_delays(final_scenario),
-        remarks=list_remarks(log),
+        circumstances=RunCircumstances.of_log(log),
     )
 
 
@@ -161,7 +157,7 @@ def judge_virtual_run(
     findings = RunFindings(
         end=end,
         roots=find_run_roots(executed_scenario, run),
-        proofs=list_law_proofs(executed_scenario),
+        law_proofs=list_law_proofs(executed_scenario),
     )
     twins = None
     if not is_decided_by_roots(findings):
@@ -185,7 +181,7 @@ def judge_virtual_run(
             certificate_of_log,
             roots=findings.roots,
             twins=twins,
-            law_proofs=tuple(findings.proofs),
+            law_proofs=tuple(findings.law_proofs),
             has_lasting_delays=has_lasting_delays(executed_scenario),
         )
         decision = certificate.decision

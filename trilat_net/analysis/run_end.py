@@ -25,12 +25,13 @@ Invariant:
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, TorqueKind, find_reach
+from ..hooks import find_hook
 from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
@@ -129,10 +130,29 @@ class EndBehaviour(StrEnum):
         return Stability.NOT_STABLE
 
 
-LASTING_ERRORS = "at rest, with errors that stay"
-"""Phrase for arms that are slow although their errors exceed the limit of settled sites."""
 _MAY_DRIFT = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+
+
+class EndDoubt(NamedTuple):
+    """Finding at the end of a run because of which its motion alone does not show stability.
+
+    Attributes:
+        name: Name of the finding. "sites apart": coupled sites do not agree, although nothing
+            holds them apart. "arms fell": arms hang down at the end, but did not at the start.
+            "arm thrown": an arm ends far away from every start pose, although nobody pushed.
+            "loop changes": the control loop changes within the judged part. "operator acts":
+            an operator changes its action within the judged part.
+        sites: Names of the sites concerned. Of sites apart, those with the smallest and the
+            largest angle.
+        distance_rad: Distance between sites apart, or of a thrown arm from the start poses.
+        until_s: Time of the last change or action, in s.
+    """
+
+    name: Literal["sites apart", "arms fell", "arm thrown", "loop changes", "operator acts"]
+    sites: tuple[str, ...] = ()
+    distance_rad: float = 0.0
+    until_s: float = 0.0
 
 
 class RunEnd(NamedTuple):
@@ -152,7 +172,7 @@ class RunEnd(NamedTuple):
             it is not known.
         end_speed_where: Name of the joint with that |qd|. Empty if it is not known.
         where: Name of the worst joint. Empty if there are no records.
-        reasons: Sentences that say why the stability of the run remains open. Empty if it is
+        doubts: Findings because of which the stability of the run remains open. Empty if it is
             decided.
         operator_acts: True if an operator changes its action in the judged part, instead of
             only holding an arm.
@@ -175,7 +195,7 @@ class RunEnd(NamedTuple):
     end_error_rad: float
     end_speed_rad_s: float
     where: str = ""
-    reasons: tuple[str, ...] = ()
+    doubts: tuple[EndDoubt, ...] = ()
     operator_acts: bool = False
     diverged_at_s: float | None = None
     divergence: str = ""
@@ -192,13 +212,13 @@ class RunEnd(NamedTuple):
     def stability(self) -> Stability:
         """The judgement of the run by its end: stable, not stable, or open.
 
-        A run that looks stable is open if `reasons` contains a doubt. A run that does not look
-        stable is open if an operator acts, who may have caused the motion. If the motion
-        exceeded the limits of an arm, it is not stable in any case.
+        A run that looks stable is open if there are `doubts`. A run that does not look stable
+        is open if an operator acts, who may have caused the motion. If the motion exceeded the
+        limits of an arm, it is not stable in any case.
         """
         stability = self.behaviour.stability
         if stability is not Stability.NOT_STABLE:
-            return Stability.OPEN if self.reasons else stability
+            return Stability.OPEN if self.doubts else stability
         has_diverged = self.behaviour is EndBehaviour.DIVERGED
         if self.operator_acts and not has_diverged:
             return Stability.OPEN
@@ -208,58 +228,18 @@ class RunEnd(NamedTuple):
     def text(self) -> str:
         """A sentence for the user on how the motion ends, with the numbers that show it.
 
-        The sentence also has the reasons why the run cannot be called stable.
+        The sentence also has the reasons why the run cannot be called stable. The package
+        `presentation` writes it.
         """
-        return "; ".join([self._behaviour_text, *self.reasons])
+        return str(find_hook("describe a finding")(self))
 
     @property
-    def phrase(self) -> str:
-        """A phrase for the behaviour at the end, such as "converged" or "growing".
+    def reasons(self) -> tuple[str, ...]:
+        """Sentences that say why the stability of the run remains open, one for each doubt.
 
-        If the arms rest, but with synchronisation errors above the limit of settled sites, the
-        phrase says that errors stay.
+        Empty if it is decided. The package `presentation` writes the sentences.
         """
-        has_converged = self.behaviour is EndBehaviour.CONVERGED
-        if has_converged and self.end_error_rad > SETTLED_ERROR_RAD:
-            return LASTING_ERRORS
-        if self.missing_sites and self.behaviour is EndBehaviour.UNDECIDED:
-            return "undecided"  # a longer record of the other sites would not help
-        return self.behaviour.value
-
-    @property
-    def _behaviour_text(self) -> str:
-        """A sentence for the user on how the run ends, with the numbers that show it."""
-        behaviour = self.behaviour
-        if self.diverged_at_s is not None:
-            unnamed = f"a joint passed its qd_limit_rad_s at {self.diverged_at_s:.4g} s"
-            return f"diverged: {self.divergence or unnamed}"
-        if self.missing_sites:
-            return f"undecided: no record of {', '.join(self.missing_sites)}"
-
-        end_error = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
-        end_speed = f"|qd| {self.end_speed_rad_s:.3g} rad/s"
-        if self.end_error_where:
-            end_error += f" of {self.end_error_where}"
-        if self.end_speed_where:
-            end_speed += f" of {self.end_speed_where}"
-        part = "in the last second" if self.lasts_s >= 1.0 else "in the whole record"
-        end = f"largest {end_error} and {end_speed} {part}"
-        if behaviour is EndBehaviour.CONVERGED:
-            if self.end_error_rad > SETTLED_ERROR_RAD:
-                return f"{LASTING_ERRORS}: {end}"
-            return f"converged: {end}"
-
-        joint = f" at {self.where}" if self.where else ""
-        if behaviour is EndBehaviour.BOUNDED:
-            motion = "bounded motion"
-            if self.frequency_hz is not None:
-                motion = f"bounded oscillation at {self.frequency_hz:.3g} Hz"
-            return f"{motion}{joint}: {end}"
-        if behaviour is EndBehaviour.UNDECIDED:
-            trends = f"|e| {self.error.text}, |qd| {self.speed.text}"
-            return f"undecided, record longer{joint}: {trends}; {end}"
-        rates = f"|e| {self.error.rate_text}, |qd| {self.speed.rate_text}"
-        return f"{behaviour.value}{joint} ({rates}): {end}"
+        return tuple(find_hook("list the sentences of a finding")(self))
 
     @classmethod
     def of_log(cls, log: Log) -> "RunEnd":
@@ -359,16 +339,14 @@ class RunTrace(NamedTuple):
                 behaviour=EndBehaviour.DIVERGED, diverged_at_s=self.diverged_at_s
             )
         if end.behaviour.stability is Stability.SETTLED:
-            reasons = list(_find_disagreement(scenario, self, t_s, columns))
-            reasons += _find_odd_pose(scenario, sites)
+            doubts = list(_find_disagreement(scenario, self, t_s, columns))
+            doubts += _find_odd_pose(scenario, sites)
             if is_disturbed and not operator_acts:
-                reasons.append(
-                    f"the loop changes until {changed_s:.4g} s, within the judged part"
-                )
-            return end._replace(reasons=tuple(reasons))
+                doubts.append(EndDoubt("loop changes", until_s=changed_s))
+            return end._replace(doubts=tuple(doubts))
         if operator_acts:
-            reason = f"an operator acts until {acted_s:.4g} s, within the judged part"
-            return end._replace(operator_acts=True, reasons=(reason,))
+            doubt = EndDoubt("operator acts", until_s=acted_s)
+            return end._replace(operator_acts=True, doubts=(doubt,))
         return end
 
 
@@ -871,8 +849,8 @@ def _find_disagreement(
     trace: RunTrace,
     t_s: Array,
     columns: Sequence[Array],
-) -> Iterable[str]:
-    """Yields a sentence for each group of coupled sites that do not agree at the end.
+) -> Iterable[EndDoubt]:
+    """Yields a doubt for each group of coupled sites that do not agree at the end.
 
     Sites agree if the angles of their joints are nearly equal. Sites that are still approaching
     each other, or that an operator or environment holds apart, are not reported.
@@ -885,7 +863,15 @@ def _find_disagreement(
     """
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        if len(group) < 2 or _compares_sites_by_error(scenario, names):
+        # The tracking error |e| shows whether two arms agree if the law compares positions, or
+        # if the arms follow end effectors. Otherwise the joint angles must be compared.
+        shown_by_error = [
+            name
+            for name in names
+            if scenario.sites[name].control.compares_positions
+            or scenario.arms[name].shares_pose
+        ]
+        if len(group) < 2 or shown_by_error:
             continue
         q = np.array([columns[n][:, 2] for n in group])
         spread = np.ptp(q, axis=0)
@@ -909,23 +895,7 @@ def _find_disagreement(
         if end_spread > AGREEMENT_RAD and not (is_approaching or is_held):
             lowest = names[int(np.argmin(end_q))]
             highest = names[int(np.argmax(end_q))]
-            yield (
-                f"{lowest} and {highest} stand {end_spread:.3g} rad apart, "
-                "and nothing holds them there"
-            )
-
-
-def _compares_sites_by_error(scenario: Scenario, sites: Iterable[str]) -> bool:
-    """Returns True if the tracking error |e| alone shows whether two arms agree.
-
-    This holds for control laws that compare positions, and for arms that follow end effectors.
-    For other arms the joint angles must be compared.
-    """
-    for site in sites:
-        compares_positions = scenario.sites[site].control.compares_positions
-        if compares_positions or scenario.arms[site].shares_pose:
-            return True
-    return False
+            yield EndDoubt("sites apart", (lowest, highest), distance_rad=float(end_spread))
 
 
 def _find_held_sites(
@@ -965,8 +935,8 @@ def _find_held_sites(
     return held
 
 
-def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
-    """Yields a sentence if arms end in a pose that no good controller should cause.
+def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDoubt]:
+    """Yields a doubt if arms end in a pose that no good controller should cause.
 
     Such arms hang down, or are far from every start pose although nobody pushed.
 
@@ -979,8 +949,7 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     end_by_site = dict(zip(scenario.names, ends, strict=True))
     hanging = find_hanging_sites(scenario, end_by_site)
     if hanging:
-        verb = "hangs" if len(hanging) == 1 else "hang"
-        yield f"{', '.join(hanging)} {verb}: the arms fell"
+        yield EndDoubt("arms fell", tuple(hanging))
         return
 
     # largest distance of a joint of each site from the start poses of all arms of its size
@@ -993,10 +962,8 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     worst = int(np.argmax(distances))
     has_operator = any(spec.hands for spec in scenario.sites.values())
     if distances[worst] > THROWN_RAD and not (scenario.external or has_operator):
-        yield (
-            f"{scenario.names[worst]} ends {distances[worst]:.3g} rad away from every start "
-            "pose, and nobody pushed"
-        )
+        thrown = scenario.names[worst]
+        yield EndDoubt("arm thrown", (thrown,), distance_rad=distances[worst])
 
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:

@@ -22,30 +22,24 @@ Invariant:
       known period over which the loop was analysed.
     - Exact roots in the left half-plane exclude the word "not stable", except for a run that
       left its limits. Numerical roots exclude it if the end of the run may be their slow decay.
-    - A decision states what it rests on.
+    - A decision names what it rests on.
     - Twins never change a decision that `is_decided_by_roots` announces, so that a command may
       save them.
 """
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
 
-from ..errors import count_nouns
-from .run_end import EndBehaviour, RunEnd, Stability
+from .decision_facts import Basis, Obstacle, RunFindings, StabilityDecision
+from .run_end import EndBehaviour, Stability
 from .site_signals import SETTLED_ERROR_RAD
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeTrend
-from .twins.twin_growth import DOUBLES, TwinGrowth
+from .twins.twin_growth import DOUBLES
 
 NEAR_REST_RAD = 0.02
 """Largest distance of a run from a rest whose unstable roots refute the run, in rad.
 
 A run that is further away may come to rest in another pose, whose roots may be stable.
 """
-RATE_AGREEMENT_SHARE = 0.25
-"""Largest difference between the rates of a push and of the slowest root, as a share."""
-RATE_AGREEMENT_PER_S = 2e-4
-"""Difference of these rates that always confirms the root, in 1/s."""
 LEAST_BURSTS = 100.0
 """Number of bursts of lost samples from which on their mean effect decides how a run ends."""
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
@@ -56,160 +50,6 @@ so small that its value means little.
 _UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 
 
-class LoopRoots(NamedTuple):
-    """Growth rates (roots) of small motions about the pose at which a run ended.
-
-    They are characteristic roots of the linearised control loop. If the real parts of all of
-    them are negative, small motions die away. `theory.loop_roots` computes them for every
-    command.
-
-    Attributes:
-        verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
-            cannot be linearised.
-        rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
-            of the structure of the loop. None if there is no such root.
-        exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
-            the roots may cast doubt on a run, but prove nothing.
-        text: The pose and its roots, or the reason why there are no roots.
-        distance_rad: Largest difference between the last angle of a joint and its angle at the
-            pose at rest to which the roots belong, in rad.
-        leaves_out: What the linearised loop leaves out, as a phrase, for example "how the
-            program at m2 reacts to the arms". Empty if it contains everything.
-        is_numerical: True if the code of a user's law was differentiated numerically. Such
-            roots can refute a run, but not prove it stable.
-        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. None
-            if no computed root oscillates.
-    """
-
-    verdict: str
-    rate_per_s: float | None
-    exact: bool
-    text: str
-    distance_rad: float = 0.0
-    leaves_out: str = ""
-    is_numerical: bool = False
-    swing_rate_per_s: float | None = None
-
-    @property
-    def is_proof(self) -> bool:
-        """True if the roots (growth rates) prove that small motions about the final pose decay.
-
-        Only exact roots prove it: those of a loop with its ticks and its repeating delays.
-        """
-        return self.exact and self.verdict == "stable"
-
-    def describe_as_basis(self) -> str:
-        """Returns the phrase that a decision shows after "rests on:" if these roots decide.
-
-        For example "exact roots, slowest -0.832 /s": the mode that decays most slowly has the
-        rate of -0.832 per second. If the roots refute stability, the fastest growing mode is
-        named instead. Without a root that is not zero, the phrase has no rate.
-        """
-        name = "roots by numerical derivatives" if self.is_numerical else "exact roots"
-        if self.rate_per_s is None:
-            return name
-        decisive = "fastest growing" if self.is_refutation else "slowest"
-        return f"{name}, {decisive} {self.rate_per_s:+.3g} /s"
-
-    @property
-    def is_refutation(self) -> bool:
-        """True if the roots (growth rates) prove that small motions about the final pose grow.
-
-        Only exact roots prove it: those of a loop with its ticks and its repeating delays.
-        """
-        return self.exact and self.verdict == "unstable"
-
-    def measure_decay_misfit(self, end: RunEnd) -> float:
-        """Measures how badly the slow decay of these roots explains an end that looks lasting.
-
-        An oscillation is compared with the roots that oscillate, because another slow root does
-        not explain the oscillation, and a drift with the slowest root. The decay is compatible
-        if the root halves the motion at most once in the judged part, so that no trend can show
-        the decay, or if |e| and |qd| have the rate of the root.
-
-        Args:
-            end: How the motion ends.
-
-        Returns:
-            A share without unit: at most 1 if the end may be the decay, infinity if the roots
-            are not numerical or not stable, or if the motion grows or is not lasting.
-        """
-        is_swing = end.behaviour is EndBehaviour.BOUNDED
-        is_lasting = is_swing or end.behaviour is EndBehaviour.DRIFTS
-        rate_per_s = self.swing_rate_per_s if is_swing else self.rate_per_s
-        is_stable = self.is_numerical and self.verdict == "stable"
-        if rate_per_s is None or not is_stable or not is_lasting:
-            return math.inf
-
-        misfits = []
-        for fit in (end.error, end.speed):
-            if fit.trend is EnvelopeTrend.GROWS:
-                return math.inf
-            misfits.append(_measure_rate_misfit(fit.rate_per_s, rate_per_s))
-
-        judged_s = 0.5 * (end.lasts_s - end.counts_from_s)
-        halvings = -rate_per_s * judged_s / math.log(DOUBLES)
-        return min(halvings, max(misfits))
-
-
-class StabilityDecision(NamedTuple):
-    """Decision whether a run of coupled arms is stable, with the evidence for it.
-
-    Attributes:
-        stability: The decision.
-        rests_on: What the decision rests on, as a phrase for the user.
-        reasons: Sentences that prevent a better decision. Empty if the run is stable.
-        is_too_short: True if only the length of the record prevents a better decision.
-    """
-
-    stability: Stability
-    rests_on: str
-    reasons: tuple[str, ...] = ()
-    is_too_short: bool = False
-
-
-class RunFindings(NamedTuple):
-    """All evidence on the stability of a run, from which `decide_stability` decides.
-
-    Attributes:
-        end: How the motion ends.
-        twins: How small pushes in repeated runs develop. None if no run was repeated.
-        roots: Roots of the loop at the end of the run. None if they were not computed.
-        proofs: Phrases that name further proofs for this loop, such as the stability theorem.
-        doubts: Sentences on findings that contradict a stable run, such as an energy function
-            that rises, or missing records.
-        rises: True if the energy function V of the stability proof rose by energy that nobody
-            supplied.
-    """
-
-    end: RunEnd
-    twins: TwinGrowth | None = None
-    roots: LoopRoots | None = None
-    proofs: Sequence[str] = ()
-    doubts: Sequence[str] = ()
-    rises: bool = False
-
-    @property
-    def all_proofs(self) -> list[str]:
-        """Phrases that name every proof that the control loop is stable, exact roots last.
-
-        Empty if there is no proof. The texts appear after "rests on:".
-        """
-        proofs = list(self.proofs)
-        if self.has_stable_roots:
-            assert self.roots is not None
-            proofs.append(self.roots.describe_as_basis())
-        return proofs
-
-    @property
-    def has_stable_roots(self) -> bool:
-        """True if the exact roots (growth rates) of the loop prove that small motions die away.
-
-        Roots that are not exact never count as a proof.
-        """
-        return self.roots is not None and self.roots.is_proof
-
-
 def decide_stability(run: RunFindings) -> StabilityDecision:
     """Decides from all evidence whether a run is stable, settled, not stable, or open.
 
@@ -218,36 +58,33 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
     Args:
         run: Everything that is known about the run.
     """
-    reasons = _list_reasons(run)
-    decision = _decide_by_roots(run, reasons)
+    obstacles = _list_obstacles(run)
+    decision = _decide_by_roots(run, obstacles)
     if decision is not None:
         return decision
 
-    run_end = run.end
+    end = run.end
     refutation = _find_refutation(run)
-    if refutation:
-        stability = Stability.OPEN if run_end.operator_acts else Stability.NOT_STABLE
-        return StabilityDecision(stability, refutation, reasons)
+    if refutation is not None:
+        stability = Stability.OPEN if end.operator_acts else Stability.NOT_STABLE
+        return StabilityDecision(stability, run, refutation, obstacles)
 
-    proofs = run.all_proofs
-    if proofs and not reasons and _agrees_with_proof(run):
-        return StabilityDecision(Stability.STABLE, "; ".join(proofs))
-    looks_unstable = run_end.stability is Stability.NOT_STABLE
-    if looks_unstable and not run.has_stable_roots and not _is_end_excused(run):
-        # The frequency of an oscillation is known only if all records are.
-        end_text = run_end._replace(frequency_hz=None).text
-        return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end_text}")
-    if not reasons and _has_settled(run):
-        return StabilityDecision(Stability.SETTLED, _describe_pushes(run))
-    if reasons:
-        return StabilityDecision(Stability.OPEN, "", reasons)
+    if run.has_proof and not obstacles and _agrees_with_proof(run):
+        return StabilityDecision(Stability.STABLE, run, "proofs")
+    looks_unstable = end.stability is Stability.NOT_STABLE
+    if looks_unstable and run.proven_by_roots != "stable" and not _is_end_excused(run):
+        return StabilityDecision(Stability.NOT_STABLE, run, "end")
+    if not obstacles and _has_settled(run):
+        return StabilityDecision(Stability.SETTLED, run, "dying pushes")
+    if obstacles:
+        return StabilityDecision(Stability.OPEN, run, obstacles=obstacles)
     needed_s = _estimate_needed_s(run)
-    if run.all_proofs and needed_s is not None and needed_s > run_end.lasts_s:
-        reason = "the run is too short to tell; try one of twice its length"
-        if needed_s <= _LONGEST_ADVISED_S:
-            reason = f"the run is too short to tell; a run of {needed_s:.3g} s would"
-        return StabilityDecision(Stability.OPEN, "", (reason,), is_too_short=True)
-    return StabilityDecision(Stability.OPEN, "", (_explain_open(run),))
+    if run.has_proof and needed_s is not None and needed_s > end.lasts_s:
+        advised_s = needed_s if needed_s <= _LONGEST_ADVISED_S else None
+        return StabilityDecision(
+            Stability.OPEN, run, obstacles=("short record",), advised_s=advised_s
+        )
+    return StabilityDecision(Stability.OPEN, run, obstacles=(_explain_open(run),))
 
 
 def is_decided_by_roots(run: RunFindings) -> bool:
@@ -258,24 +95,28 @@ def is_decided_by_roots(run: RunFindings) -> bool:
     Args:
         run: What is known about the run without twins.
     """
-    return _decide_by_roots(run, _list_reasons(run)) is not None
+    return _decide_by_roots(run, _list_obstacles(run)) is not None
 
 
-def _list_reasons(run: RunFindings) -> tuple[str, ...]:
-    """Lists the sentences that prevent the judgements "stable" and "settled", in order.
+def _list_obstacles(run: RunFindings) -> tuple[Obstacle, ...]:
+    """Lists the findings that prevent the judgements "stable" and "settled", in order.
 
-    They come from the end of the run, from missing records, from the runs with small pushes,
-    from doubts about the analyses, and from roots that show growth.
+    They are the end of the run, missing records, runs with small pushes, doubts of other
+    analyses, and roots that show growth.
 
     Args:
         run: What the analyses found about the run.
     """
-    reasons = [*run.end.reasons]
-    reasons += [f"no record of {site}" for site in run.end.missing_sites]
+    obstacles: list[Obstacle] = []
+    if run.end.doubts:
+        obstacles.append("end")
+    if run.end.missing_sites:
+        obstacles.append("missing records")
     twins = run.twins
-    if twins is not None and twins.hides_period and not run.all_proofs:
-        reasons.append(twins.period_text)
-    reasons += run.doubts
+    if twins is not None and twins.hides_period and not run.has_proof:
+        obstacles.append("hidden period")
+    if run.doubts:
+        obstacles.append("doubts")
     roots = run.roots
     if roots is not None and roots.verdict == "unstable":
         # Twins repeat the recorded ticks. Roots that are not exact do not count if the twins
@@ -283,11 +124,13 @@ def _list_reasons(run: RunFindings) -> tuple[str, ...]:
         excluded_per_s = math.inf if twins is None else twins.excluded_rate_per_s
         is_excluded = roots.rate_per_s is not None and roots.rate_per_s > excluded_per_s
         if roots.exact or not is_excluded:
-            reasons.append(roots.text)
-    return tuple(reasons)
+            obstacles.append("growing roots")
+    return tuple(obstacles)
 
 
-def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDecision | None:
+def _decide_by_roots(
+    run: RunFindings, obstacles: tuple[Obstacle, ...]
+) -> StabilityDecision | None:
     """Decides whether a run is stable from its end and its exact roots alone.
 
     The roots are growth rates of small motions, computed from the linearised control loop. If
@@ -295,36 +138,35 @@ def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDec
 
     Args:
         run: Everything that is known about the run.
-        reasons: Sentences that prevent a stable run.
+        obstacles: Names of the findings that prevent a stable run.
 
     Returns:
         The decision. None if twins may change it.
     """
     end = run.end
     if end.behaviour is EndBehaviour.DIVERGED:
-        return StabilityDecision(Stability.NOT_STABLE, end.text, (end.text,))
-    roots = run.roots
-    if roots is None or not roots.exact:
+        return StabilityDecision(Stability.NOT_STABLE, run, "divergence", ("divergence",))
+    if run.roots is None:
         return None
 
-    is_near_rest = roots.distance_rad <= NEAR_REST_RAD
+    is_near_rest = run.roots.distance_rad <= NEAR_REST_RAD
     looks_unstable = end.stability is Stability.NOT_STABLE
-    if roots.is_refutation and (is_near_rest or looks_unstable):
+    if run.proven_by_roots == "unstable" and (is_near_rest or looks_unstable):
         stability = Stability.OPEN if end.operator_acts else Stability.NOT_STABLE
-        return StabilityDecision(stability, roots.describe_as_basis(), reasons)
-    if not roots.is_proof:
+        return StabilityDecision(stability, run, "roots", obstacles)
+    if run.proven_by_roots != "stable":
         return None
-    if reasons:
-        return StabilityDecision(Stability.OPEN, "", reasons)
+    if obstacles:
+        return StabilityDecision(Stability.OPEN, run, obstacles=obstacles)
     # Pushes of a run that rests where its loop is stable die away in the end, even if they
     # still grow in the transient before the rest.
     if is_near_rest and end.behaviour is EndBehaviour.CONVERGED:
-        return StabilityDecision(Stability.STABLE, "; ".join(run.all_proofs))
+        return StabilityDecision(Stability.STABLE, run, "proofs")
     return None
 
 
-def _find_refutation(run: RunFindings) -> str:
-    """Returns the evidence that small motions grow. Empty if there is none.
+def _find_refutation(run: RunFindings) -> Basis | None:
+    """Returns the evidence that small motions grow. None if there is none.
 
     Unstable exact roots of a distant rest are evidence if the run is shorter than the period of
     its delays, because such a run cannot show by itself where it ends. The growth of pushes is
@@ -334,15 +176,15 @@ def _find_refutation(run: RunFindings) -> str:
     end = run.end
     twins = run.twins
     if twins is None:
-        return ""
-    if run.roots is not None and run.roots.is_refutation and twins.hides_period:
-        return run.roots.describe_as_basis()
-    if not twins.pushes or run.has_stable_roots:
-        return ""
+        return None
+    if run.proven_by_roots == "unstable" and twins.hides_period:
+        return "roots"
+    if not twins.pushes or run.proven_by_roots == "stable":
+        return None
     is_slowing = end.speed.trend in _FALLING and end.end_speed_rad_s > FLOOR_RAD
     departs = twins.departure is not None and end.behaviour is not EndBehaviour.COASTS
     grows = twins.grows and not is_slowing and not twins.hides_period
-    return twins.text if grows or departs else ""
+    return "growing pushes" if grows or departs else None
 
 
 def _agrees_with_proof(run: RunFindings) -> bool:
@@ -370,19 +212,10 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
     small motions. A push that shows no clear trend then agrees with the roots: it merely decays
     slowly.
     """
-    roots = run.roots
     worst = None if run.twins is None else run.twins.worst
-    if worst is None or roots is None or not roots.is_proof or roots.rate_per_s is None:
+    if worst is None or run.roots is None or run.proven_by_roots != "stable":
         return False
-    if not worst.rate_per_s < 0.0:
-        return False
-    return _measure_rate_misfit(worst.rate_per_s, roots.rate_per_s) <= 1.0
-
-
-def _measure_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
-    """Returns the difference of a measured rate and a root, divided by its tolerance."""
-    tolerance_per_s = RATE_AGREEMENT_SHARE * abs(root_per_s) + RATE_AGREEMENT_PER_S
-    return abs(measured_per_s - root_per_s) / tolerance_per_s
+    return worst.rate_per_s < 0.0 and run.roots.measure_rate_misfit(worst.rate_per_s) <= 1.0
 
 
 def _is_end_excused(run: RunFindings) -> bool:
@@ -432,57 +265,28 @@ def _has_settled(run: RunFindings) -> bool:
     return end.behaviour in _UNTREND_ENDS and travel_rad <= SETTLED_ERROR_RAD
 
 
-def _describe_pushes(run: RunFindings) -> str:
-    """Returns the basis of a settled run: the number of pushes, and why nothing proves more.
+def _explain_open(run: RunFindings) -> Obstacle:
+    """Returns why the stability of a run stays open although nothing contradicts it.
 
-    For example "8 pushes over 12 s, all of which died away; its roots are not exact".
-    """
-    assert run.twins is not None
-    pushes = len({growth.push.name for growth in run.twins.pushes})
-    duration_s = run.twins.to_s
-    ending = "all of which died away" if pushes > 1 else "which died away"
-    text = f"{count_nouns(pushes, 'push', 'pushes')} over {duration_s:.4g} s, {ending}"
-    roots = run.roots
-    if roots is None:
-        return text
-    if not roots.verdict:
-        return f"{text}; {roots.text}"
-    if roots.leaves_out:
-        return f"{text}; pushes and roots leave out {roots.leaves_out}"
-    if not roots.exact:
-        return f"{text}; its roots are not exact"
-    return text
-
-
-def _explain_open(run: RunFindings) -> str:
-    """Returns the reason why the stability of a run stays open although nothing contradicts it.
-
-    Several reasons may apply. The first that applies is stated, from proofs that disagree with
+    Several names may apply. The first that applies is returned, from proofs that disagree with
     the run to an end of the run that does not settle the question.
 
     Args:
         run: What the analyses found about the run.
     """
-    if run.all_proofs:
-        return "the end of the run does not agree with its proof"
+    if run.has_proof:
+        return "disputed proof"
     if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
-        lasting = "drift" if run.end.behaviour is EndBehaviour.DRIFTS else "oscillation"
-        return (
-            f"too slow to be told from a lasting {lasting} in the judged part; its numerical "
-            f"roots decay at {run.roots.rate_per_s:.3g} /s"
-        )
-
+        return "slow decay"
     if run.twins is None:
-        return "no proof exists, and no run with small pushes was made"
+        return "missing pushes"
     if not run.twins.pushes:
-        return f"no proof exists, and no pushes were judged: {run.twins.why}"
-
+        return "unjudged pushes"
     if run.end.stability is Stability.SETTLED:
-        return run.twins.text
+        return "unclear pushes"
     if run.twins.judged_bursts < LEAST_BURSTS:
-        bursts = f"{run.twins.judged_bursts:.2g} bursts of lost samples"
-        return f"{run.end.text}; the judged part has {bursts}, too few for an average"
-    return run.end.text
+        return "few bursts"
+    return "unclear end"
 
 
 def _estimate_needed_s(run: RunFindings) -> float | None:

@@ -19,23 +19,23 @@ from typing import NamedTuple
 import numpy as np
 
 from ..analysis import (
-    NEGATIVE_ENERGY_MEANING,
     SETTLED_ERROR_RAD,
     ZERO_ENERGY_J,
     Certificate,
     EndBehaviour,
     EnergyBalance,
     EnvelopeTrend,
-    LoopRoots,
     ObservedFinding,
     PushedTwins,
     Stability,
     TwinGrowth,
+    decision_facts,
     premise_quantities,
     verdict_facts,
 )
 from ..core import Array
 from ..errors import count_nouns
+from .end_text import name_behaviour
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
@@ -83,9 +83,10 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         yield _tabulate_premises(premises)
 
     if observed is not None and observed.least:
-        rows = []
-        for name, amount_j, at_s in observed.least:
-            rows.append((name, f"{amount_j:.4g}", f"{at_s:.4g}"))
+        rows = [
+            (least.name, f"{least.amount_j:.4g}", f"{least.at_s:.4g}")
+            for least in observed.least
+        ]
         headers = ("energy of the laws", "least J", "at s")
         yield ""
         yield TextTable(headers, rows, align="lrr")
@@ -184,7 +185,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     if observed is not None:
         lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
         if observed.finding is ObservedFinding.NEGATIVE:
-            lines.append(CertificateLine("note", NEGATIVE_ENERGY_MEANING))
+            lines.append(CertificateLine("note", observed.finding.meaning))
 
     roots = certificate.roots
     if roots is not None:
@@ -333,7 +334,9 @@ def describe_theorem(certificate: Certificate) -> list[str]:
     return [f"stability theorem of the paper (V: its energy function): {text}"]
 
 
-def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[CertificateLine]:
+def _compare_rates(
+    roots: decision_facts.LoopRoots | None, twins: TwinGrowth
+) -> list[CertificateLine]:
     """Returns a remark why two measured rates of decay differ, if their printed numbers do.
 
     A certificate states the rate of the characteristic roots, and the rate at which small
@@ -431,12 +434,13 @@ def _describe_end(certificate: Certificate) -> str:
     """
     end = certificate.end
     if certificate.stability is not Stability.SETTLED:
-        return end.phrase
+        return name_behaviour(end)
     if end.behaviour is EndBehaviour.DECAYS:
         error = f"|e| {end.end_error_rad:.2g} {end.error_unit}"
-        return f"{end.phrase}, with {error} and |qd| {end.end_speed_rad_s:.2g} rad/s at the end"
+        speed = f"|qd| {end.end_speed_rad_s:.2g} rad/s"
+        return f"{name_behaviour(end)}, with {error} and {speed} at the end"
     if end.stability is Stability.SETTLED:
-        return end.phrase
+        return name_behaviour(end)
 
     # The speed of the arms, times the length of the judged part, is below this limit.
     return (
@@ -459,8 +463,7 @@ def describe_judgement(certificate: Certificate) -> str:
 
     reasons = []
     roots = certificate.roots
-    rests_on = certificate.decision.rests_on
-    is_based_on_roots = roots is not None and rests_on == roots.describe_as_basis()
+    is_based_on_roots = certificate.decision.rests_on_roots_alone
     for reason in certificate.reasons:
         if is_based_on_roots and roots is not None and reason == roots.text:
             continue  # the headline names these roots already

@@ -102,7 +102,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
 
-    if certificate.stability is Stability.STABLE and _is_proved_by_roots_alone(certificate):
+    if certificate.stability is Stability.STABLE and certificate.decision.rests_on_roots_alone:
         decay_rate = describe_pace(certificate)
         if decay_rate:
             sentences.append(f"{_start_sentence(decay_rate)}.")
@@ -136,12 +136,6 @@ def _start_sentence(text: str) -> str:
     first_word = text.split(" ", 1)[0]
     is_name = any(letter.isdigit() for letter in first_word) or len(first_word) == 1
     return text if is_name and first_word != "a" else f"{text[:1].upper()}{text[1:]}"
-
-
-def _is_proved_by_roots_alone(certificate: Certificate) -> bool:
-    """Returns True if neither the theorem nor a condition of the law is among the proofs."""
-    roots = certificate.roots
-    return roots is not None and certificate.decision.rests_on == roots.describe_as_basis()
 
 
 def describe_basis(certificate: Certificate) -> str:

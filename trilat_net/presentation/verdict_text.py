@@ -4,13 +4,13 @@
 writes that V rose by 0.2 J at 3.1 s, or which condition of the theorem failed.
 
 Invariant:
-    - Each class of `VerdictFacts` has one function here, in `DESCRIBERS`.
+    - Each class of `VerdictFacts` has one function here, in `FACT_DESCRIBERS`.
     - A sentence that names a condition (premise) that fails says in plain words what the
       condition requires.
     - The theorem is named with its own premises of continuous time, which no log can show.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from ..analysis import verdict_facts as facts
@@ -60,15 +60,12 @@ def name_theorem() -> str:
     return THEOREM
 
 
-def describe_verdict(verdict: facts.StabilityVerdict) -> str:
+def _describe_verdict(verdict: facts.StabilityVerdict) -> str:
     """Returns a sentence on whether the energy function V of a run rose.
 
     V is the energy of the stability proof, which must not rise.
-
-    Args:
-        verdict: The finding with its facts.
     """
-    sentence = DESCRIBERS[type(verdict.facts)](verdict.facts)
+    sentence = FACT_DESCRIBERS[type(verdict.facts)](verdict.facts)
     return f"{_PREFIXES.get(verdict.finding, '')}{sentence}"
 
 
@@ -151,7 +148,7 @@ def _describe_rise(rise: facts.FunctionalRise, largest_j: float) -> str:
     return text + (f"; given by {causes}" if causes else "; nobody gave it")
 
 
-DESCRIBERS: dict[type, Callable[[Any], str]] = {
+FACT_DESCRIBERS: dict[type, Callable[[Any], str]] = {
     facts.NoFunctional: _describe_no_functional,
     facts.RecordGap: _describe_gap,
     facts.UnclosedBalance: _describe_unclosed_balance,
@@ -163,14 +160,11 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
 """For each class of facts, the function that writes its sentence."""
 
 
-def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
+def _describe_growth(growth: facts.UnsuppliedGrowth) -> str:
     """Returns a sentence on a growth of the energy V that no operator or wall explains.
 
     V is the energy of the stability proof. Such a growth is doubtful, even if the run looks
     stable.
-
-    Args:
-        growth: The growth at the end of the run.
     """
     energy = f"{growth.energy_j:.3g} J"
     if growth.from_s is None:
@@ -180,37 +174,36 @@ def describe_growth(growth: facts.UnsuppliedGrowth) -> str:
     )
 
 
-def describe_evidence(evidence: facts.Evidence) -> str:
-    """Returns a sentence on how many records a run has, and whether its log is unchanged.
-
-    Args:
-        evidence: The records on which a certificate is based.
-    """
+def _describe_evidence(evidence: facts.Evidence) -> str:
+    """Returns a sentence on how many records a run has, and whether its log is unchanged."""
     return f"{evidence.coverage.describe(evidence.min_coverage)}; {evidence.integrity.text}"
 
 
-def doubt_evidence(evidence: facts.Evidence) -> list[str]:
-    """Returns sentences that say why records do not suffice to judge the stability of a run.
+def _list_lacks(evidence: facts.Evidence) -> list[str]:
+    """Returns sentences that say why records do not suffice to judge the stability of a run."""
+    return [_describe_lack(doubt) for doubt in evidence.doubts]
 
-    For example, the log has been changed, or too many records are missing.
 
-    Args:
-        evidence: The records on which a certificate is based.
+def _describe_lack(doubt: facts.EvidenceDoubt) -> str:
+    """Returns a sentence that says why records do not suffice to judge a run."""
+    evidence = doubt.evidence
+    if doubt.name == "changed log":
+        return f"the log is not as it was made: {evidence.integrity.text}"
+    if doubt.name == "missing records":
+        coverage = evidence.coverage.describe(evidence.min_coverage)
+        return f"records are missing: {coverage}"
+    if doubt.name == "missing periods":
+        judged_share = evidence.functional_share or 0.0
+        return f"V is judged over {100.0 * judged_share:.4g} % of its periods"
+    return f"{' and '.join(evidence.unmet)}, as recorded, did not react to this run"
 
-    Returns:
-        The sentences. Empty if the records suffice.
-    """
-    required_share = evidence.min_coverage
-    reasons = []
-    if not evidence.integrity.passed:
-        reasons.append(f"the log is not as it was made: {evidence.integrity.text}")
-    if evidence.coverage.share < required_share:
-        reasons.append(f"records are missing: {evidence.coverage.describe(required_share)}")
 
-    judged_share = evidence.functional_share
-    if judged_share is not None and judged_share < required_share:
-        reasons.append(f"V is judged over {100.0 * judged_share:.4g} % of its periods")
-    if evidence.unmet:
-        sites = " and ".join(evidence.unmet)
-        reasons.append(f"{sites}, as recorded, did not react to this run")
-    return reasons
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    facts.StabilityVerdict: _describe_verdict,
+    facts.UnsuppliedGrowth: _describe_growth,
+    facts.Evidence: _describe_evidence,
+    facts.EvidenceDoubt: _describe_lack,
+}
+"""The functions that describe the findings of this module, by the class of the finding."""
+SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {facts.Evidence: _list_lacks}
+"""The functions that list the sentences of a finding, by its class."""

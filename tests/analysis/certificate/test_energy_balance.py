@@ -26,12 +26,13 @@ from tests.scenario.builders import planar_task_text, six_joint_text
 from tests.theory.delay_equations import DelayEquations, inertia, make_equations
 from tests.theory.energy import compute_balance as balance_by_hand
 from tests.theory.energy import left_null_vector
+from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from trilat_net.presentation.premise_text import explain_no_functional

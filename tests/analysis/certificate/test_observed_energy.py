@@ -16,11 +16,7 @@ from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, make_energy_pair
 from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from tests.scenario.builders import make_scenario
 from tests.unit_arm import make_spring_hand, make_unit_scenario
-from trilat_net.analysis.certificate.observed_energy import (
-    NEGATIVE_ENERGY_MEANING,
-    ObservedEnergy,
-    ObservedFinding,
-)
+from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, ObservedFinding
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_end import Stability
 from trilat_net.errors import LogError
@@ -29,6 +25,7 @@ from trilat_net.files import find_page
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.figures.registry import figure
+from trilat_net.presentation.observed_text import NEGATIVE_ENERGY_MEANING
 from trilat_net.scenario import load_scenario
 
 B = 10.0

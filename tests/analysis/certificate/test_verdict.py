@@ -23,17 +23,13 @@ from tests.log.builders import (
 )
 from tests.log.surgery import take_apart
 from tests.scenario.builders import make_overrides
-from trilat_net.analysis.certificate.stability_certificate import (
-    Certificate,
-    certify,
-    find_unsupplied_growth,
-)
+from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, Stability
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
-from trilat_net.presentation.verdict_text import describe_growth
 from trilat_net.scenario import parse_scenario
 
 SHORT = {"duration_s": 4.0, "rate_hz": 200}
@@ -256,7 +252,7 @@ def test_a_broken_balance_is_never_accepted() -> None:
 
 
 def test_an_unstable_rest_never_passes_a_run() -> None:
-    roots = LoopRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
+    roots = LoopRoots("unstable", 0.012, True)
     refuted = replace(certify_rest(), roots=roots)
     assert refuted.stability is Stability.NOT_STABLE
     assert refuted.headline().endswith("rests on: exact roots, fastest growing +0.012 /s")
@@ -269,14 +265,13 @@ def test_an_unstable_rest_never_passes_a_run() -> None:
 def test_v_that_rises_at_the_end_is_named() -> None:
     balance = certify_rest().balance
     assert balance is not None
-    t_s = balance.t_s
-    V = balance.unsupplied
+    t_s, V = balance.t_s, balance.unsupplied
 
     def growth(added: np.ndarray) -> list[str]:
         changed = replace(
             balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
         )
-        return [describe_growth(growth) for growth in find_unsupplied_growth(changed, 1e-3)]
+        return [growth.text for growth in changed.find_unsupplied_growth(1e-3)]
 
     assert growth(np.zeros(len(V))) == []
     assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []

@@ -43,6 +43,7 @@ from ..row_reductions import any_in_rows, sum_rows
 from ..torque_sources import TorqueSplit
 from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion
+from .verdict_facts import FunctionalRise, UnsuppliedGrowth
 
 MIN_PERIODS = 10
 """Least number of judged periods from which the error of the trapezoid rule is estimated."""
@@ -50,6 +51,8 @@ ZERO_ENERGY_J = 1e-12
 """Rounding error of an energy that is zero, in J."""
 EXTERNAL_SOURCES = ("hands", "walls", "stops")
 """Sources of work outside the loop: operators, environments, and the stops of joints."""
+_NOTABLE_CAUSE_SHARE = 0.05
+"""Least share of a rise of V that a source must supply to be named as a cause."""
 _EnergyKey = tuple[str, str]
 """Kind and name of an energy, such as ("dissipation", "damping")."""
 
@@ -472,6 +475,82 @@ class EnergyBalance:
     def _accumulate_judged(self, values: Array) -> Array:
         """Returns the sum of a quantity's changes over the judged periods, shape (T,)."""
         return _accumulate(np.diff(values), self.judged)
+
+    def find_largest_rise(self, tolerance: float) -> FunctionalRise | None:
+        """Finds the largest rise of the energy function V above an earlier minimum.
+
+        The work of operators and environments is subtracted before, because V may rise by it.
+        The sources of the remaining energy are also found.
+
+        Args:
+            tolerance: Size that the rise must exceed, in J.
+
+        Returns:
+            The rise. None if it does not exceed the tolerance.
+        """
+        V = self.unsupplied
+        rise = rise_above_minimum(V)
+        peak_row = int(rise.argmax())
+        if rise[peak_row] <= tolerance:
+            return None
+        start_row = int(V[: peak_row + 1].argmin())
+
+        # work of every source inside the loop: any of them may have caused the rise
+        work_by_source = {}
+        for name, work in self.work.items():
+            if name not in EXTERNAL_SOURCES:
+                is_link = "->" in name
+                work_by_source[name if is_link else f"the {name}"] = work
+        work_by_source["sampling"] = self.sampling
+        work_by_source["what beta does not cancel"] = -self.transfer
+
+        causes = {}
+        for name, work in work_by_source.items():
+            causes[name] = float(work[peak_row] - work[start_row])
+        least_amount = _NOTABLE_CAUSE_SHARE * rise[peak_row]
+        notable = {}
+        for name in sorted(causes, key=causes.__getitem__, reverse=True):
+            if causes[name] > least_amount:
+                notable[name] = causes[name]
+
+        return FunctionalRise(
+            from_s=float(self.t_s[start_row]),
+            at_s=float(self.t_s[peak_row]),
+            amount=float(rise[peak_row]),
+            causes=notable,
+        )
+
+    def find_unsupplied_growth(self, tolerance: float) -> list[UnsuppliedGrowth]:
+        """Finds growths of the energy V that nobody supplied, although the run looks stable.
+
+        V is the energy function of the stability proof, from which the work of operators and
+        environments is subtracted here. Two rules are checked. First, V must not end above its
+        beginning. Second, only the second half of the run is regarded: the rise from the
+        minimum to the end must be at most half of the fall from the beginning of this half to
+        the minimum.
+
+        Args:
+            tolerance: Size that a rise must exceed to count, in J.
+
+        Returns:
+            The growth for each rule that is violated.
+        """
+        V = self.unsupplied
+        middle_row = len(V) // 2
+        growths = []
+        gained = float(V[-1] - V[0])
+        if gained > tolerance:
+            growths.append(UnsuppliedGrowth(gained))
+
+        judged = V[middle_row:]
+        lowest_row = int(judged.argmin())
+        risen = float(judged[-1] - judged[lowest_row])
+        fell = float(judged[0] - judged[lowest_row])
+        if risen > tolerance and risen > 0.5 * fell:
+            growths.append(
+                UnsuppliedGrowth(risen, from_s=float(self.t_s[middle_row + lowest_row]))
+            )
+        return growths
 
 
 def compute_energy_balance(

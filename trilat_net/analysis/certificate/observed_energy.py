@@ -18,13 +18,13 @@ Invariant:
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from enum import StrEnum
-from typing import Any, NamedTuple
+from enum import Enum, auto
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction, sum_work
-from ...errors import count_nouns
+from ...hooks import find_hook
 from ...log import Log
 from ...own_code import ImportedLaw
 from ...results import JsonObject
@@ -46,28 +46,29 @@ SAMPLING_SHARE = 1e-2
 """Energy that an arm may get beyond what its law books, as a share of the largest energy."""
 
 
-NEGATIVE_ENERGY_MEANING = (
-    "an observed energy below zero, such as -0.85 mJ, means that at this tick one end of a "
-    "connection had taken out that much more energy than it knew to have been put in, its "
-    "reserve included, so that passivity proves nothing about the run, which may be stable all "
-    "the same"
-)
-"""What a negative energy means, in the same words wherever it is explained to the user."""
-
-
-class ObservedFinding(StrEnum):
+class ObservedFinding(Enum):
     """Result of checking the energies that control laws declare, such as a tank's.
 
     A law that never returns more energy than it received keeps its declared energy above zero.
     The result is BROKEN if the declared energy does not follow from the recorded torques and
-    velocities, and NOT_JUDGED if the records do not suffice. The value of each member is the
-    phrase for the user.
+    velocities, and NOT_JUDGED if the records do not suffice.
     """
 
-    PASSIVE = "observed energy never below zero"
-    NEGATIVE = "observed energy below zero"
-    BROKEN = "the energies that a law declares do not add up"
-    NOT_JUDGED = "observed energy cannot be judged"
+    PASSIVE = auto()
+    NEGATIVE = auto()
+    BROKEN = auto()
+    NOT_JUDGED = auto()
+
+    @property
+    def meaning(self) -> str:
+        """What the finding means for a run, for the user. Empty if it needs no explanation.
+
+        The package `presentation` writes it, in the same words wherever it is explained.
+        """
+        return str(find_hook("describe a finding")(self))
+
+
+_EnergyKind = Literal["line", "known", "store", "taken", "given"]
 
 
 class _EnergyCurve(NamedTuple):
@@ -87,7 +88,7 @@ class _EnergyCurve(NamedTuple):
             its largest earlier value, as a dissipated energy must not fall.
     """
 
-    kind: str
+    kind: _EnergyKind
     site: str
     peer: str
     t_s: Array
@@ -102,12 +103,7 @@ class _EnergyCurve(NamedTuple):
         this energy that is known to s is named "known at s of m". The energy
         stored at s is named "store of s".
         """
-        if self.kind == "line":
-            return f"line {self.peer}->{self.site}"
-        if self.kind == "known":
-            return f"known at {self.site} of {self.peer}"
-        preposition = "of" if self.kind == "store" else "by"
-        return f"{self.kind} {preposition} {self.site}"
+        return _name_energy(self.kind, self.site, self.peer)
 
 
 class _LeastEnergy(NamedTuple):
@@ -117,14 +113,37 @@ class _LeastEnergy(NamedTuple):
     adds.
 
     Attributes:
-        name: Name of the energy's curve.
+        kind: Kind of the energy, as in `_EnergyCurve`.
+        site: Name of the site.
+        peer: Name of the site at the other end of a line. Empty for other kinds.
         amount_j: The minimum.
         at_s: Time of the minimum.
     """
 
-    name: str
+    kind: _EnergyKind
+    site: str
+    peer: str
     amount_j: float
     at_s: float
+
+    @property
+    def name(self) -> str:
+        """Short name of the energy for reports, the same as that of its curve."""
+        return _name_energy(self.kind, self.site, self.peer)
+
+    def to_json(self) -> JsonObject:
+        """Returns the minimum as values for JSON."""
+        return {"name": self.name, "amount_j": self.amount_j, "at_s": self.at_s}
+
+
+def _name_energy(kind: _EnergyKind, site: str, peer: str) -> str:
+    """Returns the short name of an energy, such as "line m->s" or "store of s"."""
+    if kind == "line":
+        return f"line {peer}->{site}"
+    if kind == "known":
+        return f"known at {site} of {peer}"
+    preposition = "of" if kind == "store" else "by"
+    return f"{kind} {preposition} {site}"
 
 
 class ObservedEnergy(NamedTuple):
@@ -136,7 +155,6 @@ class ObservedEnergy(NamedTuple):
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
-        text: The verdict as a sentence.
         premises: The conditions under which the energies count as evidence, each checked.
         least: Minimum over time of every energy.
         largest_j: Largest of all energies, in J.
@@ -145,16 +163,26 @@ class ObservedEnergy(NamedTuple):
         sampling_j: Largest energy that an arm received and its law did not count, in J. It
             arises between ticks.
         curves: Every energy over time, and the energies that the arms gave to their laws.
+        undeclared_sites: Sites whose laws declare no energies, although others do. The energies
+            are then not judged.
+        incomplete_sites: Sites of which records are missing, so that the energies are not
+            judged.
     """
 
     finding: ObservedFinding
-    text: str
     premises: Sequence[Premise] = ()
     least: Sequence[_LeastEnergy] = ()
     largest_j: float = 0.0
     residual_j: float = 0.0
     sampling_j: float = 0.0
     curves: Sequence[_EnergyCurve] = ()
+    undeclared_sites: tuple[str, ...] = ()
+    incomplete_sites: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The verdict as a sentence for the user, which the package `presentation` writes."""
+        return str(find_hook("describe a finding")(self))
 
     def to_json(self) -> JsonObject:
         """Returns the verdict, its premises and the least energies as values for JSON.
@@ -162,12 +190,15 @@ class ObservedEnergy(NamedTuple):
         The energies over time are left out, because they have a value per tick and serve for
         figures.
         """
-        content = self._asdict()
-        del content["curves"]
-        content["finding"] = self.finding.name.lower()
-        content["premises"] = [premise.to_json() for premise in self.premises]
-        content["least"] = [least._asdict() for least in self.least]
-        return content
+        return {
+            "finding": self.finding.name.lower(),
+            "text": self.text,
+            "premises": [premise.to_json() for premise in self.premises],
+            "least": [least.to_json() for least in self.least],
+            "largest_j": self.largest_j,
+            "residual_j": self.residual_j,
+            "sampling_j": self.sampling_j,
+        }
 
     @classmethod
     def of_log(cls, log: Log, *, own_laws: bool = False) -> "ObservedEnergy | None":
@@ -196,8 +227,7 @@ class ObservedEnergy(NamedTuple):
         unjudged = ObservedFinding.NOT_JUDGED
         undeclared_sites = [site for site in log.sites if site not in laws]
         if undeclared_sites:
-            text = f"{unjudged}: the law of {', '.join(undeclared_sites)} declares none"
-            return ObservedEnergy(unjudged, text)
+            return ObservedEnergy(unjudged, undeclared_sites=tuple(undeclared_sites))
 
         parts = {site: log[site] for site in log.sites}
         incomplete = []
@@ -206,8 +236,7 @@ class ObservedEnergy(NamedTuple):
             if not len(part) or part.missing or part.tick[0]:
                 incomplete.append(site)
         if incomplete:
-            text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
-            return ObservedEnergy(unjudged, text)
+            return ObservedEnergy(unjudged, incomplete_sites=tuple(incomplete))
 
         accounts = {site: _read_books(log, site, law) for site, law in laws.items()}
         return _judge_books(log, accounts)
@@ -435,7 +464,7 @@ def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_Ener
     """
     for site, account in accounts.items():
         declared = account.declared
-        energies = []
+        energies: list[tuple[_EnergyKind, str, Array]] = []
         if declared.store is not None:
             energies.append(("store", "", declared.store))
         for j, peer in enumerate(log[site].peers):
@@ -485,7 +514,9 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
     for curve in curves:
         row = int(curve.least_j.argmin())
         minimum = _LeastEnergy(
-            name=curve.name,
+            kind=curve.kind,
+            site=curve.site,
+            peer=curve.peer,
             amount_j=float(curve.least_j[row]),
             at_s=float(curve.t_s[row]),
         )
@@ -509,22 +540,13 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
     premises = _check_books(log, accounts, scale_j)
 
     lowest = min(least, key=lambda energy: energy.amount_j)
-    failed = [premise.name for premise in premises if not premise.holds]
+    finding = ObservedFinding.PASSIVE
     if not premises[0].holds:
         finding = ObservedFinding.BROKEN
-        text = premises[0].text
     elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale_j:
         finding = ObservedFinding.NEGATIVE
-        text = f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
-    else:
-        finding = ObservedFinding.PASSIVE
-        text = f"{count_nouns(len(least), 'energy')}, the largest {largest_j:.4g} J"
-        if failed:
-            text += f"; but a premise fails: {', '.join(failed)}"
-
     return ObservedEnergy(
         finding=finding,
-        text=f"{finding}: {text}",
         premises=premises,
         least=least,
         largest_j=largest_j,

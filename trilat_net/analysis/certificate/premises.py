@@ -105,38 +105,6 @@ Slower speeds are the rounding error of an axis along which the end effector can
 """
 
 
-def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
-    """Finds the arms for which the energy function of the stability proof does not exist.
-
-    The energy exists only for certain control laws. It requires the true dynamic parameters of
-    the arm. It is not defined if the end effector also follows the orientation of other arms.
-
-    Args:
-        scenario: The description of the experiment.
-
-    Returns:
-        The sites of these arms, grouped by the reason. Empty if the energy exists for every
-        arm.
-    """
-    sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
-    for site, spec in scenario.sites.items():
-        law = ""
-        if not spec.arm.known:
-            obstacle = FunctionalObstacle.UNKNOWN_PARAMETERS
-        elif not spec.control.has_functional:
-            obstacle = FunctionalObstacle.LAW
-            law = spec.control.tag
-        elif spec.task.space == "pose":
-            obstacle = FunctionalObstacle.ORIENTATIONS
-        else:
-            continue
-        sites_by_reason.setdefault((obstacle, law), []).append(site)
-    return [
-        MissingFunctional(obstacle, law, tuple(sites))
-        for (obstacle, law), sites in sites_by_reason.items()
-    ]
-
-
 class FunctionalFacts(NamedTuple):
     """Quantities of a run that the checks of the stability theorem's conditions read.
 
@@ -233,6 +201,38 @@ def gather_facts(log: Log) -> _RunFacts:
         tolerance=float(np.ptp(balance.unexplained)) + sampling_j + ZERO_ENERGY_J,
     )
     return _RunFacts(log, constants, facts)
+
+
+def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
+    """Finds the arms for which the energy function of the stability proof does not exist.
+
+    The energy exists only for certain control laws. It requires the true dynamic parameters of
+    the arm. It is not defined if the end effector also follows the orientation of other arms.
+
+    Args:
+        scenario: The description of the experiment.
+
+    Returns:
+        The sites of these arms, grouped by the reason. Empty if the energy exists for every
+        arm.
+    """
+    sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
+    for site, spec in scenario.sites.items():
+        law = ""
+        if not spec.arm.known:
+            obstacle = FunctionalObstacle.UNKNOWN_PARAMETERS
+        elif not spec.control.has_functional:
+            obstacle = FunctionalObstacle.LAW
+            law = spec.control.tag
+        elif spec.task.space == "pose":
+            obstacle = FunctionalObstacle.ORIENTATIONS
+        else:
+            continue
+        sites_by_reason.setdefault((obstacle, law), []).append(site)
+    return [
+        MissingFunctional(obstacle, law, tuple(sites))
+        for (obstacle, law), sites in sites_by_reason.items()
+    ]
 
 
 def check_premises(run: _RunFacts) -> list[Premise]:
@@ -430,24 +430,6 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
             ticks = int(np.count_nonzero(any_in_rows(limited)))
             cut_off.append(CutTorque(site, _find_joints(run, site, limited), ticks))
     return Premise("torque", not cut_off, TorqueQuantities(tuple(cut_off)))
-
-
-def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
-    """Returns the names of the joints that an effect, such as a torque limit, concerned.
-
-    Args:
-        run: Facts of the run.
-        site: Site of the arm.
-        is_affected: True for each record and joint that is affected, shape (K, n).
-
-    Returns:
-        The names. Empty for the built-in planar arm, whose joints have no names.
-    """
-    model = run.log.scenario.arms[site]
-    if model.chain is None:
-        return ()
-    affected_joints = np.flatnonzero(is_affected.any(axis=0))
-    return tuple(model.joint_names[joint] for joint in affected_joints)
 
 
 def _check_stops(run: FunctionalFacts) -> Premise | None:
@@ -665,6 +647,24 @@ FUNCTIONAL_CHECKS = (
     _check_presence,
 )
 """Checks of the premises that can be decided only if V is known, in the order of the report."""
+
+
+def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
+    """Returns the names of the joints that an effect, such as a torque limit, concerned.
+
+    Args:
+        run: Facts of the run.
+        site: Site of the arm.
+        is_affected: True for each record and joint that is affected, shape (K, n).
+
+    Returns:
+        The names. Empty for the built-in planar arm, whose joints have no names.
+    """
+    model = run.log.scenario.arms[site]
+    if model.chain is None:
+        return ()
+    affected_joints = np.flatnonzero(is_affected.any(axis=0))
+    return tuple(model.joint_names[joint] for joint in affected_joints)
 
 
 def _examine_stretch(

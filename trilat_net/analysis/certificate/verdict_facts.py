@@ -12,7 +12,7 @@ Invariant:
 """
 
 from enum import Enum, auto
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from ...hooks import find_hook
 from ...log import Coverage, Integrity
@@ -69,6 +69,11 @@ class UnsuppliedGrowth(NamedTuple):
 
     energy_j: float
     from_s: float | None = None
+
+    @property
+    def text(self) -> str:
+        """The finding as a sentence for the user, which the package `presentation` writes."""
+        return str(find_hook("describe a finding")(self))
 
 
 class NoFunctional(NamedTuple):
@@ -226,7 +231,7 @@ class StabilityVerdict(NamedTuple):
 
         The package `presentation` writes it. V is the energy function of the stability proof.
         """
-        return str(find_hook("describe a verdict")(self))
+        return str(find_hook("describe a finding")(self))
 
 
 class Evidence(NamedTuple):
@@ -252,13 +257,30 @@ class Evidence(NamedTuple):
     unmet: tuple[str, ...] = ()
 
     @property
+    def doubts(self) -> "tuple[EvidenceDoubt, ...]":
+        """What the records lack to call the run stable. Empty if they suffice.
+
+        Examples are a log that was changed after the run, or too many missing records.
+        """
+        doubts = []
+        if not self.integrity.passed:
+            doubts.append(EvidenceDoubt("changed log", self))
+        if self.coverage.share < self.min_coverage:
+            doubts.append(EvidenceDoubt("missing records", self))
+        judged_share = self.functional_share
+        if judged_share is not None and judged_share < self.min_coverage:
+            doubts.append(EvidenceDoubt("missing periods", self))
+        if self.unmet:
+            doubts.append(EvidenceDoubt("copied sites", self))
+        return tuple(doubts)
+
+    @property
     def reasons(self) -> list[str]:
         """Sentences that say why the log does not suffice to call the run stable.
 
-        Examples are a log that was changed after the run, or too many missing records. Empty if
-        the records suffice.
+        There is one for each doubt. The package `presentation` writes them.
         """
-        return list(find_hook("doubt evidence")(self))
+        return list(find_hook("list the sentences of a finding")(self))
 
     @property
     def text(self) -> str:
@@ -266,7 +288,7 @@ class Evidence(NamedTuple):
 
         The certificate prints this sentence for every run, also if the records suffice.
         """
-        return str(find_hook("describe evidence")(self))
+        return str(find_hook("describe a finding")(self))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the extent and authenticity of the records as plain values.
@@ -283,3 +305,23 @@ class Evidence(NamedTuple):
             "integrity": self.integrity.state.name.lower(),
             "open_loop_sites": list(self.unmet),
         }
+
+
+class EvidenceDoubt(NamedTuple):
+    """Finding that records do not suffice to call a run stable.
+
+    Attributes:
+        name: Name of the finding. "changed log": the log is not as it was made. "missing
+            records": too few ticks of a site are recorded. "missing periods": the energy
+            function V is known in too few tick periods. "copied sites": the motion of some
+            sites was copied from an earlier run.
+        evidence: The records, with their numbers.
+    """
+
+    name: Literal["changed log", "missing records", "missing periods", "copied sites"]
+    evidence: Evidence
+
+    @property
+    def text(self) -> str:
+        """The finding as a sentence for the user, which the package `presentation` writes."""
+        return str(find_hook("describe a finding")(self))

@@ -38,10 +38,10 @@ from ...own_code import ImportedLaw
 from ...records import NS_PER_S, Mode
 from ...scenario import ConstantDelay, LinkBase, Scenario
 from ..blas_threads import limit_blas_threads
+from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
-from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
@@ -365,17 +365,17 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
             exact = _has_same_sign(sampled_loop, sampled, loop.last_pose)
-        roots = _describe_roots(sampled, sampled.basis, exact=exact)
+        roots = _summarise_roots(sampled, sampled.basis, exact=exact)
         return roots._replace(
             distance_rad=loop.distance_rad,
             leaves_out=_name_left_out(loop.programs),
             is_numerical=has_imported_law,
         )
     continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
-    basis = ", in continuous time"
+    span = ", in continuous time"
     if loop.conditions.varying or loop.has_mean_ages:
-        basis += ", of the mean ages"
-    roots = _describe_roots(continuous, basis, exact=False)
+        span += ", of the mean ages"
+    roots = _summarise_roots(continuous, span, exact=False)
     return roots._replace(leaves_out=_name_left_out(loop.programs))
 
 
@@ -416,31 +416,26 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
     return grows_at_last == (rate_per_s > 0.0)
 
 
-def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots:
+def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots:
     """Returns the fastest growing root, and what it says about the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.
-        basis: A phrase that states over which ticks the roots are computed.
+        span: A phrase that states over which ticks the roots are computed.
         exact: True if no delay is averaged or assumed to repeat.
     """
     root = spectrum.rightmost
-    verdict = spectrum.verdict
     if root is None:
-        return LoopRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
-
-    omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
-    drift = ""
-    if spectrum.drifting:
-        drift = f"{spectrum.drifting} of its motions keep their speed, the others "
-    text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{basis}"
+        return LoopRoots(spectrum.verdict, None, exact)
     swing_rates_per_s = [other.s.real for other in spectrum.roots if other.s.imag]
     return LoopRoots(
-        verdict=verdict,
+        verdict=spectrum.verdict,
         rate_per_s=root.s.real,
         exact=exact,
-        text=text,
         swing_rate_per_s=max(swing_rates_per_s, default=None),
+        omega_rad_s=abs(root.s.imag),
+        drifting=spectrum.drifting,
+        span=span,
     )
 
 
@@ -450,7 +445,7 @@ def _explain_no_roots(reason: str) -> LoopRoots:
     Args:
         reason: The reason, as a phrase for the user.
     """
-    return LoopRoots("", None, False, f"this rest: no roots: {reason}")
+    return LoopRoots("", None, False, reason=reason)
 
 
 def _end_traces(scenario: Scenario) -> Scenario:

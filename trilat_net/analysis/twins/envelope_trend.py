@@ -26,7 +26,7 @@ later. A beat that is longer than the run looks like growth while it rises.
 """
 
 import math
-from enum import StrEnum
+from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
@@ -54,18 +54,17 @@ _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 """Largest rise over the quarters of a response that starts at zero and saturates."""
 
 
-class EnvelopeTrend(StrEnum):
+class EnvelopeTrend(Enum):
     """Trend of the magnitude of an oscillation in the second half of a run.
 
-    The module's docstring defines the classes. The value of each member is a phrase for the
-    user.
+    The module's docstring defines the classes.
     """
 
-    DECAYS = "decays"
-    HARDLY = "hardly decays"
-    STEADY = "steady"
-    GROWS = "grows"
-    UNDECIDED = "undecided (record longer)"
+    DECAYS = auto()
+    HARDLY = auto()
+    STEADY = auto()
+    GROWS = auto()
+    UNDECIDED = auto()
 
 
 class EnvelopeFit(NamedTuple):
@@ -86,27 +85,6 @@ class EnvelopeFit(NamedTuple):
     trend: EnvelopeTrend
     rate_per_s: float
     calm: bool = False
-
-    @property
-    def text(self) -> str:
-        """The trend of the envelope in a few words for the user, such as "grows".
-
-        An undecided trend reads "shows no trend".
-        """
-        if self.trend is EnvelopeTrend.UNDECIDED:
-            return "shows no trend"
-        return self.trend.value
-
-    @property
-    def rate_text(self) -> str:
-        """The trend of the envelope in a few words for the user.
-
-        If the envelope grows or decays, it is the rate, such as "+0.12/s". Otherwise it is
-        `text`, such as "steady".
-        """
-        if self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
-            return self.text
-        return f"{self.rate_per_s:+.3g}/s"
 
 
 def fit_envelopes(

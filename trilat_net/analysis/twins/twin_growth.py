@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core import BUCKETS_PER_S, Array, DelayKind, TorqueKind
-from ...errors import NotRepeatable, UsageError, count_nouns
+from ...errors import NotRepeatable, UsageError
 from ...execution import (
     LEAST_PUSH,
     MOST_PUSH,
@@ -40,6 +40,7 @@ from ...execution import (
     TwinPath,
     Twins,
 )
+from ...hooks import find_hook
 from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
@@ -66,7 +67,6 @@ _TRENDS_FROM_BEST = (
     EnvelopeTrend.STEADY,
     EnvelopeTrend.GROWS,
 )
-_FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 _AMPLITUDE_FLOOR = 1e-300
 """Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
 SAME_SCALED = math.log(1.1)
@@ -113,20 +113,35 @@ class PushGrowth(NamedTuple):
     leads: bool = True
 
 
-def estimate_miss_probability(directions: int) -> float:
-    """Estimates how likely pushes in random directions miss a mode that grows clearly.
+class _MissChance(NamedTuple):
+    """Probability that pushes in random directions miss a mode that grows.
 
-    A mode that grows by `CLEAR_GROWTH` is missed if less than 1 / `CLEAR_GROWTH` of the usual
-    share of every push excites it. The share of a mode in a push with many random components is
-    nearly normally distributed, with the density 1 / sqrt(2 pi) at zero.
-
-    Args:
-        directions: Number of independent random directions.
+    Attributes:
+        directions: Number of random directions.
+        growth: Growth of the mode in the judged part of the run, as a factor.
+        probability: The probability.
     """
-    largest_missed_share = 1.0 / CLEAR_GROWTH
-    # probability that a standard normal number lies between - and + this share
-    miss_by_one_push = 2.0 * largest_missed_share / math.sqrt(2.0 * math.pi)
-    return math.pow(miss_by_one_push, directions)
+
+    directions: int
+    growth: float
+    probability: float
+
+    @classmethod
+    def of_directions(cls, directions: int) -> "_MissChance":
+        """Estimates how likely pushes in random directions miss a mode that grows clearly.
+
+        A mode that grows by `CLEAR_GROWTH` is missed if less than 1 / `CLEAR_GROWTH` of the
+        usual share of every push excites it. The share of a mode in a push with many random
+        components is nearly normally distributed, with the density 1 / sqrt(2 pi) at zero.
+
+        Args:
+            directions: Number of independent random directions.
+        """
+        largest_missed_share = 1.0 / CLEAR_GROWTH
+        # probability that a standard normal number lies between - and + this share
+        miss_by_one_push = 2.0 * largest_missed_share / math.sqrt(2.0 * math.pi)
+        probability = math.pow(miss_by_one_push, directions)
+        return cls(directions, CLEAR_GROWTH, probability)
 
 
 class RestDeparture(NamedTuple):
@@ -183,13 +198,14 @@ class TwinGrowth(NamedTuple):
     twins: Twins | None = None
 
     @property
-    def worst(self) -> PushGrowth | None:
-        """The small push whose effect on the run grew most, or died away most slowly.
+    def hides_period(self) -> bool:
+        """True if the delays repeat only after more time than the judged part of the run.
 
-        Each push was made in a repetition of the run. The trend of this push counts as the
-        trend of the whole run. None if there are no pushes.
+        Pushes that died away in this part might then grow in the rest of the period. A decision
+        without a proof therefore stays open.
         """
-        return max(self.pushes, key=_rank_badness, default=None)
+        judged_s = self.to_s - self.from_s
+        return self.delay_period_s is not None and self.delay_period_s > judged_s
 
     @property
     def trend(self) -> EnvelopeTrend:
@@ -199,6 +215,15 @@ class TwinGrowth(NamedTuple):
         if there are no pushes.
         """
         return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
+
+    @property
+    def worst(self) -> PushGrowth | None:
+        """The small push whose effect on the run grew most, or died away most slowly.
+
+        Each push was made in a repetition of the run. The trend of this push counts as the
+        trend of the whole run. None if there are no pushes.
+        """
+        return max(self.pushes, key=_rank_badness, default=None)
 
     @property
     def grows(self) -> bool:
@@ -231,30 +256,15 @@ class TwinGrowth(NamedTuple):
         return False
 
     @property
-    def _miss_text(self) -> str:
-        """A clause for the user on how likely random pushes fail to reveal an unstable run.
+    def miss_chance(self) -> _MissChance | None:
+        """How likely random pushes fail to reveal that a run is unstable.
 
-        Empty if each joint was pushed by itself.
+        None if each joint was pushed by itself, because such pushes have no random direction.
         """
-        # pushes of a single joint have no random direction
         directions = {push.push.direction for push in self.pushes if push.push.direction}
         if not directions:
-            return ""
-        probability = estimate_miss_probability(len(directions))
-        return (
-            f"; {count_nouns(len(directions), 'random direction')} of all joints miss a mode "
-            f"that grows {CLEAR_GROWTH:g} times with a probability of {probability:.0e}"
-        )
-
-    @property
-    def hides_period(self) -> bool:
-        """True if the delays repeat only after more time than the judged part of the run.
-
-        Pushes that died away in this part might then grow in the rest of the period. A decision
-        without a proof therefore stays open.
-        """
-        judged_s = self.to_s - self.from_s
-        return self.delay_period_s is not None and self.delay_period_s > judged_s
+            return None
+        return _MissChance.of_directions(len(directions))
 
     @property
     def judged_bursts(self) -> float:
@@ -266,20 +276,6 @@ class TwinGrowth(NamedTuple):
         if self.burst_interval_s is None:
             return math.inf
         return (self.to_s - self.from_s) / self.burst_interval_s
-
-    @property
-    def period_text(self) -> str:
-        """A sentence for repetitions that were shorter than the period of the delays.
-
-        Pushes that died away then prove little, because the delays of the rest of the period
-        were never tried. For example "the delays repeat after 20 s, but the twins were judged
-        over 8 s".
-        """
-        judged_s = self.to_s - self.from_s
-        return (
-            f"the delays repeat after {self.delay_period_s:.6g} s, but the twins were judged "
-            f"over {judged_s:.4g} s"
-        )
 
     @property
     def needs_s(self) -> float | None:
@@ -342,34 +338,10 @@ class TwinGrowth(NamedTuple):
 
         It describes the push that grows most or dies away most slowly. If the arms left a
         position of rest by themselves, the sentence describes that motion instead. If the run
-        was not repeated with pushes, the sentence gives the reason.
+        was not repeated with pushes, the sentence gives the reason. The package `presentation`
+        writes it.
         """
-        worst = self.worst
-        departure = self.departure
-        if worst is None:
-            return f"twins: {self.why}"
-        if departure is not None:
-            span = f"from {departure.from_s:.4g} to {departure.to_s:.4g} s"
-            rate = f"{departure.rate_per_s:+.3g} /s at {departure.joint}"
-            return f"twins: {span} the run and its twins left a rest by themselves, {rate}"
-        if worst.factor == 0.0:
-            return "twins: every push died down to the rounding of the numbers"
-        if math.isnan(worst.rate_per_s):
-            return "twins: the run is too short to tell"
-
-        name = worst.push.name
-        span = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
-        if self.trend in _FALLING:
-            slowest = f"{name}, to {worst.factor:.3g} of its size {span}"
-            return f"twins: every push dies away; the slowest, {slowest}{self._miss_text}"
-
-        change = f"x {worst.factor:.3g} {span}, most at {worst.joint}"
-        if self.trend is EnvelopeTrend.GROWS:
-            return f"twins: a push of {name} grows {change}"
-        text = f"twins: a push of {name} shows no clear trend: it changes {change}"
-        if self.needs_s is not None:
-            text += f"; a run of {self.needs_s:.3g} s would tell"
-        return text
+        return str(find_hook("describe a finding")(self))
 
     @classmethod
     def of_log(
@@ -794,6 +766,24 @@ def _find_departures(
                 )
 
 
+class _NonlinearPush(NamedTuple):
+    """The smallest push whose effect is not proportional to its size.
+
+    Attributes:
+        size: Size of the push.
+        saturates: True if the effect is smaller than a proportional one, and grows.
+        has_wall: True if a wall stands at some site, whose contact makes the run nonlinear.
+        ratio: Ratio of the effect to a proportional one at the time of the largest deviation.
+        at_s: This time, in s.
+    """
+
+    size: float
+    saturates: bool
+    has_wall: bool
+    ratio: float
+    at_s: float
+
+
 class _LinearSizes(NamedTuple):
     """The range of sizes for which the effect of a push is proportional to its size.
 
@@ -803,12 +793,14 @@ class _LinearSizes(NamedTuple):
     Attributes:
         smallest: The smallest size of the push in this range.
         largest: The largest size of the push in this range.
-        text: A sentence on this range, and on the effect of a larger push.
+        unit: Unit of the sizes, and what is pushed.
+        beyond: The next larger push. None if the effect of every push is proportional.
     """
 
     smallest: float
     largest: float
-    text: str
+    unit: str
+    beyond: _NonlinearPush | None
 
 
 @dataclass(frozen=True, repr=False)
@@ -840,20 +832,7 @@ class PushedTwins(Result):
         Args:
             pushed: The push and its effect.
         """
-        rate = "" if math.isnan(pushed.rate_per_s) else f" ({pushed.rate_per_s:+.3g} /s)"
-        push = f"a push of {pushed.push.name} at {self.at_s:.4g} s"
-        to_s = self.growth.to_s
-        if pushed.ended_s is not None:
-            outcome = "makes the run diverge"
-            if pushed.trend is EnvelopeTrend.DECAYS:
-                outcome = "dies down to the rounding of the numbers"
-            return f"{push} {outcome} in {pushed.ended_s - self.at_s:.3g} s{rate}"
-        if pushed.trend is EnvelopeTrend.GROWS:
-            growth = f"grows x {pushed.factor:.3g} in {to_s - self.growth.from_s:.4g} s"
-            return f"{push} {growth}{rate}, most at {pushed.joint}"
-        outcome = f"becomes {pushed.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}"
-        text = f"{push} {outcome}, most at {pushed.joint}"
-        return text if pushed.trend in _FALLING else f"{text}; it shows no clear trend"
+        return str(find_hook("describe a push")(self, pushed))
 
     def headline(self) -> str:
         """Returns a sentence for the user on how the pushes develop.
@@ -862,10 +841,7 @@ class PushedTwins(Result):
         asked for pushes of several sizes, it says instead for which sizes the effect is
         proportional to the size.
         """
-        if self.linear:
-            return self.linear.text
-        worst = self.growth.worst
-        return self.describe(worst) if worst else self.growth.text
+        return str(find_hook("describe a finding")(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a table row for each small push: what was pushed, and how its effect evolves.
@@ -885,6 +861,14 @@ class PushedTwins(Result):
         The entry "linear" is None if the growth was not compared with characteristic roots.
         """
         growth = self.growth.to_json()
+        text = self.headline()
+        linear = None
+        if self.linear is not None:
+            linear = {
+                "smallest": self.linear.smallest,
+                "largest": self.linear.largest,
+                "text": text,
+            }
         return {
             "log": self.log.source,
             "at_s": self.at_s,
@@ -892,8 +876,8 @@ class PushedTwins(Result):
             "to_s": growth["to_s"],
             "same_bits": growth["same_bits"],
             "pushes": self.to_rows(),
-            "linear": self.linear and self.linear._asdict(),
-            "text": self.headline(),
+            "linear": linear,
+            "text": text,
         }
 
 
@@ -1023,7 +1007,7 @@ def _find_linear_sizes(
     envelopes = [_running_maximum(measure_amplitude(path, all_joints)) for path in paths]
     unit = paths[0].push.name.partition(" ")[2]
     largest_linear = sizes[-1]
-    beyond = ""
+    beyond = None
     for n, (smaller, larger) in enumerate(pairwise(envelopes)):
         log_scale = np.full(len(larger), math.log(sizes[n + 1] / sizes[n]))
         # Rounding errors decide on amplitudes below this limit: they count as proportional.
@@ -1037,20 +1021,15 @@ def _find_linear_sizes(
                 push.trend is EnvelopeTrend.GROWS and push.push is paths[n].push
                 for push in growth.pushes
             )
-            outcome = "goes another way"
-            if grows and deviation[row] < 0.0:
-                outcome = "saturates"
-            if _has_wall(scenario):
-                outcome += " (there is a wall)"
-            ratio = _exp(float(deviation[row]))
-            times = f"x {ratio:.3g} of that at {paths[0].t_s[row]:.4g} s"
-            beyond = f"; a push of {sizes[n + 1]:g} {outcome}: {times}"
+            beyond = _NonlinearPush(
+                size=sizes[n + 1],
+                saturates=grows and bool(deviation[row] < 0.0),
+                has_wall=_has_wall(scenario),
+                ratio=_exp(float(deviation[row])),
+                at_s=float(paths[0].t_s[row]),
+            )
             break
-
-    text = f"not linear, from {largest_linear:g} {unit} on"
-    if largest_linear > sizes[0]:
-        text = f"linear from {sizes[0]:g} to {largest_linear:g} {unit}"
-    return _LinearSizes(sizes[0], largest_linear, text + beyond)
+    return _LinearSizes(sizes[0], largest_linear, unit, beyond)
 
 
 def _has_wall(scenario: Scenario) -> bool:

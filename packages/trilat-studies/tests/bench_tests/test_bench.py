@@ -73,8 +73,8 @@ from trilat_studies.tuning.candidate import (
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 
 import trilat_net
+from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
-from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import TwinGrowth
 from trilat_net.core.step.vectors import Array
@@ -369,7 +369,7 @@ def make_judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
         "records": {},
         "end": RunEnd(EndBehaviour.HARDLY, fit, fit, 0.1, 0.1),
         "twins": TwinGrowth(""),
-        "roots": LoopRoots("stable" if rate_per_s else "", rate_per_s, True, ""),
+        "roots": LoopRoots("stable" if rate_per_s else "", rate_per_s, True),
         "stability": Stability.OPEN,
         "text": "open",
         **more,

@@ -13,7 +13,7 @@ from trilat_studies.measure_run import (
     measure_virtual_run,
 )
 
-from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.run_end import EndBehaviour, EndDoubt, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.expect import ExpectWindow
 
@@ -112,7 +112,7 @@ def test_stable_needs_the_judgement_and_open_fails(
     assert outcome.held is (stability is wanted)
     assert outcome.measured == f"{stability}: {end.text}"
     assert evaluate_single(
-        Expect(stable=True), end=CALM.end._replace(reasons=("a reason",))
+        Expect(stable=True), end=CALM.end._replace(doubts=(EndDoubt("operator acts"),))
     ).measured.startswith("open: ")
 
 

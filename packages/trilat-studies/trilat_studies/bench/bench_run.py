@@ -35,11 +35,11 @@ from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     THROWN_RAD,
     EndBehaviour,
-    LoopRoots,
     RunEnd,
     Stability,
     TwinGrowth,
     build_arm_rows,
+    decision_facts,
     judge_virtual_run,
     list_walls,
     plan_dominance,
@@ -164,7 +164,7 @@ class JudgedRun(NamedTuple):
     records: dict[str, RecordBatch]
     end: RunEnd
     twins: TwinGrowth | None
-    roots: LoopRoots
+    roots: decision_facts.LoopRoots
     stability: Stability
     text: str
     at_limit: bool = False

@@ -25,7 +25,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from trilat_net.analysis import NEGATIVE_ENERGY_MEANING
+from trilat_net.analysis import ObservedFinding
 from trilat_net.errors import count_nouns
 from trilat_net.files import write_whole
 from trilat_net.presentation import (
@@ -313,7 +313,7 @@ def list_energy_notes(tuned: "TuningResult") -> list[str]:
         return []
     return [
         f"{', '.join(laws)} declare energies, which `trilat certify` checks and the classes "
-        f"above do not: {NEGATIVE_ENERGY_MEANING}"
+        f"above do not: {ObservedFinding.NEGATIVE.meaning}"
     ]
 
 

@@ -1,0 +1,349 @@
+"""Defines the result of judging a run from its log: `Certificate`, with every reason.
+
+`stability_certificate.certify` creates it, and `judge.certify_run` adds the repetitions of the
+run and the characteristic roots. `stability_decision` decides from its evidence.
+
+Invariant:
+    - Keys of the JSON output end in their unit, and unknown values are null.
+    - The package `presentation` writes every sentence, when somebody asks for it.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from ...core import Array
+from ...hooks import find_hook
+from ...results import JsonObject, Result, finite_or_none
+from ..decision_facts import Doubt, LoopRoots, RunFindings, StabilityDecision
+from ..run_end import EndBehaviour, RunEnd, Stability
+from ..run_remarks import RunCircumstances
+from ..stability_decision import decide_stability
+from ..twins.twin_growth import TwinGrowth
+from .energy_balance import EnergyBalance, SiteEnergy
+from .observed_energy import ObservedEnergy, ObservedFinding
+from .premise_quantities import Premise
+from .premises import find_unjudged_spans
+from .verdict_facts import Evidence, FunctionalRise, StabilityFinding, StabilityVerdict
+
+_REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
+
+
+@dataclass(frozen=True, repr=False)
+class Certificate(Result):
+    """Judgement whether a recorded run was stable, with every reason. `certify` creates it.
+
+    It combines several kinds of evidence: the energy function V of the stability proof, the end
+    of the motion, the roots of the linearised loop, and repeated runs with a small push.
+
+    Attributes:
+        premises: The conditions of the stability theorem, each checked.
+        verdict: What the energy function V shows.
+        end: The end of the run, judged from the errors e and the velocities qd alone.
+        evidence: On how many records the certificate rests, and whether the log was changed.
+        balance: Energy balance of all sites. None if V does not exist, or if the weights beta
+            of the sites in V are not unique.
+        paper_balance: Energy balance with the weights of the paper, which are 1 for every site.
+            None if these are the right weights, or if there is no balance.
+        groups: Closed groups of sites, which follow nobody outside their group. Empty unless
+            there are several; beta is then not unique.
+        energies: Energies of every site, by name. Empty if V does not exist.
+        roots: Roots of the loop at the pose where the run ended. None if not computed.
+        observed: Check of the energies that control laws declare. None if no law declares any.
+        twins: Growth of small pushes in repeated runs. None if not computed.
+        law_proofs: Phrases that name the stability conditions of control laws that hold at
+            every site and prove that small motions die away. Empty if there are none.
+        law_conditions: Sentences on the stability conditions of the control laws of the run.
+        has_lasting_delays: True if delays that are constant in the run stay so after it.
+        circumstances: What readers of the judgement should know, such as a motor at its torque
+            limit. Empty if it was not examined.
+    """
+
+    premises: list[Premise]
+    verdict: StabilityVerdict
+    end: RunEnd
+    evidence: Evidence
+    balance: EnergyBalance | None = None
+    paper_balance: EnergyBalance | None = None
+    groups: tuple[tuple[str, ...], ...] = ()
+    energies: Mapping[str, SiteEnergy] = field(default_factory=lambda: MappingProxyType({}))
+    roots: LoopRoots | None = None
+    observed: ObservedEnergy | None = None
+    twins: TwinGrowth | None = None
+    law_proofs: tuple[str, ...] = ()
+    law_conditions: tuple[str, ...] = ()
+    has_lasting_delays: bool = True
+    circumstances: RunCircumstances = field(default_factory=RunCircumstances)
+
+    @property
+    def has_functional(self) -> bool:
+        """True if the energy function V of the stability proof exists for this run's laws.
+
+        Texts and pages leave out V and its terms otherwise.
+        """
+        laws = [premise.holds for premise in self.premises if premise.name == "law"]
+        return laws != [False]
+
+    @property
+    def paper_weights_rise(self) -> FunctionalRise | None:
+        """The largest rise that the total energy would have if all arms had the same weight.
+
+        The paper on which the control law is based uses such equal weights in the energy
+        function of its stability proof. None if this energy does not rise, or was not computed.
+        """
+        if self.paper_balance is None:
+            return None
+        return self.paper_balance.find_largest_rise(self.verdict.tolerance)
+
+    @property
+    def bounded_by_v(self) -> bool:
+        """True if the energy V of the stability proof limits the motion of every arm.
+
+        V must not have risen, and every arm must have a positive weight in V. An arm has the
+        weight zero if the arms that it follows do not follow it. It is limited as well if only
+        the condition on the dominance factors, the weights with which arms follow each other,
+        fails, and these factors are constant. It then converges after the arms that it follows.
+        """
+        did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
+        if self.balance is None or self.verdict.finding not in did_not_rise:
+            return False
+        if (self.balance.beta > 0.0).all():
+            return True
+        failed = [premise.name for premise in self.premises if premise.holds is not True]
+        constant = all(energy.motion.dominance.constant for energy in self.energies.values())
+        return failed == ["shares"] and constant
+
+    def accepts(self, accepted: Collection[str]) -> bool:
+        """Returns True if the run is stable, or has another judgement that the user accepts.
+
+        For example, a user may accept "settled". A run with a broken energy balance or a
+        changed log is never accepted.
+
+        Args:
+            accepted: Further judgements to accept: "settled" for a run that slowed down and
+                whose pushes all died away, "bounded" for a bounded oscillation, "open" for a
+                run that cannot be decided.
+        """
+        if self.verdict.finding is StabilityFinding.BROKEN:
+            return False
+        if not self.evidence.integrity.passed:
+            return False
+        if "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED:
+            return True
+        stability = self.decision.stability
+        if "settled" in accepted and stability is Stability.SETTLED:
+            return True
+        if "open" in accepted and stability is Stability.OPEN:
+            return True
+        return stability is Stability.STABLE
+
+    @cached_property
+    def decision(self) -> StabilityDecision:
+        """The decision whether the run is stable, with its evidence and the reasons against it.
+
+        It combines the motion at the end, the repetitions with small pushes, the characteristic
+        roots, the proofs and the doubts, by the rules of `stability_decision`. It is computed
+        at first use.
+        """
+        findings = RunFindings(
+            end=self.end,
+            twins=self.twins,
+            roots=self.roots,
+            is_covered=self._is_covered,
+            law_proofs=self.law_proofs,
+            doubts=self._doubts,
+            rises=self.verdict.finding is StabilityFinding.ROSE,
+        )
+        return decide_stability(findings)
+
+    @property
+    def _is_covered(self) -> bool:
+        """True if the stability theorem proves that the loop is stable.
+
+        All of its premises must hold, also after the run, and V must not have risen.
+        """
+        covered = self.verdict.finding is StabilityFinding.COVERED
+        all_hold = all(premise.holds is True for premise in self.premises)
+        return covered and all_hold and self.has_lasting_delays
+
+    @property
+    def proofs(self) -> tuple[str, ...]:
+        """Phrases that name the proofs for this loop, apart from its characteristic roots.
+
+        The stability theorem is a proof if all of its premises hold, also after the run, and V
+        did not rise. The stability condition of a control law is a proof if it holds at every
+        site.
+        """
+        if not self._is_covered:
+            return self.law_proofs
+        return (str(find_hook("name the theorem")()), *self.law_proofs)
+
+    @property
+    def _doubts(self) -> tuple[Doubt, ...]:
+        """Findings that contradict a stable run. Empty if there are none.
+
+        Such findings are a rise of the energy function V, declared energies that are wrong or
+        negative, and a damaged or incomplete log.
+        """
+        doubts: list[Doubt] = []
+        if self.verdict.finding is StabilityFinding.BROKEN:
+            doubts.append(self.verdict)
+        elif self.balance is not None:
+            doubts += self.balance.find_unsupplied_growth(self.verdict.tolerance)
+        if self.observed is not None and self.observed.finding in _REFUTING_FINDINGS:
+            doubts.append(self.observed)
+        return (*doubts, *self.evidence.doubts)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Sentences on everything that speaks against calling the run stable.
+
+        They concern the end of the run, the energy V, the roots at the end pose, the energies
+        that control laws declare, and the completeness of the log. Empty for a stable run.
+        """
+        return self.decision.reasons
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on circumstances that readers of the judgement should know.
+
+        For example, a motor was at its torque limit. See `run_remarks`.
+        """
+        return self.circumstances.remarks
+
+    @property
+    def stability(self) -> Stability:
+        """The judgement of the run in one word: stable, settled, not stable, or open.
+
+        `stability_decision` explains how the findings lead to this judgement.
+        """
+        return self.decision.stability
+
+    @property
+    def passed(self) -> bool:
+        """True if the run is judged stable, in the strict sense.
+
+        A run that merely settled, so that its motion became slow, has not passed. `accepts` is
+        less strict.
+        """
+        return self.accepts(())
+
+    def headline(self) -> str:
+        """Returns the judgement and its basis in one line for people.
+
+        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". The line is
+        composed by the package `presentation`.
+        """
+        return str(find_hook("head a certificate")(self))
+
+    def to_dict(self) -> JsonObject:
+        """Converts the certificate to plain values, as `trilat certify --json` prints them.
+
+        docs/reference/json.md explains the most important keys. The entry "functional" is None
+        if the energy function V cannot be computed.
+        """
+        verdict = self.verdict
+        end = self.end
+        balance = self.balance
+        return {
+            "passed": self.passed,
+            "stability": self.stability.value,
+            "rests_on": self.decision.rests_on,
+            "reasons": list(self.reasons),
+            "remarks": list(self.remarks),
+            "verdict": verdict.finding.name.lower(),
+            "text": verdict.text,
+            "rise": _rise_to_json(verdict.rise),
+            "tolerance_j": verdict.tolerance,
+            "closed_groups": [list(group) for group in self.groups],
+            "premises": [premise.to_json() for premise in self.premises],
+            "growth": {
+                "motion": end.behaviour.name.lower(),
+                "text": end.text,
+                "where": end.where or None,
+                "error_rate_per_s": finite_or_none(end.error.rate_per_s),
+                "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
+                "end_error_rad": end.end_error_rad,
+                "end_error_where": end.end_error_where or None,
+                "end_speed_rad_s": end.end_speed_rad_s,
+                "end_speed_where": end.end_speed_where or None,
+            },
+            "evidence": self.evidence.to_json(),
+            "roots": None if self.roots is None else self.roots.to_json(),
+            "observed": None if self.observed is None else self.observed.to_json(),
+            "twins": None if self.twins is None else self.twins.to_json(),
+            "functional": None if balance is None else _functional_to_json(self, balance),
+        }
+
+    def to_rows(self) -> list[JsonObject]:
+        """Returns the conditions (premises) of the stability theorem as rows of a table.
+
+        A row has the keys "name", "holds" and "text", from which `to_frame` makes a data frame.
+        """
+        return [premise.to_json() for premise in self.premises]
+
+
+def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
+    """Converts the results about the energy function V to plain values for JSON output.
+
+    Args:
+        certificate: The certificate.
+        balance: Its energy balance, which must exist.
+    """
+    V = balance.V
+    sites = certificate.energies
+
+    paper_balance = certificate.paper_balance
+    paper_json: JsonObject | None = None
+    if paper_balance is not None:
+        paper_json = {
+            "v_first_j": float(paper_balance.V[0]),
+            "v_max_j": float(paper_balance.V.max()),
+            "rise": _rise_to_json(certificate.paper_weights_rise),
+        }
+
+    return {
+        "beta_first": dict(zip(sites, balance.beta[0].tolist(), strict=True)),
+        "beta_last": dict(zip(sites, balance.beta[-1].tolist(), strict=True)),
+        "v_first_j": float(V[0]),
+        "v_last_j": float(V[-1]),
+        "v_max_j": float(V.max()),
+        "parts_last_j": _last_values(balance.parts),
+        "taken_j": _last_values(balance.dissipation),
+        "given_j": _last_values(balance.work),
+        "sampling_j": float(balance.sampling[-1]),
+        "passed_on_j": float(balance.transfer[-1]),
+        "scale_j": balance.scale,
+        "residual_max_j": _largest(balance.residual),
+        "unexplained_max_j": _largest(balance.unexplained),
+        "sites_unexplained_max_j": {
+            site: _largest(energy.unexplained) for site, energy in sites.items()
+        },
+        "not_judged_s": find_unjudged_spans(balance),
+        "ones": paper_json,
+    }
+
+
+def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
+    """Returns a rise of V as plain values, with the keys of the JSON output."""
+    if rise is None:
+        return None
+    return {
+        "from_s": rise.from_s,
+        "at_s": rise.at_s,
+        "amount_j": rise.amount,
+        "causes_j": rise.causes,
+    }
+
+
+def _last_values(columns: dict[str, Array]) -> dict[str, float]:
+    """Returns the value at the end of the run of each curve, by the name of the curve."""
+    return {name: float(values[-1]) for name, values in columns.items()}
+
+
+def _largest(values: Array) -> float:
+    """Returns the largest absolute value."""
+    return float(np.abs(values).max())

@@ -1,0 +1,286 @@
+"""Defines the evidence on the stability of a run, and the decision that rests on it.
+
+`stability_decision` decides, and the package `presentation` writes the sentences about what a
+decision rests on and what prevents a better one.
+
+Invariant:
+    - A decision and its evidence contain only names and numbers, apart from phrases that the
+      control laws and the analysis of roots provide.
+    - Every name of `Basis` and of `Obstacle` refers to numbers in the evidence, `RunFindings`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+from ..hooks import find_hook
+from ..results import JsonObject
+from .certificate.observed_energy import ObservedEnergy
+from .certificate.verdict_facts import EvidenceDoubt, StabilityVerdict, UnsuppliedGrowth
+from .run_end import EndBehaviour, RunEnd, Stability
+from .twins.envelope_trend import EnvelopeTrend
+from .twins.twin_growth import DOUBLES, TwinGrowth
+
+_RATE_AGREEMENT_SHARE = 0.25
+"""Largest difference between the rates of a push and of the slowest root, as a share."""
+_RATE_AGREEMENT_PER_S = 2e-4
+"""Difference of these rates that always confirms the root, in 1/s."""
+
+Basis = Literal[
+    "nothing",
+    "divergence",
+    "end",
+    "roots",
+    "proofs",
+    "growing pushes",
+    "dying pushes",
+]
+"""What a decision rests on.
+
+"divergence" and "end" are the end of the run: an arm exceeded its limits, or its motion does
+not come to rest. "roots" are the exact roots of the loop, and "proofs" all proofs that exist.
+"growing pushes" and "dying pushes" are the repetitions of the run with small pushes. An open
+run may rest on nothing.
+"""
+Obstacle = Literal[
+    "divergence",
+    "end",
+    "missing records",
+    "hidden period",
+    "doubts",
+    "growing roots",
+    "short record",
+    "disputed proof",
+    "slow decay",
+    "missing pushes",
+    "unjudged pushes",
+    "unclear pushes",
+    "few bursts",
+    "unclear end",
+]
+"""What prevents a better decision.
+
+The first six are findings that speak against a stable run: an arm exceeded its limits, the end
+of the run has doubts, sites have no records, delays repeat only after the judged part, other
+analyses have doubts, or the roots show growth. The others say why nothing decides: the record
+is too short, its end does not agree with a proof, a numerical root decays too slowly to be told
+from lasting motion, no run with pushes was made or judged, the pushes show no clear trend, the
+judged part has few bursts of lost samples, or the end of the run shows no clear trend.
+"""
+Doubt = StabilityVerdict | UnsuppliedGrowth | ObservedEnergy | EvidenceDoubt
+"""A finding of another analysis that contradicts a stable run."""
+
+
+class LoopRoots(NamedTuple):
+    """Growth rates (roots) of small motions about the pose at which a run ended.
+
+    They are characteristic roots of the linearised control loop. If the real parts of all of
+    them are negative, small motions die away. `theory.loop_roots` computes them for every
+    command.
+
+    Attributes:
+        verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
+            cannot be linearised.
+        rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
+            of the structure of the loop. None if there is no such root.
+        exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
+            the roots may cast doubt on a run, but prove nothing.
+        distance_rad: Largest difference between the last angle of a joint and its angle at the
+            pose at rest to which the roots belong, in rad.
+        leaves_out: What the linearised loop leaves out, as a phrase, for example "how the
+            program at m2 reacts to the arms". Empty if it contains everything.
+        is_numerical: True if the code of a user's law was differentiated numerically. Such
+            roots can refute a run, but not prove it stable.
+        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. None
+            if no computed root oscillates.
+        omega_rad_s: Angular frequency of the root with the largest real part, in rad/s.
+        drifting: Number of motions that keep their speed, because of the structure of the loop.
+        span: Phrase for the ticks and delays over which the roots were computed, such as ", in
+            continuous time". Empty if every tick has the same delays.
+        reason: The reason why there are no roots. Empty if the loop was linearised.
+    """
+
+    verdict: str
+    rate_per_s: float | None
+    exact: bool
+    distance_rad: float = 0.0
+    leaves_out: str = ""
+    is_numerical: bool = False
+    swing_rate_per_s: float | None = None
+    omega_rad_s: float = 0.0
+    drifting: int = 0
+    span: str = ""
+    reason: str = ""
+
+    @property
+    def text(self) -> str:
+        """A sentence on the roots, or on the reason why there are none, for the user.
+
+        The package `presentation` writes it.
+        """
+        return str(find_hook("describe a finding")(self))
+
+    def to_json(self) -> JsonObject:
+        """Returns the roots as values for JSON, with the sentence about them."""
+        return {
+            "verdict": self.verdict,
+            "rate_per_s": self.rate_per_s,
+            "exact": self.exact,
+            "text": self.text,
+            "distance_rad": self.distance_rad,
+            "leaves_out": self.leaves_out,
+            "is_numerical": self.is_numerical,
+            "swing_rate_per_s": self.swing_rate_per_s,
+        }
+
+    @property
+    def proven(self) -> str:
+        """The verdict on small motions about the final pose that the roots prove.
+
+        It is "stable" if the motions decay and "unstable" if they grow. Only exact roots prove
+        it: those of a loop with its ticks and its repeating delays. Empty otherwise.
+        """
+        return self.verdict if self.exact else ""
+
+    @property
+    def is_proof(self) -> bool:
+        """True if the roots prove that small motions about the final pose decay."""
+        return self.proven == "stable"
+
+    @property
+    def is_refutation(self) -> bool:
+        """True if the roots prove that small motions about the final pose grow."""
+        return self.proven == "unstable"
+
+    def measure_decay_misfit(self, end: RunEnd) -> float:
+        """Measures how badly the slow decay of these roots explains an end that looks lasting.
+
+        An oscillation is compared with the roots that oscillate, because another slow root does
+        not explain the oscillation, and a drift with the slowest root. The decay is compatible
+        if the root halves the motion at most once in the judged part, so that no trend can show
+        the decay, or if |e| and |qd| have the rate of the root.
+
+        Args:
+            end: How the motion ends.
+
+        Returns:
+            A share without unit: at most 1 if the end may be the decay, infinity if the roots
+            are not numerical or not stable, or if the motion grows or is not lasting.
+        """
+        is_swing = end.behaviour is EndBehaviour.BOUNDED
+        is_lasting = is_swing or end.behaviour is EndBehaviour.DRIFTS
+        rate_per_s = self.swing_rate_per_s if is_swing else self.rate_per_s
+        is_stable = self.is_numerical and self.verdict == "stable"
+        if rate_per_s is None or not is_stable or not is_lasting:
+            return math.inf
+
+        misfits = []
+        for fit in (end.error, end.speed):
+            if fit.trend is EnvelopeTrend.GROWS:
+                return math.inf
+            misfits.append(_compute_rate_misfit(fit.rate_per_s, rate_per_s))
+
+        judged_s = 0.5 * (end.lasts_s - end.counts_from_s)
+        halvings = -rate_per_s * judged_s / math.log(DOUBLES)
+        return min(halvings, max(misfits))
+
+    def measure_rate_misfit(self, measured_per_s: float) -> float:
+        """Measures how much a measured rate differs from that of the slowest root.
+
+        Args:
+            measured_per_s: The measured rate, in 1/s.
+
+        Returns:
+            The difference divided by its tolerance: at most 1 if the rates agree, infinity if
+            there is no root.
+        """
+        if self.rate_per_s is None:
+            return math.inf
+        return _compute_rate_misfit(measured_per_s, self.rate_per_s)
+
+
+def _compute_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
+    """Returns the difference of a measured rate and a root, divided by its tolerance."""
+    tolerance_per_s = _RATE_AGREEMENT_SHARE * abs(root_per_s) + _RATE_AGREEMENT_PER_S
+    return abs(measured_per_s - root_per_s) / tolerance_per_s
+
+
+class RunFindings(NamedTuple):
+    """All evidence on the stability of a run, from which `decide_stability` decides.
+
+    Attributes:
+        end: How the motion ends.
+        twins: How small pushes in repeated runs develop. None if no run was repeated.
+        roots: Roots of the loop at the end of the run. None if they were not computed.
+        is_covered: True if the stability theorem proves the loop stable.
+        law_proofs: Phrases that name the stability conditions of control laws that prove the
+            loop stable.
+        doubts: Findings that contradict a stable run, such as an energy function that rises, or
+            missing records.
+        rises: True if the energy function V of the stability proof rose by energy that nobody
+            supplied.
+    """
+
+    end: RunEnd
+    twins: TwinGrowth | None = None
+    roots: LoopRoots | None = None
+    is_covered: bool = False
+    law_proofs: Sequence[str] = ()
+    doubts: Sequence[Doubt] = ()
+    rises: bool = False
+
+    @property
+    def has_proof(self) -> bool:
+        """True if the theorem, a control law or exact roots prove the loop stable."""
+        return self.is_covered or bool(self.law_proofs) or self.proven_by_roots == "stable"
+
+    @property
+    def proven_by_roots(self) -> str:
+        """The verdict that the roots prove: "stable", "unstable", or empty for none."""
+        return "" if self.roots is None else self.roots.proven
+
+
+class StabilityDecision(NamedTuple):
+    """Decision whether a run of coupled arms is stable, with the evidence for it.
+
+    Attributes:
+        stability: The decision.
+        findings: The evidence.
+        basis: Name of the evidence on which the decision rests.
+        obstacles: Names of what prevents a better decision. Empty if the run is stable.
+        advised_s: Length of a run that would show the decay of the slowest motion clearly, in
+            s. None if none is advised.
+    """
+
+    stability: Stability
+    findings: RunFindings
+    basis: Basis = "nothing"
+    obstacles: tuple[Obstacle, ...] = ()
+    advised_s: float | None = None
+
+    @property
+    def rests_on(self) -> str:
+        """What the decision rests on, as a phrase for the user. Empty if it rests on nothing.
+
+        The package `presentation` writes it.
+        """
+        return str(find_hook("describe a finding")(self))
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Sentences that prevent a better decision. Empty if the run is stable.
+
+        The package `presentation` writes them.
+        """
+        return tuple(find_hook("list the sentences of a finding")(self))
+
+    @property
+    def rests_on_roots_alone(self) -> bool:
+        """True if the decision rests on the exact roots of the loop, and on no other proof."""
+        has_other_proof = self.findings.is_covered or bool(self.findings.law_proofs)
+        return self.basis == "roots" or (self.basis == "proofs" and not has_other_proof)
+
+    @property
+    def is_too_short(self) -> bool:
+        """True if only the length of the record prevents a better decision."""
+        return "short record" in self.obstacles

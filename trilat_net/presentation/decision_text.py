@@ -1,0 +1,203 @@
+"""Writes what a decision about the stability of a run rests on, and what prevents a better one.
+
+`analysis.stability_decision` decides and returns names, and the evidence with its numbers. For
+example, this module states the basis "roots" as "exact roots, slowest -0.832 /s".
+
+Invariant:
+    - Each name of a basis has one function here, in `BASES`, and each name of an obstacle one
+      in `OBSTACLES`.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from ..analysis import EndBehaviour, decision_facts
+from ..errors import count_nouns
+from .verdict_text import THEOREM
+
+
+def _state_basis(decision: decision_facts.StabilityDecision) -> str:
+    """Returns what a decision rests on, as a phrase. Empty if it rests on nothing."""
+    return BASES[decision.basis](decision.findings)
+
+
+def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
+    """Returns sentences on everything that prevents a better decision.
+
+    Empty if the run is stable.
+    """
+    if decision.is_too_short:
+        return [_describe_short_record(decision.advised_s)]
+    reasons = []
+    for obstacle in decision.obstacles:
+        reasons += OBSTACLES[obstacle](decision.findings)
+    return reasons
+
+
+def _describe_roots(roots: decision_facts.LoopRoots) -> str:
+    """Returns a sentence on the roots at the end of a run, or why there are none."""
+    if not roots.verdict:
+        return f"this rest: no roots: {roots.reason}"
+    if roots.rate_per_s is None:
+        return f"this rest: {roots.verdict}, without roots"
+
+    omega = f" at {roots.omega_rad_s:.4g} rad/s" if roots.omega_rad_s else ""
+    drift = ""
+    if roots.drifting:
+        drift = f"{roots.drifting} of its motions keep their speed, the others "
+    rate = f"{drift}{roots.rate_per_s:+.3g} /s"
+    return f"this rest: {roots.verdict}, {rate}{omega}{roots.span}"
+
+
+def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
+    """Returns the phrase after "rests on:" if the roots of the loop decide.
+
+    For example "exact roots, slowest -0.832 /s": the mode that decays most slowly has the rate
+    of -0.832 per second. If the roots refute stability, the fastest growing mode is named
+    instead. Without a root that is not zero, the phrase has no rate.
+    """
+    name = "roots by numerical derivatives" if roots.is_numerical else "exact roots"
+    if roots.rate_per_s is None:
+        return name
+    decisive = "fastest growing" if roots.is_refutation else "slowest"
+    return f"{name}, {decisive} {roots.rate_per_s:+.3g} /s"
+
+
+def _state_end(run: decision_facts.RunFindings) -> str:
+    # The frequency of an oscillation is known only if all records are.
+    return f"the end of the run: {run.end._replace(frequency_hz=None).text}"
+
+
+def _state_roots(run: decision_facts.RunFindings) -> str:
+    assert run.roots is not None
+    return _describe_root_basis(run.roots)
+
+
+def _state_proofs(run: decision_facts.RunFindings) -> str:
+    """Returns phrases that name every proof of a stable loop, exact roots last."""
+    proofs = [THEOREM] if run.is_covered else []
+    proofs += run.law_proofs
+    if run.roots is not None and run.roots.is_proof:
+        proofs.append(_describe_root_basis(run.roots))
+    return "; ".join(proofs)
+
+
+def _state_pushes(run: decision_facts.RunFindings) -> str:
+    """Returns the basis of a settled run: the number of pushes, and why nothing proves more.
+
+    For example "8 pushes over 12 s, all of which died away; its roots are not exact".
+    """
+    assert run.twins is not None
+    pushes = len({growth.push.name for growth in run.twins.pushes})
+    duration_s = run.twins.to_s
+    ending = "all of which died away" if pushes > 1 else "which died away"
+    text = f"{count_nouns(pushes, 'push', 'pushes')} over {duration_s:.4g} s, {ending}"
+    roots = run.roots
+    if roots is None:
+        return text
+    if not roots.verdict:
+        return f"{text}; {roots.text}"
+    if roots.leaves_out:
+        return f"{text}; pushes and roots leave out {roots.leaves_out}"
+    if not roots.exact:
+        return f"{text}; its roots are not exact"
+    return text
+
+
+def _describe_twins(run: decision_facts.RunFindings) -> str:
+    assert run.twins is not None
+    return run.twins.text
+
+
+BASES: dict[decision_facts.Basis, Callable[[decision_facts.RunFindings], str]] = {
+    "nothing": lambda _: "",
+    "divergence": lambda run: run.end.text,
+    "end": _state_end,
+    "roots": _state_roots,
+    "proofs": _state_proofs,
+    "growing pushes": _describe_twins,
+    "dying pushes": _state_pushes,
+}
+"""For each basis of a decision, the function that writes its phrase."""
+
+
+def _list_missing_records(run: decision_facts.RunFindings) -> list[str]:
+    return [f"no record of {site}" for site in run.end.missing_sites]
+
+
+def _describe_period(run: decision_facts.RunFindings) -> list[str]:
+    """Returns a sentence for repetitions that were shorter than the period of the delays.
+
+    Pushes that died away then prove little, because the delays of the rest of the period were
+    never tried.
+    """
+    twins = run.twins
+    assert twins is not None
+    judged_s = twins.to_s - twins.from_s
+    sentence = (
+        f"the delays repeat after {twins.delay_period_s:.6g} s, but the twins were judged "
+        f"over {judged_s:.4g} s"
+    )
+    return [sentence]
+
+
+def _describe_growing_roots(run: decision_facts.RunFindings) -> list[str]:
+    assert run.roots is not None
+    return [run.roots.text]
+
+
+def _describe_short_record(advised_s: float | None) -> str:
+    if advised_s is None:
+        return "the run is too short to tell; try one of twice its length"
+    return f"the run is too short to tell; a run of {advised_s:.3g} s would"
+
+
+def _describe_slow_decay(run: decision_facts.RunFindings) -> list[str]:
+    assert run.roots is not None
+    lasting = "drift" if run.end.behaviour is EndBehaviour.DRIFTS else "oscillation"
+    sentence = (
+        f"too slow to be told from a lasting {lasting} in the judged part; its numerical "
+        f"roots decay at {run.roots.rate_per_s:.3g} /s"
+    )
+    return [sentence]
+
+
+def _explain_no_pushes(run: decision_facts.RunFindings) -> list[str]:
+    assert run.twins is not None
+    return [f"no proof exists, and no pushes were judged: {run.twins.why}"]
+
+
+def _describe_few_bursts(run: decision_facts.RunFindings) -> list[str]:
+    assert run.twins is not None
+    bursts = f"{run.twins.judged_bursts:.2g} bursts of lost samples"
+    return [f"{run.end.text}; the judged part has {bursts}, too few for an average"]
+
+
+OBSTACLES: dict[decision_facts.Obstacle, Callable[[decision_facts.RunFindings], list[str]]] = {
+    "divergence": lambda run: [run.end.text],
+    "end": lambda run: list(run.end.reasons),
+    "missing records": _list_missing_records,
+    "hidden period": _describe_period,
+    "doubts": lambda run: [doubt.text for doubt in run.doubts],
+    "growing roots": _describe_growing_roots,
+    "disputed proof": lambda _: ["the end of the run does not agree with its proof"],
+    "slow decay": _describe_slow_decay,
+    "missing pushes": lambda _: ["no proof exists, and no run with small pushes was made"],
+    "unjudged pushes": _explain_no_pushes,
+    "unclear pushes": lambda run: [_describe_twins(run)],
+    "few bursts": _describe_few_bursts,
+    "unclear end": lambda run: [run.end.text],
+}
+"""For each obstacle, the function that writes its sentences. `_list_reasons` itself writes the
+one on a short record.
+"""
+
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    decision_facts.StabilityDecision: _state_basis,
+    decision_facts.LoopRoots: _describe_roots,
+}
+"""The functions that describe the findings of this module, by the class of the finding."""
+SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
+    decision_facts.StabilityDecision: _list_reasons
+}
+"""The function that lists the reasons of a decision, by its class."""

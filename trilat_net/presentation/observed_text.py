@@ -1,0 +1,63 @@
+"""Writes the sentences on the energies that control laws declare, for people.
+
+`analysis.certificate.observed_energy` compares these energies with the records, and returns
+names and numbers.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from ..analysis import ObservedEnergy, ObservedFinding
+from ..errors import count_nouns
+
+NEGATIVE_ENERGY_MEANING = (
+    "an observed energy below zero, such as -0.85 mJ, means that at this tick one end of a "
+    "connection had taken out that much more energy than it knew to have been put in, its "
+    "reserve included, so that passivity proves nothing about the run, which may be stable all "
+    "the same"
+)
+"""What a negative energy means, in the same words wherever it is explained to the user."""
+_FINDINGS = {
+    ObservedFinding.PASSIVE: "observed energy never below zero",
+    ObservedFinding.NEGATIVE: "observed energy below zero",
+    ObservedFinding.BROKEN: "the energies that a law declares do not add up",
+    ObservedFinding.NOT_JUDGED: "observed energy cannot be judged",
+}
+
+
+def _describe_observed(observed: ObservedEnergy) -> str:
+    """Returns a sentence on whether the declared energies are true and stay above zero."""
+    return f"{_FINDINGS[observed.finding]}: {_describe_cause(observed)}"
+
+
+def _describe_cause(observed: ObservedEnergy) -> str:
+    """Returns the numbers behind the finding, or the reason why there are none."""
+    if observed.undeclared_sites:
+        return f"the law of {', '.join(observed.undeclared_sites)} declares none"
+    if observed.incomplete_sites:
+        return f"records of {', '.join(observed.incomplete_sites)} are missing"
+    if observed.finding is ObservedFinding.BROKEN:
+        return observed.premises[0].text
+    if observed.finding is ObservedFinding.NEGATIVE:
+        lowest = min(observed.least, key=lambda energy: energy.amount_j)
+        return f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
+
+    text = (
+        f"{count_nouns(len(observed.least), 'energy')}, the largest {observed.largest_j:.4g} J"
+    )
+    failed = [premise.name for premise in observed.premises if not premise.holds]
+    if failed:
+        text += f"; but a premise fails: {', '.join(failed)}"
+    return text
+
+
+def _explain_finding(finding: ObservedFinding) -> str:
+    """Returns what a finding means for a run. Empty if it needs no explanation."""
+    return NEGATIVE_ENERGY_MEANING if finding is ObservedFinding.NEGATIVE else ""
+
+
+DESCRIBERS: dict[type, Callable[[Any], str]] = {
+    ObservedEnergy: _describe_observed,
+    ObservedFinding: _explain_finding,
+}
+"""The functions that describe the findings of this module, by the class of the finding."""
