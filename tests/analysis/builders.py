@@ -12,13 +12,14 @@ import numpy as np
 import trilat_net
 from tests.log.builders import open_bytes, replace_fields, rewrite_log
 from tests.scenario.builders import rough_arm_text
+from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
     SiteEnergy,
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.core.step.ticks import LinkCounts
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork

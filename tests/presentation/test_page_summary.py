@@ -56,7 +56,7 @@ def make_certificate(
     """Returns a certificate of a run with a proof, with the given behaviour and error at its end."""
     certificate = make_run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     end = certificate.end._replace(
-        behaviour=behaviour, end_error_rad=error_rad, reasons=(), operator_acts=False
+        behaviour=behaviour, end_error_rad=error_rad, doubts=(), operator_acts=False
     )
     return replace(certificate, **{"end": end, "roots": STABLE_ROOTS, **fields})
 
