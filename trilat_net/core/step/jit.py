@@ -656,7 +656,13 @@ class _Leaf(CPUDispatcher):
         """
         plain_arguments = tuple(map(types.unliteral, arguments))
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
-        return super().get_call_template(plain_arguments, plain_keywords)
+        # The caller may be a function of Numba's own, such as one of a user's law. It too gets
+        # an inner leaf: a reference to machine code would be missing when it is loaded again.
+        _LeafCompiler.depth += 1
+        try:
+            return super().get_call_template(plain_arguments, plain_keywords)
+        finally:
+            _LeafCompiler.depth -= 1
 
     def add_overload(self, result: Any) -> None:
         """Stores a compiled form of the function, so that it need not be compiled again.
