@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from tests.cli.running import simulate_by_command
+from trilat_net.app.cli import run_progress
 from trilat_net.presentation import terminal_output
 
 from .running import trilat
@@ -99,6 +100,18 @@ def test_progress_off_terminals_goes_to_stderr(
     done = trilat(*arguments, cwd=tmp_path)
     assert line in done.err
     assert json.loads(done.out)
+
+
+def test_work_that_grows_prints_further_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sweep is refined in steps, each of which adds runs to those that were planned."""
+    make_terminal(monkeypatch, interactive=False)
+    lines: list[str] = []
+    with run_progress.show_progress("sweeping", lines.append) as show:
+        for first, total in ((0, 100), (100, 300)):
+            for done in range(first, total + 1):
+                show(done, total)
+    totals = [re.findall(r"\d+", line)[1] for line in lines]
+    assert totals == 9 * ["100"] + 6 * ["300"]
 
 
 def test_long_work_has_a_bar_that_disappears(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Shows the progress of commands with many runs, and runs a scenario live for such a command.
 
 A sweep or a tuning may take hours. `show_progress` shows a bar in a terminal. In a file or a
-pipe it prints at most ten lines with the remaining time.
+pipe it prints at most ten lines with the remaining time. If the number of all items grows, as
+in a sweep that is refined, it prints up to ten more.
 """
 
 from collections.abc import Callable, Iterator
@@ -49,6 +50,7 @@ def show_progress(
     first_call_ns = -1  # time of the first call of `show_line`, -1 before it
     done_at_first_call = 0
     printed_tenths = 0  # tenths of the items that were finished at the last printed line
+    last_total = 0
 
     def show_line(done: int, total: int) -> None:
         """Prints a line with the remaining time, about once per tenth of the items.
@@ -61,13 +63,16 @@ def show_progress(
             done: Number of finished items.
             total: Number of all items.
         """
-        nonlocal first_call_ns, done_at_first_call, printed_tenths
+        nonlocal first_call_ns, done_at_first_call, printed_tenths, last_total
         if first_call_ns < 0:
             # The time before the first item is the start of the processes, which does not
             # count towards the duration of an item.
             first_call_ns = clock.monotonic_ns()
             done_at_first_call = done
         finished_tenths = done * _PROGRESS_LINES // total
+        if total != last_total:
+            last_total = total
+            printed_tenths = finished_tenths
         has_no_remaining_time = done in (total, done_at_first_call)
         if has_no_remaining_time or finished_tenths <= printed_tenths:
             return
