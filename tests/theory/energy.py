@@ -97,3 +97,10 @@ def compute_shipped_balance(
         name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S}
     )
     return compute_balance(trajectory_of_run, left_null_vector(trajectory_of_run.scenario))
+
+
+def measure_order(name: str, scheme: str, rate_hz: int) -> float:
+    """Returns the order of the balance's error from half of a rate to that rate."""
+    coarse = compute_shipped_balance(name, scheme, rate_hz // 2).residual
+    fine = compute_shipped_balance(name, scheme, rate_hz).residual
+    return float(np.log2(coarse / fine))
