@@ -412,9 +412,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         scales["tau_x"][:] = user_limits.tau_limit_nm
         for index, peer in enumerate(base.peers(self.user)):
             limits = base.sites[peer].limits
-            # Rates and forces of shared poses are those of an end effector 1 m from its base.
-            scales["peer_qd"][index] = limits.qd_limit_rad_s
-            scales["peer_tau_x"][index] = limits.tau_limit_nm
+            speeds = np.array(limits.qd_limit_rad_s)
+            torques = np.array(limits.tau_limit_nm)
+            if base.arms[peer].shares_pose:
+                # Those of an end effector 1 m from the fastest and the strongest joint.
+                speeds = speeds.max()
+                torques = torques.max()
+            scales["peer_qd"][index] = speeds
+            scales["peer_tau_x"][index] = torques
 
         reach_m = self._find_reach_m()
         if base.arms[self.user].shares_pose:
