@@ -141,7 +141,8 @@ def test_a_shipped_law_is_called_by_its_name(tmp_path: Path) -> None:
             cwd=tmp_path,
         ).succeeds()
 
-    text = trilat("compare", "tdpa.mcap", "wave.mcap", "adaptive.mcap", cwd=tmp_path).succeeds()
+    logs = ["tdpa.mcap", "wave.mcap", "adaptive.mcap"]
+    text = trilat("compare", "--all", *logs, cwd=tmp_path).succeeds()
     assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(
         text.split()
     )
