@@ -25,7 +25,7 @@ from trilat_net.analysis.arm_rows import PlanarArmRows, build_arm_rows
 from trilat_net.core.life.resting import limit_torque_rate
 from trilat_net.core.plug.user_law import LawContext, LawInput
 from trilat_net.core.step.site_arrays import SiteArrays
-from trilat_net.core.step.site_setup import RestGains
+from trilat_net.core.step.site_setup import LEAST_STOP_S, RestGains
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, LifeOrder, Mode, TickInput
 from trilat_net.core.step.vectors import Array
@@ -101,7 +101,8 @@ def test_storage_falls_by_its_dissipation(how: str) -> None:
     theta = log.scenario.arms["m"].theta
     first = int(np.argmax(part.mode == ("hold" if how == "cut" else "stopped")))
     gains = log.scenario.setup("m").rest
-    still = int(np.argmax((part.qd_des == 0.0).all(axis=1) & (np.arange(len(part)) > first)))
+    brakes = np.arange(len(part)) < first + round(1e3 * LEAST_STOP_S)  # w loses B |qd| as well
+    still = int(np.argmax((part.qd_des == 0.0).all(axis=1) & ~brakes))
     rows = slice(still, 5900)
     q = part.q[rows]
     qd = part.qd[rows]
@@ -211,10 +212,12 @@ def test_one_stop_stops_a_learning_arm(at: int) -> None:
     """Damping and a frozen estimate took it from 0.61 rad/s to 5.12, over 1.92 rad."""
     log = make_ordered_log(load_scenario("free", HARNESS), {"m1": {at: "stop"}})
     part = log["m1"]
-    speed = np.abs(part.qd[at:]).max(axis=1)
+    before, *speed = np.abs(part.qd[at - 1 :]).max(axis=1)
     assert speed[0] > 0.5
-    assert speed.max() <= 1.02 * speed[0]
-    assert speed[700:].max() <= AT_REST_RAD_S
+    # The limit of the torque's rate leaves the acceleration of the order for some milliseconds.
+    acceleration = max((speed[0] - before) / 1e-3, 0.0)
+    assert max(speed) <= speed[0] + 8e-3 * acceleration
+    assert max(speed[700:]) <= AT_REST_RAD_S
     assert np.abs(part.q[at:] - part.q[at]).max() <= 0.07
 
 
