@@ -122,7 +122,7 @@ def test_recovering_blames_the_unwritable_file(tmp_path: Path) -> None:
         ("log", "check", str(LOG), "--key"),
         ("keys", "info"),
     ],
-    ids=" ".join,
+    ids=lambda arguments: " ".join(Path(word).name for word in arguments),
 )
 def test_contents_of_foreign_files_are_not_repeated(
     arguments: tuple[str, ...], tmp_path: Path
