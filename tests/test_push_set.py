@@ -26,3 +26,8 @@ def test_every_listed_test_exists() -> None:
         assert re.search(rf"^def {re.escape(case.partition('[')[0])}\(", text, re.MULTILINE), (
             name
         )
+
+
+def test_names_are_the_same_in_every_copy() -> None:
+    """A case that contains the folder of one copy of the program is not found in another."""
+    assert [name for name in read_long_tests() if re.search(r"[\[ ]/\w+/", name)] == []
