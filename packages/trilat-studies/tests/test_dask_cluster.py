@@ -128,7 +128,7 @@ def test_losing_a_worker_changes_no_byte(cluster: Cluster, tmp_path: Path) -> No
 
 
 @pytest.mark.long
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(900)  # five minutes for the run without a cluster alone
 def test_losing_a_worker_of_2000_cells_changes_nothing(
     cluster: Cluster, tmp_path: Path
 ) -> None:
