@@ -17,11 +17,9 @@ def describe(first: str, second: str) -> str:
 
 def test_changed_settings_are_named() -> None:
     other = load_scenario("paper", {"links.s->m1.delay_ms": 150.0, "seed": 2}).text
-    seed, delay_ms = (
-        "seed is 2 at s and 1 at m1",
-        "links.s->m1.delay_ms is 150.0 at s and 200.0 at m1",
+    assert describe(other, PAPER) == (
+        "seed is 2 at s and 1 at m1; links.s->m1.delay_ms is 150.0 at s and 200.0 at m1"
     )
-    assert describe(other, PAPER) == f"{seed}; {delay_ms}"
 
 
 def test_descriptions_are_named_last() -> None:
@@ -42,6 +40,12 @@ def test_further_settings_are_counted(count: int, end: str) -> None:
 @pytest.mark.parametrize("text", ["= no", "a = " + 5000 * "["])
 def test_unreadable_scenarios_name_nothing(text: str) -> None:
     assert describe(text, PAPER) == ""
+
+
+def test_long_values_differ_beyond_their_printed_part() -> None:
+    """A value is cut only where it is printed."""
+    first = f"a = {list(range(99))}"
+    assert describe(first, first.replace("98", "0")).startswith("a is [0, 1, 2")
 
 
 def test_equal_scenarios_name_nothing() -> None:

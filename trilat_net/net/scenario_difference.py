@@ -13,10 +13,14 @@ import tomllib
 from collections.abc import Iterator
 from typing import Any
 
+from ..errors import count_nouns
+
 LISTED_SETTINGS = 3
 """Number of settings whose values are stated. The others are counted."""
 _VALUE_LENGTH = 40
 """Longest text of a value, in characters."""
+_NAME_LENGTH = 80
+"""Longest name of a setting, in characters."""
 _ABSENT = "absent"
 _DESCRIPTIONS = ("title", "about", "assumed")
 """Settings that have no effect. They are named last."""
@@ -42,24 +46,25 @@ def describe_scenario_difference(
     second = _read_settings(second_text)
     if first is None or second is None:
         return ""
+    # Values are compared whole, and cut only where they are printed.
     names = [name for name in (second | first) if first.get(name) != second.get(name)]
     names.sort(key=_DESCRIPTIONS.__contains__)
     phrases = []
     for name in names[:LISTED_SETTINGS]:
-        first_value = first.get(name, _ABSENT)
-        second_value = second.get(name, _ABSENT)
+        first_value = _shorten(first.get(name, _ABSENT))
+        second_value = _shorten(second.get(name, _ABSENT))
         phrases.append(
-            f"{name} is {first_value} at {first_member} and {second_value} at {second_member}"
+            f"{_shorten(name, _NAME_LENGTH)} is {first_value} at {first_member} "
+            f"and {second_value} at {second_member}"
         )
     more = len(names) - LISTED_SETTINGS
     if more > 0:
-        settings = "setting differs" if more == 1 else "settings differ"
-        phrases.append(f"{more} more {settings}")
+        phrases.append(count_nouns(more, "more setting differs", "more settings differ"))
     return "; ".join(phrases)
 
 
 def _read_settings(text: str) -> dict[str, str] | None:
-    """Returns the settings of a scenario by their dotted names, with their values as text.
+    """Returns the settings of a scenario by their dotted names, with their values as JSON.
 
     Args:
         text: The scenario, in TOML.
@@ -76,16 +81,16 @@ def _read_settings(text: str) -> dict[str, str] | None:
 def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yields the dotted name and the value of each setting of a table and of its subtables."""
     for key, value in table.items():
-        name = prefix + _shorten(key)
+        name = prefix + key
         if isinstance(value, dict):
             yield from _list_settings(value, f"{name}.")
         else:
-            yield name, _shorten(json.dumps(value, default=str))
+            yield name, json.dumps(value, default=str)
 
 
-def _shorten(text: str) -> str:
-    """Returns a text without control characters, cut to `_VALUE_LENGTH` characters."""
+def _shorten(text: str, length: int = _VALUE_LENGTH) -> str:
+    """Returns a text without control characters, cut to a number of characters."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
-    if len(printable) <= _VALUE_LENGTH:
+    if len(printable) <= length:
         return printable
-    return printable[: _VALUE_LENGTH - 3] + "..."
+    return printable[: length - 3] + "..."
