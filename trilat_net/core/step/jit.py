@@ -25,8 +25,8 @@ import pickle
 import re
 import sys
 import zlib
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -486,7 +486,7 @@ class _LeafCompiler(Compiler):
     inner leaf, and becomes a part of its caller.
 
     Attributes:
-        depth: Number of leaves that are being compiled now, one within another.
+        depth: Number of compiled callers that need leaves now, one within another.
         library_class: Class of the code of a leaf that is not an inner leaf.
         has_distinct_arguments: True if the arguments of a leaf that is not an inner leaf never
             overlap in memory.
@@ -524,11 +524,8 @@ class _LeafCompiler(Compiler):
             state.flags.no_cfunc_wrapper = True
 
         # A leaf that Numba compiles meanwhile is an inner leaf.
-        _LeafCompiler.depth += 1
-        try:
+        with _compiling_caller():
             result = super().compile_extra(function)
-        finally:
-            _LeafCompiler.depth -= 1
 
         if is_inner:
             return _as_inner(result)
@@ -538,6 +535,16 @@ class _LeafCompiler(Compiler):
         for environment in result._find_referenced_environments():
             result.library.codegen.set_env(environment.env_name, environment)
         return result
+
+
+@contextmanager
+def _compiling_caller() -> Iterator[None]:
+    """Makes each leaf an inner leaf that Numba compiles or looks up within the context."""
+    _LeafCompiler.depth += 1
+    try:
+        yield
+    finally:
+        _LeafCompiler.depth -= 1
 
 
 def _prefer_wide_vectors(llvm_code: str) -> str:
@@ -658,11 +665,8 @@ class _Leaf(CPUDispatcher):
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
         # The caller may be a function of Numba's own, such as one of a user's law. It too gets
         # an inner leaf: a reference to machine code would be missing when it is loaded again.
-        _LeafCompiler.depth += 1
-        try:
+        with _compiling_caller():
             return super().get_call_template(plain_arguments, plain_keywords)
-        finally:
-            _LeafCompiler.depth -= 1
 
     def add_overload(self, result: Any) -> None:
         """Stores a compiled form of the function, so that it need not be compiled again.
