@@ -101,7 +101,8 @@ def test_keys_are_complete_or_absent(
     failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk refuses the n-th file, or Ctrl-C comes there: earlier files are removed too."""
-    put, written = member_keys._write_new_file, list[Path]()
+    put = member_keys._write_new_file
+    written: list[Path] = []
 
     def refuse(error: BaseException) -> Callable[[Path, bytes], None]:
         def act(path: Path, content: bytes) -> None:

@@ -209,7 +209,9 @@ def test_held_arms_return_from_free_motion() -> None:
     part = trilat_net.simulate(scenario)["s"]
     assert (np.abs(part.tau) < scenario.sites["s"].limits.tau_limit_nm).all()
 
-    resting, pushed, returned = 2499, 3700, 5000
+    resting = 2499
+    pushed = 3700
+    returned = 5000
     assert set(part.mode[resting:6000]) == {"hold"}
     distance = np.abs(part.q - part.q[resting]).max(axis=1)
     assert distance[pushed] >= 0.05

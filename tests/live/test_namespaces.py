@@ -93,9 +93,12 @@ class Heard:
 
 def list_heard(log: Log, site: str, peer: str) -> Heard:
     states = log[site].states
-    place = log.scenario.peers(site).index(peer)
+    peer_index = log.scenario.peers(site).index(peer)
     arrivals = [
-        (state.tick, tick) for state in states for index, tick, _ in state.rx if index == place
+        (state.tick, tick)
+        for state in states
+        for index, tick, _ in state.rx
+        if index == peer_index
     ]
     ticks = sorted({tick for tick, _ in arrivals})
     outages = [(before, after) for before, after in pairwise(ticks) if after - before > 1000]

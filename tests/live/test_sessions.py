@@ -54,8 +54,8 @@ def test_frozen_sites_on_slow_links_keep_bits(stage: Stage) -> None:
 def ping_waiting_session(session: Session) -> None:
     """Asserts that a ping is answered before the session begins; the ping joins nothing."""
     to = connection_options(session.endpoints)
-    words = ("ping", "--session", "t", "--count", "10", *to)
-    printed = trilat(*words, cwd=session.log.parent).succeeds()
+    arguments = ("ping", "--session", "t", "--count", "10", *to)
+    printed = trilat(*arguments, cwd=session.log.parent).succeeds()
     assert "session t waits for its members" in printed
     assert "the same clock" in printed
     assert "between the sites" not in printed

@@ -37,10 +37,10 @@ def watch_session(stage: Stage, session: str) -> Iterator[int]:
     """`trilat watch` with a terminal, whose keys are pressed at the other end, once it shows the session."""
     keys, terminal = pty.openpty()
     printed = stage.folder / "watch.printed"
-    words = [*COMMAND, "watch", "--session", session]
+    command = [*COMMAND, "watch", "--session", session]
     with printed.open("wb") as sink:
         owns = {"stdin": terminal, "start_new_session": True, "preexec_fn": own_terminal}
-        watch = subprocess.Popen(words, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
+        watch = subprocess.Popen(command, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
     try:
         until(
             lambda: "m1" in printed.read_text(encoding="utf-8") or watch.poll() is not None,

@@ -103,10 +103,10 @@ def make_bytes_of_messages(
 
 def make_parts(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> list[bytes]:
     """Returns the parts of a log: file n has the messages whose indices are in `hands[n]`, in their order."""
-    every = read_messages(data)
+    messages = read_messages(data)
     return [
         make_bytes_of_messages(
-            data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs
+            data, [messages[index] for index in sorted(hand)], part=n + 1, **kwargs
         )  # type: ignore[arg-type]
         for n, hand in enumerate(hands)
     ]

@@ -175,8 +175,8 @@ def test_events_are_in_their_order_of_arrival() -> None:
         ("s", None, 2**64 - 1),
     ]
     assert sorted(rows["boots"]) == ["", '{"m1": 5}']
-    every = read_messages(make_log_bytes("paper"))
-    ends = [m for m in every if m[0].endswith("/event")]
+    messages = read_messages(make_log_bytes("paper"))
+    ends = [m for m in messages if m[0].endswith("/event")]
     late = [
         (topic, payload, 10**9 - n, sent, number)
         for n, (topic, payload, _, sent, number) in enumerate(ends)
@@ -211,8 +211,8 @@ def test_arrivals_of_missing_peers_are_refused() -> None:
 
 
 def test_numbers_beyond_64_bits_are_refused() -> None:
-    every = read_messages(make_log_bytes("paper"))
-    event = next(m for m in every if m[0].endswith("/event"))
+    messages = read_messages(make_log_bytes("paper"))
+    event = next(m for m in messages if m[0].endswith("/event"))
     log = open_bytes(
         make_bytes_of_messages(
             make_log_bytes("paper"), [change_message(event, ticks=2**64 - 1)]

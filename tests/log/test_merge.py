@@ -99,8 +99,8 @@ def place_of(topic_end: str, number: int = 0) -> int:
 def test_contradicting_parts_are_refused_by_name(
     where: str, fields: dict[str, object], named: str, tmp_path: Path
 ) -> None:
-    every = read_messages(make_whole_bytes())
-    other: list[Message] = [change_message(every[place_of(where)], **fields)]
+    messages = read_messages(make_whole_bytes())
+    other: list[Message] = [change_message(messages[place_of(where)], **fields)]
     paths = [tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"]
     paths[0].write_bytes(make_whole_bytes())
     paths[1].write_bytes(make_bytes_of_messages(make_whole_bytes(), other))
@@ -134,18 +134,18 @@ def test_other_sessions_are_refused_with_differences(
 
 
 def test_parts_fill_holes_of_torn_parts() -> None:
-    every = read_messages(make_whole_bytes())
-    torn = make_bytes_of_messages(make_whole_bytes(), every[:150], finished=False)
-    carried_on = make_bytes_of_messages(make_whole_bytes(), every[100:], part=2)
+    messages = read_messages(make_whole_bytes())
+    torn = make_bytes_of_messages(make_whole_bytes(), messages[:150], finished=False)
+    carried_on = make_bytes_of_messages(make_whole_bytes(), messages[100:], part=2)
     assert not open_bytes(torn).complete
     assert not open_bytes(carried_on).complete
     assert open_parts(torn, carried_on).complete
 
 
 def test_a_record_missing_in_all_parts_is_missing() -> None:
-    every = read_messages(make_whole_bytes())
-    torn = make_bytes_of_messages(make_whole_bytes(), every[:150], finished=False)
-    log = open_parts(torn, make_bytes_of_messages(make_whole_bytes(), every[151:], part=2))
+    messages = read_messages(make_whole_bytes())
+    torn = make_bytes_of_messages(make_whole_bytes(), messages[:150], finished=False)
+    log = open_parts(torn, make_bytes_of_messages(make_whole_bytes(), messages[151:], part=2))
     assert not log.complete
     assert sum(map(log.missing, log.sites)) == 1
     assert sum("missing 1" in log.account(name) for name in log.sites) == 1
@@ -158,10 +158,10 @@ def test_unfinished_parts_leave_the_whole_incomplete() -> None:
     assert open_parts(*parts).complete
     assert not open_parts(parts[0], parts[2]).complete
     assert not open_bytes(parts[2]).complete
-    every = read_messages(make_whole_bytes())
+    messages = read_messages(make_whole_bytes())
     assert not open_parts(
-        make_bytes_of_messages(make_whole_bytes(), every[:50]),
-        make_bytes_of_messages(make_whole_bytes(), every[50:], finished=False),
+        make_bytes_of_messages(make_whole_bytes(), messages[:50]),
+        make_bytes_of_messages(make_whole_bytes(), messages[50:], finished=False),
     ).complete
 
 
@@ -202,12 +202,14 @@ def test_drops_counted_across_parts_are_counted_once() -> None:
 
 
 def test_unnumbered_events_differ_by_content() -> None:
-    every = read_messages(make_whole_bytes())
-    place = place_of("m1/event")
-    old = [change_message(every[place], n=-1, text=text) for text in ("a", "b")]
+    messages = read_messages(make_whole_bytes())
+    event_index = place_of("m1/event")
+    old = [change_message(messages[event_index], n=-1, text=text) for text in ("a", "b")]
     log = open_parts(
         make_bytes_of_messages(make_whole_bytes(), old),
-        make_bytes_of_messages(make_whole_bytes(), [*old, every[place_of("m1/state")]], part=2),
+        make_bytes_of_messages(
+            make_whole_bytes(), [*old, messages[place_of("m1/state")]], part=2
+        ),
     )
     assert [event.text for event in log.events] == ["a", "b"]
 
@@ -226,13 +228,13 @@ def test_progress_covers_all_parts(tmp_path: Path) -> None:
 
 
 def test_parts_with_invalid_messages_are_named(tmp_path: Path) -> None:
-    every = read_messages(make_whole_bytes())
+    messages = read_messages(make_whole_bytes())
     first = tmp_path / "run-001.mcap"
     second = tmp_path / "run-002.mcap"
-    first.write_bytes(make_bytes_of_messages(make_whole_bytes(), every[:100]))
+    first.write_bytes(make_bytes_of_messages(make_whole_bytes(), messages[:100]))
     second.write_bytes(
         make_bytes_of_messages(
-            make_whole_bytes(), [(every[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2
+            make_whole_bytes(), [(messages[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2
         )
     )
     with pytest.raises(

@@ -56,7 +56,7 @@ def list_chunks(data: bytes) -> list[Chunk]:
     """The chunks of a whole file, by its index."""
     summary = make_reader(io.BytesIO(data)).get_summary()
     assert summary is not None
-    every = iter(read_messages(data))
+    messages = iter(read_messages(data))
     all_chunks = []
     for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
         begin = index.chunk_start_offset
@@ -67,7 +67,9 @@ def list_chunks(data: bytes) -> list[Chunk]:
             (size,) = struct.unpack_from("<Q", data, at + 1)
             entries += (size - 6) // 16
             at += 9 + size
-        all_chunks.append(Chunk(begin, begin + length, [next(every) for _ in range(entries)]))
+        all_chunks.append(
+            Chunk(begin, begin + length, [next(messages) for _ in range(entries)])
+        )
     return all_chunks
 
 

@@ -42,12 +42,16 @@ counts = st.integers(0, 30)
 @given(counts, st.lists(st.one_of(st.integers(-35, 35), st.slices(30)), max_size=10))
 def test_site_logs_equal_lists_of_records(count: int, looks: list[int | slice]) -> None:
     payloads = [str(n).encode() for n in range(count)]
-    every = decode_ticks(payloads)
+    all_records = decode_ticks(payloads)
     some = LazyRecords(payloads, decode_ticks)
-    assert (len(some), list(some), list(reversed(some))) == (count, every, every[::-1])
+    assert (len(some), list(some), list(reversed(some))) == (
+        count,
+        all_records,
+        all_records[::-1],
+    )
     for look in looks:
         try:
-            expected = every[look]
+            expected = all_records[look]
         except IndexError:
             with pytest.raises(IndexError):
                 some[look]

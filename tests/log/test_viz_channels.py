@@ -315,14 +315,14 @@ def test_events_become_text_with_levels(kind: str, level: int) -> None:
         "/viz/events",
         "m: ü happened",
     )
-    shown = _make_decoder(line.message[0])(line.message[1])
-    assert (line.topic, shown.level, shown.name, shown.msg) == (
+    entry = _make_decoder(line.message[0])(line.message[1])
+    assert (line.topic, entry.level, entry.name, entry.msg) == (
         "/viz/log",
         level,
         "m",
         "ü happened",
     )
-    assert shown.stamp.sec * 10**9 + shown.stamp.nanosec == EPOCH_NS + 5
+    assert entry.stamp.sec * 10**9 + entry.stamp.nanosec == EPOCH_NS + 5
     assert text.publish_ns == text.log_ns == line.publish_ns == line.log_ns == EPOCH_NS + 9
 
 
@@ -338,16 +338,16 @@ def test_early_events_have_their_arrival_time() -> None:
 
 def test_views_leave_other_messages_unchanged() -> None:
     other_messages = []
-    shown = []
+    has_views = []
     for views_hz in (0.0, 100.0):
         scenario = load_scenario("paper", {"duration_s": 0.5})
-        every = read_messages(simulate_bytes(scenario, views_hz=views_hz))
+        messages = read_messages(simulate_bytes(scenario, views_hz=views_hz))
         other_messages.append(
-            [message for message in every if not message.topic.startswith("/viz")]
+            [message for message in messages if not message.topic.startswith("/viz")]
         )
-        shown.append(len(every) > len(other_messages[-1]))
+        has_views.append(len(messages) > len(other_messages[-1]))
     assert other_messages[0] == other_messages[1]
-    assert shown == [False, True]
+    assert has_views == [False, True]
 
 
 def test_parts_end_with_all_extremes() -> None:

@@ -122,7 +122,8 @@ def test_routers_admit_by_password_and_filter(tmp_path: Path) -> None:
             enter("guessed")
         with pytest.raises(RouterSilent):
             ZenohBus([], endpoints, "client")
-        first, other = enter("secret"), enter("secret")
+        first = enter("secret")
+        other = enter("secret")
         first.announce("trilat/lab/one/alive/1")
         first.respond("trilat/lab/one/ping", lambda sent: sent)
         assert until(other.presence("trilat/lab/*/alive/*").poll) == (

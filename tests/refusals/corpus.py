@@ -70,17 +70,17 @@ def read_cases(file: str, kind: type[CaseKind], folder: Path = FOLDER) -> list[C
     assert list(tables) == ["case"], f"{file}: the file must consist of tables [[case]]"
     cases: list[CaseKind] = []
     for number, table in enumerate(tables["case"], start=1):
-        place = f"{file}, case {number} ({table.get('name', 'without a name')})"
+        location = f"{file}, case {number} ({table.get('name', 'without a name')})"
         try:
             case = msgspec.convert(table, kind)
         except msgspec.ValidationError as error:
-            raise AssertionError(f"{place}: {error}") from None
-        assert case.name, f"{place}: the name is empty"
-        assert any([case.path, *case.words]), f"{place}: path and words are empty"
+            raise AssertionError(f"{location}: {error}") from None
+        assert case.name, f"{location}: the name is empty"
+        assert any([case.path, *case.words]), f"{location}: path and words are empty"
         for earlier in cases:
-            assert earlier.name != case.name, f"{place}: an earlier case has this name"
+            assert earlier.name != case.name, f"{location}: an earlier case has this name"
             is_repeated = _list_inputs(earlier) == _list_inputs(case)
-            assert not is_repeated, f"{place}: has the input of the case {earlier.name}"
+            assert not is_repeated, f"{location}: has the input of the case {earlier.name}"
         cases.append(case)
     return cases
 

@@ -27,10 +27,12 @@ class ConnectionCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 @parametrize_cases("connections.toml", ConnectionCase)
 def test_contradicting_connections_are_refused(case: ConnectionCase) -> None:
-    own = check_zenoh_file(NAME, case.file, lambda _: "") if case.file else None
+    zenoh_settings = check_zenoh_file(NAME, case.file, lambda _: "") if case.file else None
     defaults = {"listen_else": ["tcp/127.0.0.1:1"], "connect_else": ["tcp/127.0.0.1:2"]}
     with pytest.raises(UsageError) as caught:
-        Connection.of_member(case.listen, case.connect, case.routers, own, **defaults)
+        Connection.of_member(
+            case.listen, case.connect, case.routers, zenoh_settings, **defaults
+        )
     case.check_message(str(caught.value), caught.value.exit_code)
 
 

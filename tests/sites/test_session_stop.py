@@ -197,19 +197,19 @@ def test_sites_too_far_apart_report_once(tmp_path: Path) -> None:
 
 def test_arms_without_glide_name_the_command(tmp_path: Path) -> None:
     session = Session.whole(load_scenario("two_sites", {"duration_s": 2.0}), tmp_path, ends={})
-    said: list[str] = []
+    refusals: list[str] = []
 
     def order(bus: Bus, clock: RelayClock) -> None:
         sleep_for_ns(clock, 1_200_000_000)
-        said.extend(
-            one.text
-            for one in reach_session(bus, clock).send_order(["s"], "stop")
-            if not one.accepted
+        refusals.extend(
+            reply.text
+            for reply in reach_session(bus, clock).send_order(["s"], "stop")
+            if not reply.accepted
         )
 
     session.stranger(order)
     session.run()
-    assert "trilat stop --end" in said[0]
+    assert "trilat stop --end" in refusals[0]
 
 
 def test_an_absent_session_is_not_stopped() -> None:

@@ -60,8 +60,8 @@ def compute_balance(run: Trajectories, beta: Array) -> Balance:
     rate_hz = scenario.sites[names[0]].rate_hz
     h = 1.0 / rate_hz
     V = 0.0
-    taken = 0.0
-    given = 0.0
+    dissipated = 0.0
+    supplied = 0.0
     for weight, name in zip(beta, names, strict=True):
         site = run.sites[name]
         spec = scenario.sites[name]
@@ -84,9 +84,9 @@ def compute_balance(run: Trajectories, beta: Array) -> Balance:
             )
             loss += 0.5 * share * (Kd * (site.qd - delayed_speeds) ** 2).sum(1)
         V = V + weight * 0.5 * v
-        taken = taken + weight * integrate(loss, h)
-        given = given + weight * integrate((r * -site.tau_x).sum(1), h)
-    return Balance(np.asarray(V), np.asarray(taken), np.asarray(given))
+        dissipated = dissipated + weight * integrate(loss, h)
+        supplied = supplied + weight * integrate((r * -site.tau_x).sum(1), h)
+    return Balance(np.asarray(V), np.asarray(dissipated), np.asarray(supplied))
 
 
 def compute_shipped_balance(

@@ -225,7 +225,8 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     assert list_effective_commands(log) == []
     assert RunEnd.of_log(log) == RunEnd.of_log(plain)
     assert find_log_roots(log) == find_log_roots(plain)
-    commanded, planned = certify_run(log).decision, certify_run(plain).decision
+    commanded = certify_run(log).decision
+    planned = certify_run(plain).decision
     assert commanded.stability is planned.stability
     assert (commanded.rests_on, commanded.reasons) == (planned.rests_on, planned.reasons)
 

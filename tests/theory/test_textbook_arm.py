@@ -161,8 +161,10 @@ def test_drives_and_stops_equal_compiled_leaves(name: str) -> None:
 
 def test_planar_arms_are_two_joint_chains() -> None:
     """Rods of different lengths, hung on z axes in the x-y plane."""
-    l1, m1 = 0.7, 1.3
-    l2, m2 = 1.1, 0.8
+    l1 = 0.7
+    m1 = 1.3
+    l2 = 1.1
+    m2 = 0.8
     g = 9.81
     outer = m2 * l2 * l2 / 3.0
     axis = (0.0, 0.0, 1.0)

@@ -86,10 +86,10 @@ class People(ManualClock):
         super().sleep_until(deadline_ns)
         self.stage.poll(NO_SESSION, [(site, n) for n, site in enumerate(self.stage.users)])
         for n, site in enumerate(self.stage.users):
-            shown = self.stage.describe("user", site, n, None)
-            items = shown.get("form", {}).get("items", {})
-            message = DoStep(key=shown.get("key", ""), answers=[self._answer] * len(items))
-            if not shown.get("done") and self.stage.accept(site, n, message):
+            stage_view = self.stage.describe("user", site, n, None)
+            items = stage_view.get("form", {}).get("items", {})
+            message = DoStep(key=stage_view.get("key", ""), answers=[self._answer] * len(items))
+            if not stage_view.get("done") and self.stage.accept(site, n, message):
                 self.steps.append((site, message.key))
 
     def run(self, fault: Fault = lambda _, __: None) -> bool:

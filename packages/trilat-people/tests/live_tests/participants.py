@@ -98,20 +98,20 @@ class Participant:
 
     def look(self) -> dict[str, Any]:
         """Returns what the page shows of the stage, and where its arm and target are."""
-        shown: dict[str, Any] = self.page.evaluate(LOOK, [self.site, self.beyond_m])
-        return shown
+        stage: dict[str, Any] = self.page.evaluate(LOOK, [self.site, self.beyond_m])
+        return stage
 
     def act(self) -> dict[str, Any]:
         """Does the next thing that the page asks for, and returns what the page shows."""
-        shown = self.look()
-        if shown.get("running"):
-            self._reach(shown)
+        stage = self.look()
+        if stage.get("running"):
+            self._reach(stage)
         else:
             self._done = None
             self._read_feedback()
-            if shown.get("key") and not shown.get("done") and not shown.get("second"):
-                self._reply(shown)
-        return shown
+            if stage.get("key") and not stage.get("done") and not stage.get("second"):
+                self._reply(stage)
+        return stage
 
     def _read_feedback(self) -> None:
         feedback = self.page.evaluate(

@@ -396,8 +396,8 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
     refusals = Refusals(said.append)
     clock = ManualClock()
     topic = DominanceTopic(["m1", "m2"], change, clock)
-    take = refusals.guard("t/s/set_dominance", topic.receive)
-    ask = refusals.guard("t/s/set_dominance", topic.send_request)
+    receive_shares = refusals.guard("t/s/set_dominance", topic.receive)
+    send_shares = refusals.guard("t/s/set_dominance", topic.send_request)
     for data in (
         pack_shares(0.9, 0.1),
         pack_shares(0.9, 0.1),
@@ -406,9 +406,9 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
         pack_shares(math.nan, 0.0),
         b"x",
     ):
-        take(data, FIRST)
-        ask()
-        ask()
+        receive_shares(data, FIRST)
+        send_shares()
+        send_shares()
     assert requests == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
     assert said == [
         "refused: t/s/set_dominance must sum to 1",
@@ -418,8 +418,8 @@ def test_shares_are_requested_once_and_refusals_are_reported() -> None:
     ]
     # whoever asks for the same later may have been overruled meanwhile
     clock.sleep_until(2 * SENDER_TIMEOUT_NS)
-    take(pack_shares(0.5, 0.1), FIRST)
-    ask()
+    receive_shares(pack_shares(0.5, 0.1), FIRST)
+    send_shares()
     assert requests[2:] == [{"m1": 0.5, "m2": 0.1}]
 
 
