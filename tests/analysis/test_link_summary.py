@@ -302,7 +302,7 @@ def test_playout_makes_smaller_jitter_constant():
     use = summarise_busy_run()["b->c"]
     assert use.drawn_ms.deviation == pytest.approx(20.0, rel=0.4)
     assert use.age_ms.p50 < 80.0  # a tick of 5 ms, a sample every 6.67 ms
-    assert use.stated[0].link.moments().deviation_ms < 21.0
+    assert use.stated.models[0].link.moments().deviation_ms < 21.0
 
 
 # -- spreads and histograms
@@ -332,7 +332,7 @@ def test_one_age_gives_one_bin():
 def test_an_empty_log_has_no_link_statistics():
     log = rewrite_log(make_short_log("paper"), keep=lambda _: False, finished=False)
     for use in summarise_links(log):
-        assert use.stated[0].link.delay_ms == 200.0
+        assert use.stated.models[0].link.delay_ms == 200.0
         assert use.plain
         assert (use.age_ms, use.ages, use.counts, use.loss, use.burst, use.silence_ms) == (
             None,

@@ -17,7 +17,7 @@ from tests.presentation.figure_content import list_curves
 from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.link_summary import DelayDistribution
-from trilat_net.analysis.timeline import find_mode_intervals
+from trilat_net.analysis.timeline import Timeline
 from trilat_net.errors import UsageError
 from trilat_net.presentation import style
 from trilat_net.presentation.appearance import SITE_COLOURS, list_site_colours
@@ -86,6 +86,7 @@ def test_a_log_without_events_has_no_markers():
 
 def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
     log = make_busy_run().log
+    timeline = Timeline(log)
     figure = joint_motion.draw_positions(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
         for axes in row:
@@ -97,11 +98,11 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
                 edge for p in axes.patches for edge in (p.get_x(), p.get_x() + p.get_width())
             ]
             assert drawn == pytest.approx(
-                [edge for span in find_mode_intervals(log[site]) for edge in span[1:]]
+                [edge for span in timeline.find_mode_intervals(site) for edge in span[1:]]
             )
     shades, changes = list_marks(joint_motion.draw_tracking_errors(log))
     assert len(changes) == 3 * 3
-    assert len(shades) == 3 * sum(len(find_mode_intervals(log[site])) for site in log.sites)
+    assert len(shades) == 3 * sum(len(timeline.find_mode_intervals(site)) for site in log.sites)
     assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
     assert "holds" in figure.get_supxlabel()
     monkeypatch.setattr(style, "MOST_EXPLAINED_CHANGES", 1)

@@ -109,23 +109,17 @@ __all__ = [
     # Links, leaders and events
     "DelayDistribution",
     "FileOverview",
-    "StatedModel",
     "find_closed_groups",
-    "find_mode_intervals",
     "find_program",
     "find_user_shares",
     "find_users",
-    "has_one_constant_delay",
     "info",
     "left_perron_vector",
     "link_summary",
-    "list_alarms",
-    "list_changes",
     "list_ramps",
-    "list_stated_models",
     "measure_delay_distributions",
     "plan_dominance",
-    "recorded_end_s",
+    "Timeline",
     "sample_ages_ns",
     "summarise_run",
     "trace_dominance",
@@ -161,12 +155,7 @@ if TYPE_CHECKING:
     )
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
-    from .link_summary import (
-        DelayDistribution,
-        has_one_constant_delay,
-        measure_delay_distributions,
-        sample_ages_ns,
-    )
+    from .link_summary import DelayDistribution, measure_delay_distributions, sample_ages_ns
     from .metrics.log_metrics import LogMetrics, compute_log_metrics, find_quantity, measure_run
     from .metrics.measured_impedance import FrequencyResponse
     from .metrics.measures import Metric, Quantity, quantities
@@ -206,14 +195,7 @@ if TYPE_CHECKING:
     from .theory.port_analysis import PortAnalysis, TwoPort
     from .theory.port_passivity import Passivity
     from .theory.port_response import QUOTED_AT_HZ, Transparency
-    from .timeline import (
-        StatedModel,
-        find_mode_intervals,
-        list_alarms,
-        list_changes,
-        list_stated_models,
-        recorded_end_s,
-    )
+    from .timeline import Timeline
     from .torque_sources import (
         TorqueSplit,
         compute_operator_script,
@@ -256,8 +238,7 @@ else:
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
             "link_summary": (
-                "DelayDistribution has_one_constant_delay link_summary "
-                "measure_delay_distributions sample_ages_ns"
+                "DelayDistribution link_summary measure_delay_distributions sample_ages_ns"
             ),
             "metrics.log_metrics": "LogMetrics compute_log_metrics find_quantity measure_run",
             "metrics.measured_impedance": "FrequencyResponse",
@@ -287,10 +268,7 @@ else:
             "theory.port_analysis": "PortAnalysis TwoPort",
             "theory.port_passivity": "Passivity",
             "theory.port_response": "QUOTED_AT_HZ Transparency",
-            "timeline": (
-                "StatedModel find_mode_intervals list_alarms list_changes "
-                "list_stated_models recorded_end_s"
-            ),
+            "timeline": "Timeline",
             "torque_sources": (
                 "TorqueSplit compute_operator_script compute_target_motion list_walls "
                 "wall_depth wall_force"

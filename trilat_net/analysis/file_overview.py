@@ -54,7 +54,7 @@ from .site_signals import (
     settling_time_of_all_s,
     settling_time_s,
 )
-from .timeline import find_mode_intervals, list_changes
+from .timeline import Timeline
 
 MOST_LISTED_GAPS = 1000
 """Largest number of gaps that are listed per channel."""
@@ -606,7 +606,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             "taken_at_tick": entry.taken_at_tick,
             "sentence": entry.sentence,
         }
-        for entry in list_changes(log)
+        for entry in Timeline(log).changes
     ]
 
     return {
@@ -680,7 +680,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         "made_ticks": executed,
         "missing": max(0, ticks - log.absent_ticks(site) - len(site_log)),
         "diverged_at_s": site_log.diverged_s,
-        "modes": [interval._asdict() for interval in find_mode_intervals(site_log)],
+        "modes": [interval._asdict() for interval in Timeline(log).find_mode_intervals(site)],
         "q_end_rad": site_log.q[-1].tolist() if len(site_log) else None,
         "max_error_rad": _largest_magnitude(site_log.e),
         "max_error_end_rad": _largest_magnitude(site_log.e[at_end]),
@@ -702,7 +702,7 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
     clock = summarise_clock(log, link.peer, link.site)
 
     stated = []
-    for model in link.stated:
+    for model in link.stated.models:
         moments = model.link.moments()
         stated.append(
             {
@@ -718,7 +718,7 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
         age_ms = link.age_ms._asdict()
 
     return {
-        "delay_ms": finite_or_none(link.stated[0].link.moments().mean_ms),
+        "delay_ms": finite_or_none(link.stated.models[0].link.moments().mean_ms),
         "stated": stated,
         "drawn_ms": link.drawn_ms._asdict() if link.drawn_ms else None,
         "age_ms": age_ms,

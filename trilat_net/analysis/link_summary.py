@@ -27,7 +27,7 @@ from ..log import Ints, Log, SiteLog
 from ..records import NS_PER_S
 from ..scenario import LinkSchedule, first_ticks
 from .aligned import Bools
-from .timeline import StatedModel, list_changes, list_stated_models
+from .timeline import StatedLink, Timeline
 
 
 class _PredictedDelivery(NamedTuple):
@@ -442,8 +442,7 @@ class LinkSummary(NamedTuple):
     Attributes:
         peer: Name of the sender.
         site: Name of the receiver.
-        stated: Delay models that the scenario and its changes prescribe for the link, in the
-            order of time.
+        stated: Delay models that the scenario and its changes prescribe for the link.
         drawn_ms: Statistics of the delays that these models gave to the samples, in ms.
         age_ms: Statistics of the effective delay, which is the age of the sample in use at each
             tick, in ms.
@@ -459,7 +458,7 @@ class LinkSummary(NamedTuple):
 
     peer: str
     site: str
-    stated: list[StatedModel]
+    stated: StatedLink
     drawn_ms: ValueStatistics | None
     age_ms: ValueStatistics | None
     ages: _AgeHistogram | None
@@ -485,21 +484,7 @@ class LinkSummary(NamedTuple):
         """
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
-        return is_as_stated and has_one_constant_delay(self.stated)
-
-
-def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """Returns True if a network link delays every message equally, and loses none.
-
-    The stability theorem requires constant delays.
-
-    Args:
-        states: Delay models of the link over time.
-    """
-    link = states[0].link
-    is_constant = link.to_core_model().kind == DelayKind.CONSTANT
-    is_lossless = not (link.loss or link.duplicate or link.outages_s)
-    return is_constant and is_lossless and len(states) == 1
+        return is_as_stated and self.stated.has_one_constant_delay
 
 
 def summarise_links(log: Log) -> list[LinkSummary]:
@@ -513,7 +498,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
     Raises:
         LogError: A record names a change that is not valid.
     """
-    changed = list_changes(log)
+    stated_links = Timeline(log).stated_links
     arrivals_by_site = {site: _read_arrivals(log, site) for site in log.sites}
     sent = {}
     for peer in log.sites:
@@ -527,7 +512,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
     return [
         _summarise_link(
             log=log,
-            states=list_stated_models(log, f"{peer}->{site}", changed),
+            stated=stated_links[f"{peer}->{site}"],
             peer=peer,
             site=site,
             sent=sent[peer],
@@ -612,7 +597,7 @@ def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
 
 def _summarise_link(
     log: Log,
-    states: list[StatedModel],
+    stated: StatedLink,
     peer: str,
     site: str,
     sent: int,
@@ -622,7 +607,7 @@ def _summarise_link(
 
     Args:
         log: The log of the run.
-        states: Delay models of the link over time.
+        stated: Delay models of the link over time.
         peer: Name of the sender.
         site: Name of the receiver.
         sent: Number of samples that the peer sent.
@@ -677,7 +662,7 @@ def _summarise_link(
     return LinkSummary(
         peer=peer,
         site=site,
-        stated=states,
+        stated=stated,
         drawn_ms=compute_statistics(delivery.drawn_ms),
         age_ms=compute_statistics(age_ns / 1e6),
         ages=bin_ages(age_ns),

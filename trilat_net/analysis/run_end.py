@@ -36,7 +36,7 @@ from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
 from .site_signals import SETTLED_ERROR_RAD, find_last_error
-from .timeline import list_effective_commands
+from .timeline import Timeline
 from .torque_sources import compute_operator_script
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 
@@ -436,7 +436,7 @@ def trace_log(log: Log) -> RunTrace:
         tau_x.append(site_log.tau_x[-1] if len(site_log) else np.zeros(1))
         push_times_s.append(_find_unscripted_push_s(log, site_log))
 
-    change_times_s = [change.at_s for change in list_effective_commands(log)]
+    change_times_s = [change.at_s for change in Timeline(log).effective_commands]
     return RunTrace(
         buckets=buckets,
         tau_x=tau_x,

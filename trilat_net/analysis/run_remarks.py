@@ -26,7 +26,7 @@ from ..log import Log
 from .dominance_history import list_program_sites
 from .link_summary import sample_ages_ns
 from .site_signals import external_torques
-from .timeline import list_effective_commands
+from .timeline import Timeline
 
 LARGE_PUSH_SHARE = 0.5
 """Least torque of operators and walls that is remarked, as a share of the torque limit."""
@@ -175,7 +175,7 @@ def _find_odd_age(log: Log) -> _OddAge | None:
         The age on the link with the largest difference. None if every link agrees.
     """
     changed = {change.link for change in log.scenario.timeline}
-    changed |= {change.link for change in list_effective_commands(log)}
+    changed |= {change.link for change in Timeline(log).effective_commands}
     ages = []
     for name, link in log.scenario.links.items():
         stated_ms, deviation_ms = link.moments()

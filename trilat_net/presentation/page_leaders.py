@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import list_ramps, recorded_end_s, trace_dominance
+from ..analysis import Timeline, list_ramps, trace_dominance
 from ..core import Array
 from ..errors import join_words
 from ..log import Log
@@ -105,7 +105,7 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
     The points are those at which the slopes of the weights change, so that straight lines
     between them show the whole course.
     """
-    end_s = recorded_end_s(log)
+    end_s = Timeline(log).end_s
     _, ramps = list_ramps(log, slave)
 
     # Candidates: equal steps, and the begin and the end of each ramp. A point just before the
@@ -244,7 +244,7 @@ def _render_bar(log: Log, lead: _Lead) -> Markup:
     The areas of the peers are stacked. The height of an area is the weight of its peer, and the
     areas together fill the bar.
     """
-    end_s = recorded_end_s(log)
+    end_s = Timeline(log).end_s
     tops = 1.0 - np.cumsum(lead.shares, axis=1)
     bottoms = tops + lead.shares
     peers = []

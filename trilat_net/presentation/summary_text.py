@@ -28,11 +28,8 @@ from ..analysis import (
     Metric,
     Quantity,
     RunView,
-    StatedModel,
-    find_mode_intervals,
+    Timeline,
     link_summary,
-    list_alarms,
-    list_changes,
     measure_undelayed_error,
     quantities,
 )
@@ -93,7 +90,7 @@ def format_run_lines(log: Log) -> list[str]:
         LogError: A record names a change that does not exist in the log.
     """
     return [
-        *_limit_lines([f"*** {alarm}" for alarm in list_alarms(log)]),
+        *_limit_lines([f"*** {alarm}" for alarm in Timeline(log).alarms]),
         *format_outside_lines(log),
         *format_link_lines(log),
         *_format_change_lines(log),
@@ -140,10 +137,10 @@ def format_link_lines(log: Log) -> list[str]:
     for link in link_summary.summarise_links(log):
         if link.plain:
             continue
-        is_measured = any(model.link.measured for model in link.stated)
+        is_measured = any(model.link.measured for model in link.stated.models)
         origin = "" if is_measured else "stated "
 
-        clauses = [f"link {link.name}: {origin}{_format_stated_models(link.stated)}"]
+        clauses = [f"link {link.name}: {origin}{_format_stated_models(link)}"]
         if link.one_way_us is not None and is_measured:
             clauses.append(f"one way {_format_spread(link.one_way_us, 1e-3)}")
         if link.age_ms is None:
@@ -166,7 +163,7 @@ def _format_change_lines(log: Log) -> list[str]:
         log: Log of the run.
     """
     lines = []
-    for change in list_changes(log):
+    for change in Timeline(log).changes:
         tick = change.taken_at_tick
         origin = "by the scenario" if tick is None else f"applied at tick {tick}"
         lines.append(f"change: {change.sentence} ({origin})")
@@ -182,9 +179,10 @@ def _format_mode_lines(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
+    timeline = Timeline(log)
     lines = []
     for site in log.sites:
-        intervals = find_mode_intervals(log[site])
+        intervals = timeline.find_mode_intervals(site)
         if not intervals:
             continue
         phrases = []
@@ -214,16 +212,16 @@ def format_clock_lines(log: Log) -> list[str]:
     return _limit_lines(lines)
 
 
-def _format_stated_models(states: Sequence[StatedModel]) -> str:
+def _format_stated_models(summary: link_summary.LinkSummary) -> str:
     """Returns how a link delays and loses messages during a run, as its scenario states.
 
     For example: "constant 400 ms, then constant 800 ms from 5 s on".
 
     Args:
-        states: Delay models of the link, in the order of time. If there are more than three,
-            only the first and the last are described, with the number of changes between them.
+        summary: Summary of the link. If the link had more than three delay models, only the
+            first and the last are described, with the number of changes between them.
     """
-    first_model, *later_models = states
+    first_model, *later_models = summary.stated.models
     phrases = [first_model.link.describe()]
     if len(later_models) > 2:
         phrases.append(f"{count_nouns(len(later_models) - 1, 'change')}")

@@ -38,7 +38,7 @@ from ..dominance_history import (
 )
 from ..following import TaskFollowing
 from ..row_reductions import any_in_rows
-from ..timeline import find_mode_intervals, recorded_end_s
+from ..timeline import Timeline
 from ..torque_sources import find_wall_energies, list_sampled_walls
 from .energy_balance import (
     ZERO_ENERGY_J,
@@ -399,10 +399,11 @@ def _check_following(run: FunctionalFacts) -> Premise:
     stopped. It does not follow them either while the velocity of its reference is limited.
     """
     log = run.log
+    timeline = Timeline(log)
     interruptions = []
     is_halted = False
     for site in log.sites:
-        intervals = find_mode_intervals(log[site])
+        intervals = timeline.find_mode_intervals(site)
         if intervals:
             from_s = intervals[0].from_s
             to_s = intervals[-1].to_s
@@ -590,7 +591,7 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
     Returns:
         The spans, sorted by their start. Empty if no site was absent.
     """
-    run_end_s = recorded_end_s(log)
+    run_end_s = Timeline(log).end_s
     absent = []
     for site in log.sites:
         site_log = log[site]
@@ -618,7 +619,7 @@ def _check_presence(run: FunctionalFacts) -> Premise | None:
     if not run.absent:
         return None
     stretch_start_s = max(energy.begin_s for energy in run.energies.values())
-    end_s = recorded_end_s(run.log)
+    end_s = Timeline(run.log).end_s
 
     # Empty absences at the start and at the end let the loop treat all stretches alike.
     absences = [(stretch_start_s, stretch_start_s)]

@@ -42,7 +42,7 @@ from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
 from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
-from ..timeline import list_effective_commands, recorded_end_s
+from ..timeline import Timeline
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
 from .floquet import DRAWN_SPAN_S, SampledLoop, SamplesInUse
@@ -271,11 +271,10 @@ def resolve_final_scenario(log: Log) -> Scenario:
     Args:
         log: The log of the run.
     """
-    commands = [change for change in list_effective_commands(log) if not change.order]
+    run = Timeline(log)
+    commands = [change for change in run.effective_commands if not change.order]
     timeline = sorted([*log.scenario.timeline, *commands], key=lambda change: change.at_s)
-    return msgspec.structs.replace(
-        log.scenario, timeline=tuple(timeline), duration_s=recorded_end_s(log)
-    )
+    return msgspec.structs.replace(log.scenario, timeline=tuple(timeline), duration_s=run.end_s)
 
 
 class _FixedDelays(NamedTuple):

@@ -19,7 +19,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import joint_positions_m, recorded_end_s, site_signals, upright_axes
+from ...analysis import Timeline, joint_positions_m, site_signals, upright_axes
 from ...core import Array
 from ...log import Log
 from ...scenario import ArmModel
@@ -190,7 +190,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     Returns:
         The times in increasing order, in s.
     """
-    end_s = recorded_end_s(log)
+    end_s = Timeline(log).end_s
     grid_s = np.linspace(0.0, end_s, 1001)
     moved_rad = np.zeros_like(grid_s)
     for site in log.sites:

@@ -24,8 +24,8 @@ from matplotlib.figure import Figure
 
 from ...analysis import (
     SETTLED_ERROR_RAD,
+    Timeline,
     build_arm_rows,
-    list_changes,
     list_walls,
     site_signals,
     trace_dominance,
@@ -722,7 +722,7 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
-    changed_sites = {changed.change.dominance for changed in list_changes(log)}
+    changed_sites = {changed.change.dominance for changed in Timeline(log).changes}
     return [site for site in log.sites if site in changed_sites]
 
 
