@@ -110,15 +110,12 @@ __all__ = [
     "DelayDistribution",
     "FileOverview",
     "find_closed_groups",
-    "find_program",
-    "find_user_shares",
-    "find_users",
     "info",
     "left_perron_vector",
     "link_summary",
-    "list_ramps",
     "measure_delay_distributions",
-    "plan_dominance",
+    "DominancePlan",
+    "SharedSlave",
     "Timeline",
     "sample_ages_ns",
     "summarise_run",
@@ -144,13 +141,9 @@ if TYPE_CHECKING:
     from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
     from .certificate.stability_certificate import certify
     from .dominance_history import (
+        DominancePlan,
         find_closed_groups,
-        find_program,
-        find_user_shares,
-        find_users,
         left_perron_vector,
-        list_ramps,
-        plan_dominance,
         trace_dominance,
     )
     from .file_overview import FileOverview, info, summarise_run
@@ -172,6 +165,7 @@ if TYPE_CHECKING:
         reduce_to_buckets,
     )
     from .run_view import RunView
+    from .shared_slave import SharedSlave
     from .site_signals import (
         SETTLED_ERROR_RAD,
         JointError,
@@ -232,8 +226,7 @@ else:
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
             "dominance_history": (
-                "find_closed_groups find_program find_user_shares find_users "
-                "left_perron_vector list_ramps plan_dominance trace_dominance"
+                "DominancePlan find_closed_groups left_perron_vector trace_dominance"
             ),
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
@@ -250,6 +243,7 @@ else:
             ),
             "run_remarks": "run_remarks",
             "run_view": "RunView",
+            "shared_slave": "SharedSlave",
             "site_signals": (
                 "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "
                 "site_signals"

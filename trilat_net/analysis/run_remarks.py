@@ -23,8 +23,8 @@ import numpy as np
 
 from ..hooks import find_hook
 from ..log import Log
-from .dominance_history import list_program_sites
 from .link_summary import sample_ages_ns
+from .shared_slave import list_program_sites
 from .site_signals import external_torques
 from .timeline import Timeline
 

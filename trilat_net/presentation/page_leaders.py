@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import Timeline, list_ramps, trace_dominance
+from ..analysis import DominancePlan, Timeline, trace_dominance
 from ..core import Array
 from ..errors import join_words
 from ..log import Log
@@ -106,12 +106,11 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
     between them show the whole course.
     """
     end_s = Timeline(log).end_s
-    _, ramps = list_ramps(log, slave)
 
     # Candidates: equal steps, and the begin and the end of each ramp. A point just before the
     # begin shows a jump as a vertical line.
     times_s = [np.linspace(0.0, end_s, _INSTANTS)]
-    for ramp in ramps:
+    for ramp in DominancePlan.of_log(log, slave).ramps:
         start_s = ramp.start_ns * 1e-9
         times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
     t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))

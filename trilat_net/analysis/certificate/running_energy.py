@@ -30,13 +30,7 @@ from ..aligned import (
     PeerTrajectory,
     find_unlimited_rows,
 )
-from ..dominance_history import (
-    DominanceHistory,
-    drop_finished_ramps,
-    evaluate_ramps,
-    find_closed_groups,
-    list_scripted_ramps,
-)
+from ..dominance_history import DominanceHistory, DominancePlan, find_closed_groups
 from .energy_balance import (
     SiteEnergy,
     compute_energy_balance,
@@ -285,7 +279,7 @@ class RunningEnergy:
 
         self._scenario = scenario
         self._windows = windows
-        self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
+        self._dominance = {site: DominancePlan.of_scenario(scenario, site) for site in windows}
         self._computed_until_s: float | None = None
         self._supplied = 0.0
 
@@ -299,10 +293,8 @@ class RunningEnergy:
             site: Name of the site, the process that runs one arm.
             changes: The changes that the site carried out.
         """
-        _, ramps = self._dominance[site]
-        for change in changes:
-            if change.ramp is not None:
-                ramps.append(change.ramp)
+        ramps = self._dominance[site].ramps
+        ramps.extend(change.ramp for change in changes if change.ramp is not None)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Computes the energy V of all arms since the last call, if all records have arrived.
@@ -372,8 +364,8 @@ class RunningEnergy:
         balance = compute_energy_balance(energies) if is_known else None
 
         ramps_from_s = begin_s - _RAMP_MARGIN_S
-        for site, (start, ramps) in self._dominance.items():
-            self._dominance[site] = drop_finished_ramps(start, ramps, ramps_from_s)
+        for site, plan in self._dominance.items():
+            self._dominance[site] = plan.drop_finished(ramps_from_s)
         # in a session that was joined late, the oldest samples in use are unknown at first
         if balance is None:
             return None
@@ -421,6 +413,4 @@ class RunningEnergy:
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
         """Returns the dominance factors of a site, its weights of the peers, at times in s."""
-        start, ramps = self._dominance[site]
-        h_s = 1.0 / self._windows[site].rate_hz
-        return evaluate_ramps(start, ramps, t_s, h_s)
+        return self._dominance[site].evaluate(t_s)

@@ -40,8 +40,8 @@ from ...scenario import ConstantDelay, LinkBase, Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
-from ..dominance_history import has_program_hand, list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
+from ..shared_slave import has_program_hand, list_program_sites
 from ..timeline import Timeline
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories

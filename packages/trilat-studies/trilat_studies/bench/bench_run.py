@@ -34,6 +34,7 @@ import numpy as np
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     THROWN_RAD,
+    DominancePlan,
     EndBehaviour,
     RunEnd,
     Stability,
@@ -42,7 +43,6 @@ from trilat_net.analysis import (
     decision_facts,
     judge_virtual_run,
     list_walls,
-    plan_dominance,
     wall_force,
 )
 from trilat_net.core import Array
@@ -812,7 +812,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    alpha = plan_dominance(scenario, SLAVE, t_s)
+    alpha = DominancePlan.of_scenario(scenario, SLAVE).evaluate(t_s).alpha
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]

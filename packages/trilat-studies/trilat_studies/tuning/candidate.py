@@ -42,6 +42,7 @@ import numpy as np
 
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
+    DominancePlan,
     EndBehaviour,
     RunEnd,
     Stability,
@@ -50,7 +51,6 @@ from trilat_net.analysis import (
     find_closed_groups,
     find_hanging_sites,
     left_perron_vector,
-    plan_dominance,
 )
 from trilat_net.core import Array
 from trilat_net.errors import CodeFailed, ScenarioError
@@ -645,7 +645,7 @@ def _compute_promised_motion(
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = plan_dominance(scenario, name, t_s)
+        alpha[:, site, peers] = DominancePlan.of_scenario(scenario, name).evaluate(t_s).alpha
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 
