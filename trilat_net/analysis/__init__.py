@@ -32,14 +32,11 @@ __all__ = [
     "ZERO_ENERGY_J",
     "Certificate",
     "EnergyBalance",
-    "EnergyCourse",
     "ObservedEnergy",
     "ObservedFinding",
     "RecordWindow",
     "RunningEnergy",
     "certify",
-    "find_missing_functionals",
-    "find_unjudged_spans",
     "premise_quantities",
     "verdict_facts",
     # Twins
@@ -137,8 +134,7 @@ if TYPE_CHECKING:
     from .certificate.certificate_result import Certificate
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
-    from .certificate.premises import find_missing_functionals, find_unjudged_spans
-    from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
+    from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
     from .certificate.stability_certificate import certify
     from .dominance_history import (
         DominancePlan,
@@ -220,8 +216,7 @@ else:
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
             "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
-            "certificate.premises": "find_missing_functionals find_unjudged_spans",
-            "certificate.running_energy": "EnergyCourse KEPT_S RecordWindow RunningEnergy",
+            "certificate.running_energy": "KEPT_S RecordWindow RunningEnergy",
             "certificate.stability_certificate": "certify",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",

@@ -24,6 +24,7 @@ __all__ = [
     "compose_doctor",
     "compose_ping",
     "compose_topic_delays",
+    "describe_energy_obstacle",
     "describe_judgement",
     "err",
     "format_number",
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
     from .export import Exporter
     from .exports import list_export_formats
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
+    from .premise_text import describe_energy_obstacle
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
@@ -92,6 +94,7 @@ else:
             "export": "Exporter",
             "exports": "list_export_formats",
             "figures.registry": "FIGURES figure write_figures write_overlay",
+            "premise_text": "describe_energy_obstacle",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable compose format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
@@ -117,8 +120,6 @@ register_hooks(
         "describe a finding": "finding_text:describe_finding",
         "list the sentences of a finding": "finding_text:list_finding_sentences",
         "describe a premise": "premise_text:describe_quantities",
-        "describe missing functionals": "premise_text:describe_missing_functionals",
-        "describe closed groups": "premise_text:describe_closed_groups",
         "name the theorem": "verdict_text:name_theorem",
     },
 )

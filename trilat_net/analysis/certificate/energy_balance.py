@@ -382,6 +382,20 @@ class EnergyBalance:
     judged: Bools
 
     @cached_property
+    def unjudged_spans(self) -> list[tuple[float, float]]:
+        """The spans of time in which V cannot be judged because records are missing.
+
+        Each has a start and an end, in s. The list is empty if V can be judged all the time.
+        """
+        # Judged periods before and after the run give each span a start and an end.
+        padded = np.concatenate([[True], self.judged, [True]])
+        edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
+        times = self.t_s[edges]
+        starts_s = times[::2].tolist()
+        ends_s = times[1::2].tolist()
+        return list(zip(starts_s, ends_s, strict=True))
+
+    @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
         """The total energy of the arms in the stability proof over time, shape (T,), in J.
 

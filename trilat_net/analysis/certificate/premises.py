@@ -28,7 +28,6 @@ import numpy as np
 
 from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
-from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited_rows
 from ..dominance_history import (
     compute_lyapunov_weights,
@@ -58,7 +57,6 @@ from .premise_quantities import (
     DelayQuantities,
     DominanceQuantities,
     FollowingQuantities,
-    FunctionalObstacle,
     GainQuantities,
     Interruption,
     LawQuantities,
@@ -166,7 +164,7 @@ def gather_facts(log: Log) -> _RunFacts:
         LogError: A recorded change of the settings, such as of a dominance factor, is not
             valid.
     """
-    missing = find_missing_functionals(log.scenario)
+    missing = MissingFunctional.list_of_scenario(log.scenario)
     if missing:
         return _RunFacts(log, {}, unknown=NoFunctional(tuple(missing)))
 
@@ -186,7 +184,7 @@ def gather_facts(log: Log) -> _RunFacts:
         tuple(log.sites[index] for index in group) for group in ambiguous_groups
     )
     unjudged_while_present = []
-    for from_s, to_s in find_unjudged_spans(balance):
+    for from_s, to_s in balance.unjudged_spans:
         if not any(span.from_s < to_s and from_s < span.to_s for span in absent):
             unjudged_while_present.append((from_s, to_s))
 
@@ -203,38 +201,6 @@ def gather_facts(log: Log) -> _RunFacts:
     return _RunFacts(log, constants, facts)
 
 
-def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
-    """Finds the arms for which the energy function of the stability proof does not exist.
-
-    The energy exists only for certain control laws. It requires the true dynamic parameters of
-    the arm. It is not defined if the end effector also follows the orientation of other arms.
-
-    Args:
-        scenario: The description of the experiment.
-
-    Returns:
-        The sites of these arms, grouped by the reason. Empty if the energy exists for every
-        arm.
-    """
-    sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
-    for site, spec in scenario.sites.items():
-        law = ""
-        if not spec.arm.known:
-            obstacle = FunctionalObstacle.UNKNOWN_PARAMETERS
-        elif not spec.control.has_functional:
-            obstacle = FunctionalObstacle.LAW
-            law = spec.control.tag
-        elif spec.task.space == "pose":
-            obstacle = FunctionalObstacle.ORIENTATIONS
-        else:
-            continue
-        sites_by_reason.setdefault((obstacle, law), []).append(site)
-    return [
-        MissingFunctional(obstacle, law, tuple(sites))
-        for (obstacle, law), sites in sites_by_reason.items()
-    ]
-
-
 def check_premises(run: _RunFacts) -> list[Premise]:
     """Checks whether a run meets the conditions (premises) of the stability theorem.
 
@@ -248,7 +214,7 @@ def check_premises(run: _RunFacts) -> list[Premise]:
     Returns:
         The premises that concern this run, in the order in which a certificate lists them.
     """
-    missing = find_missing_functionals(run.log.scenario)
+    missing = MissingFunctional.list_of_scenario(run.log.scenario)
     law = Premise("law", bool(run.constants), LawQuantities(tuple(missing)))
     premises: list[Premise | None] = [law]
 
@@ -706,26 +672,6 @@ def _examine_stretch(
     return PresentStretch(from_s, to_s, all_follow_s, tuple(varying))
 
 
-def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
-    """Finds the spans of time in which V cannot be judged because records are missing.
-
-    V is the energy function of the stability proof.
-
-    Args:
-        balance: Energy balance of all sites.
-
-    Returns:
-        The (start, end) of each span, in s. Empty if V can be judged all the time.
-    """
-    # Judged periods before and after the run give each span a start and an end.
-    padded = np.concatenate([[True], balance.judged, [True]])
-    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
-    times = balance.t_s[edges]
-    starts_s = times[::2].tolist()
-    ends_s = times[1::2].tolist()
-    return list(zip(starts_s, ends_s, strict=True))
-
-
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     """Collects how complete the records of a run are, and whether its log was changed.
 
@@ -744,7 +690,7 @@ def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
         t_s = facts.balance.t_s
         judged = facts.balance.judged
         # Spans that are unjudged because a site was absent do not count against the share.
-        unjudged_in_absence = set(find_unjudged_spans(facts.balance)) - set(facts.unjudged)
+        unjudged_in_absence = set(facts.balance.unjudged_spans) - set(facts.unjudged)
         all_present = np.ones(len(judged), dtype=np.bool_)
         for from_s, to_s in unjudged_in_absence:
             all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)

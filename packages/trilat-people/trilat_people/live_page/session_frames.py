@@ -38,6 +38,7 @@ from trilat_net.analysis import (
 )
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
+from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, describe_event, identify_law
 
@@ -491,7 +492,7 @@ class SessionFrames:
 
         energy_problem = ""
         if view.energy is not None:
-            energy_problem = view.energy.reason
+            energy_problem = describe_energy_obstacle(view.energy)
         silence_s = 0.0
         if not view.ended:
             silence_s = round(view.session_silence_s, 1)
@@ -527,7 +528,10 @@ class SessionFrames:
         There is a value for each complete control period. At most one per `ENERGY_PERIOD_S`
         becomes a point.
         """
-        new_energies = self._view.advance_energy()
+        energy = self._view.energy
+        if energy is None:
+            return
+        new_energies = energy.compute_next(self._view.complete_ticks)
         if new_energies is None:
             return
 
