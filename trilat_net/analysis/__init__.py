@@ -61,25 +61,16 @@ __all__ = [
     # The linearised loop
     "MAX_COMMON_DELAY_S",
     "QUOTED_AT_HZ",
-    "CharacteristicRoot",
     "Complex",
-    "EdgeScan",
-    "Equilibrium",
-    "FrequencyBand",
     "GrowthColumn",
     "LinearAnalysis",
-    "Minima",
-    "OperatingConditions",
+    "RestingLoop",
     "Passivity",
     "PortAnalysis",
-    "Spectrum",
-    "Transparency",
     "TwoPort",
     "analyse_linear_loop",
-    "find_rightmost_root",
     "find_root_crossings",
     "find_run_roots",
-    "find_samples_in_use",
     "read_hands",
     # Signals of a run
     "SETTLED_ERROR_RAD",
@@ -168,23 +159,16 @@ if TYPE_CHECKING:
         largest_magnitude,
         settling_time_of_all_s,
     )
-    from .theory.characteristic_roots import CharacteristicRoot, Complex, Spectrum
+    from .theory.characteristic_roots import Complex
     from .theory.delay_margin import MAX_COMMON_DELAY_S
-    from .theory.floquet import find_samples_in_use
-    from .theory.frequency_search import FrequencyBand, Minima
     from .theory.hand_files import read_hands
     from .theory.linear_analysis import LinearAnalysis, analyse_linear_loop
-    from .theory.linear_edge import (
-        EdgeScan,
-        GrowthColumn,
-        find_rightmost_root,
-        find_root_crossings,
-    )
+    from .theory.linear_edge import GrowthColumn, find_root_crossings
     from .theory.loop_roots import find_run_roots
-    from .theory.operating_point import Equilibrium, OperatingConditions
     from .theory.port_analysis import PortAnalysis, TwoPort
     from .theory.port_passivity import Passivity
-    from .theory.port_response import QUOTED_AT_HZ, Transparency
+    from .theory.port_response import QUOTED_AT_HZ
+    from .theory.resting_loop import RestingLoop
     from .timeline import Timeline
     from .torque_sources import (
         TorqueSplit,
@@ -243,20 +227,16 @@ else:
                 "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "
                 "site_signals"
             ),
-            "theory.characteristic_roots": "CharacteristicRoot Complex Spectrum",
+            "theory.characteristic_roots": "Complex",
             "theory.delay_margin": "MAX_COMMON_DELAY_S",
-            "theory.floquet": "find_samples_in_use",
-            "theory.frequency_search": "FrequencyBand Minima",
             "theory.hand_files": "read_hands",
             "theory.linear_analysis": "LinearAnalysis analyse_linear_loop",
-            "theory.linear_edge": (
-                "EdgeScan GrowthColumn find_rightmost_root find_root_crossings"
-            ),
+            "theory.linear_edge": "GrowthColumn find_root_crossings",
             "theory.loop_roots": "find_run_roots",
-            "theory.operating_point": "Equilibrium OperatingConditions",
             "theory.port_analysis": "PortAnalysis TwoPort",
             "theory.port_passivity": "Passivity",
-            "theory.port_response": "QUOTED_AT_HZ Transparency",
+            "theory.port_response": "QUOTED_AT_HZ",
+            "theory.resting_loop": "RestingLoop",
             "timeline": "Timeline",
             "torque_sources": (
                 "TorqueSplit compute_operator_script compute_target_motion list_walls "

@@ -26,6 +26,7 @@ __all__ = [
     "compose_topic_delays",
     "describe_energy_obstacle",
     "describe_judgement",
+    "describe_moving_states",
     "err",
     "format_number",
     "print_error",
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
     from .export import Exporter
     from .exports import list_export_formats
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
+    from .linear_text import describe_moving_states
     from .premise_text import describe_energy_obstacle
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
@@ -94,6 +96,7 @@ else:
             "export": "Exporter",
             "exports": "list_export_formats",
             "figures.registry": "FIGURES figure write_figures write_overlay",
+            "linear_text": "describe_moving_states",
             "premise_text": "describe_energy_obstacle",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable compose format_number",

@@ -254,23 +254,6 @@ class CharacteristicRoot(NamedTuple):
         """
         return -self.s.real / abs(self.s)
 
-    @property
-    def description(self) -> str:
-        """Names of the states that move most in this mode, for the user.
-
-        A state of a site (a process that runs one arm) is called "m1.q2", for example. Sites
-        with the same state are grouped: "q2 of m1, m2, s" stands for the second joint angle of
-        three sites.
-        """
-        sites: dict[str, list[str]] = {}
-        for state in self.states:
-            site, _, name = state.partition(".")
-            sites.setdefault(name, []).append(site)
-        phrases = []
-        for name, owners in sites.items():
-            phrases.append(f"{name} of {', '.join(sorted(owners))}")
-        return "; ".join(phrases)
-
 
 class Spectrum(NamedTuple):
     """The rightmost characteristic roots of a loop, which decide its stability.
