@@ -10,7 +10,7 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.torque_sources import TorqueSplit, compute_live_torque
+from trilat_net.analysis.torque_sources import SourceRows, TorqueSplit
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify
 from trilat_net.execution.virtual import simulate_scenario
@@ -51,8 +51,8 @@ def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
     records = align_records(held_log)["m1"]
     split = TorqueSplit.of_records(records, held_log.scenario)
     source = held_log.scenario.sites["m1"].hands[0].actor
-    expected = compute_live_torque(
-        source, records.hand, records.q, records.qd, split.end_effector
+    expected = SourceRows(source).compute_live_torque(
+        records.hand, records.q, records.qd, split.end_effector
     )
     assert expected == pytest.approx(-records.tau_x, abs=1e-9)
     assert split.operator == pytest.approx(expected, abs=1e-9)

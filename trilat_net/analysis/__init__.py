@@ -25,7 +25,6 @@ __all__ = [
     "decision_facts",
     "find_hanging_sites",
     "judge_virtual_run",
-    "reduce_to_buckets",
     "run_remarks",
     # The certificate
     "KEPT_S",
@@ -84,16 +83,13 @@ __all__ = [
     "TorqueSplit",
     "align_records",
     "build_arm_rows",
-    "compute_operator_script",
-    "compute_target_motion",
+    "SourceRows",
     "joint_positions_m",
     "largest_magnitude",
-    "list_walls",
+    "VirtualWall",
     "settling_time_of_all_s",
     "site_signals",
     "upright_axes",
-    "wall_depth",
-    "wall_force",
     # Links, leaders and events
     "DelayDistribution",
     "FileOverview",
@@ -149,7 +145,6 @@ if TYPE_CHECKING:
         RunTrace,
         Stability,
         find_hanging_sites,
-        reduce_to_buckets,
     )
     from .run_view import RunView
     from .shared_slave import SharedSlave
@@ -170,14 +165,7 @@ if TYPE_CHECKING:
     from .theory.port_response import QUOTED_AT_HZ
     from .theory.resting_loop import RestingLoop
     from .timeline import Timeline
-    from .torque_sources import (
-        TorqueSplit,
-        compute_operator_script,
-        compute_target_motion,
-        list_walls,
-        wall_depth,
-        wall_force,
-    )
+    from .torque_sources import SourceRows, TorqueSplit, VirtualWall
     from .twins.envelope_trend import EnvelopeTrend, fit_envelopes
     from .twins.twin_growth import (
         MOST_LOG,
@@ -218,7 +206,7 @@ else:
             "metrics.motion_metrics": "measure_undelayed_error",
             "run_end": (
                 "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
-                "find_hanging_sites reduce_to_buckets"
+                "find_hanging_sites"
             ),
             "run_remarks": "run_remarks",
             "run_view": "RunView",
@@ -238,10 +226,7 @@ else:
             "theory.port_response": "QUOTED_AT_HZ",
             "theory.resting_loop": "RestingLoop",
             "timeline": "Timeline",
-            "torque_sources": (
-                "TorqueSplit compute_operator_script compute_target_motion list_walls "
-                "wall_depth wall_force"
-            ),
+            "torque_sources": "SourceRows TorqueSplit VirtualWall",
             "twins.envelope_trend": "EnvelopeTrend fit_envelopes",
             "twins.twin_growth": (
                 "MOST_LOG PushGrowth PushedTwins TwinGrowth measure_amplitude twin"

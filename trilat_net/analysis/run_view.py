@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..core import POSE, POSITION, TorqueSource
+from ..core import POSE, POSITION
 from ..log import Log, compute_continuous_vectors
 from ..scenario import Scenario
 from .aligned import AlignedRecords, align_records
@@ -25,7 +25,7 @@ from .arm_rows import build_arm_rows
 from .dominance_history import DominanceHistory, trace_dominance
 from .following import JointFollowing, build_following
 from .link_summary import LinkSummary, summarise_links
-from .torque_sources import TorqueSplit, attribute_torque, list_walls
+from .torque_sources import TorqueSplit, VirtualWall
 
 T = TypeVar("T")
 
@@ -88,7 +88,7 @@ class RunView:
         for site, records in align_records(self.log).items():
             runs[site] = SiteRun(
                 records=records,
-                torque=attribute_torque(records, self.scenario),
+                torque=TorqueSplit.with_script(records, self.scenario),
                 dominance=trace_dominance(self.log, site, records.t_s),
             )
         return runs
@@ -120,14 +120,15 @@ class RunView:
         return {link.name: link for link in summarise_links(self.log)}
 
     @cached_property
-    def walls(self) -> dict[str, tuple[str, TorqueSource]]:
+    def walls(self) -> dict[str, tuple[str, VirtualWall]]:
         """All virtual walls by name, each with the arm that can touch it.
 
         The name "s/1" denotes the first wall of arm s. Walls of an arm are counted from 1.
         """
         walls = {}
         for site in self.log.sites:
-            for number, wall in enumerate(list_walls(self.scenario.sites[site]), 1):
+            spec = self.scenario.sites[site]
+            for number, wall in enumerate(VirtualWall.list_of_site(spec), 1):
                 walls[f"{site}/{number}"] = (site, wall)
         return walls
 

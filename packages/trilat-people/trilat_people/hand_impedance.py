@@ -39,13 +39,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from trilat_net.analysis import (
-    AlignedRecords,
-    Complex,
-    TorqueSplit,
-    align_records,
-    compute_operator_script,
-)
+from trilat_net.analysis import AlignedRecords, Complex, SourceRows, TorqueSplit, align_records
 from trilat_net.core import SCRIPTED_KINDS, Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.log import Log, open_log
@@ -391,11 +385,8 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
     for hand in scenario.sites[records.site].hands:
         operator = hand.actor
         if operator.kind in SCRIPTED_KINDS:
-            scripted_torque += compute_operator_script(
-                operator,
-                records.nominal_s,
-                end_effector.J[0],
-            )
+            script = SourceRows(operator).compute_script(records.nominal_s, end_effector.J[0])
+            scripted_torque += script
 
     hand_torque = split.operator - scripted_torque
     force = end_effector.find_force(hand_torque)

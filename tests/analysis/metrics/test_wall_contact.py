@@ -9,7 +9,7 @@ from tests.log.builders import rewrite_log
 from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.torque_sources import wall_force
+from trilat_net.analysis.torque_sources import VirtualWall
 from trilat_net.core.arms.two_link_arm import JOINTS
 
 WALL = """
@@ -96,6 +96,7 @@ def test_the_force_of_windup_creeps() -> None:
     spec = log.scenario.sites["s"]
     track = align_records(log)["s"]
     end_effector = build_arm_rows(log.scenario, "s").place_end_effector(track.q, track.qd)
-    force = wall_force(spec.environment[0].actor, track.nominal_s, end_effector)
+    (wall,) = VirtualWall.list_of_site(spec)
+    force = wall.find_force(track.nominal_s, end_effector)
     assert force[50 * 10] == pytest.approx(4.3, abs=0.05)
     assert force[50 * 20] == pytest.approx(8.5, abs=0.1)

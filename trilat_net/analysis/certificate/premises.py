@@ -22,6 +22,7 @@ Invariant:
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ from ..dominance_history import (
 from ..following import TaskFollowing
 from ..row_reductions import any_in_rows
 from ..timeline import Timeline
-from ..torque_sources import find_wall_energies, list_sampled_walls
+from ..torque_sources import VirtualWall, WallEnergy
 from .energy_balance import (
     ZERO_ENERGY_J,
     EnergyBalance,
@@ -284,9 +285,10 @@ def _check_walls(log: Log) -> Premise | None:
     Returns:
         The premise. None if the scenario contains no such wall.
     """
-    if not any(map(list_sampled_walls, log.scenario.sites.values())):
+    walls = map(VirtualWall.list_of_site, log.scenario.sites.values())
+    if not any(wall.may_generate_energy for wall in chain.from_iterable(walls)):
         return None
-    quantities = WallQuantities(tuple(find_wall_energies(log)))
+    quantities = WallQuantities(tuple(WallEnergy.list_of_log(log)))
     return Premise("walls", not quantities.active, quantities)
 
 

@@ -37,7 +37,6 @@ from ..arm_rows import (
 )
 from ..file_overview import describe_site_health
 from ..run_view import RunView
-from ..torque_sources import wall_depth, wall_force
 from .measures import (
     CONTACT,
     EFFORT,
@@ -382,13 +381,13 @@ def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
     t_s = run.records.nominal_s
     known = run.records.known
     end_effector = run.torque.end_effector
-    force = wall_force(wall, t_s, end_effector)
+    force = wall.find_force(t_s, end_effector)
     touches = force > 0.0
 
     is_known_free = known & ~touches
     was_known_free = np.concatenate([[False], is_known_free[:-1]])
     is_hit = touches & was_known_free
-    depth = wall_depth(wall, end_effector)[known]
+    depth = wall.find_depth(end_effector)[known]
 
     # depths are negative outside the wall
     metrics = {

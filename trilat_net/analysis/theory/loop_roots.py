@@ -40,7 +40,7 @@ from ...scenario import ConstantDelay, LinkBase, Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
-from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
+from ..run_end import SETTLED_SPEED_RAD_S, RunTrace
 from ..shared_slave import has_program_hand, list_program_sites
 from ..timeline import Timeline
 from .characteristic_roots import Spectrum, compute_delay_spectrum
@@ -176,7 +176,7 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
 
     last_ticks = [int(site_log.tick[-1]) for site_log in site_logs]
     final = _fix_delays(resolve_final_scenario(log), last_ticks, read_used_samples)
-    trace = trace_log(log)
+    trace = RunTrace.of_log(log)
     state = None
     if _has_sampled_wall(final.scenario):
         motions = [_SiteMotion(part.t_s, part.q, part.qd, part.theta_hat) for part in site_logs]

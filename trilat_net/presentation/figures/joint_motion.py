@@ -25,12 +25,10 @@ from matplotlib.figure import Figure
 from ...analysis import (
     SETTLED_ERROR_RAD,
     Timeline,
+    VirtualWall,
     build_arm_rows,
-    list_walls,
     site_signals,
     trace_dominance,
-    wall_depth,
-    wall_force,
 )
 from ...core import LINK_PARAMETERS, Array
 from ...execution import simulate_without_operators
@@ -781,7 +779,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
-    return [site for site in log.sites if list_walls(log.scenario.sites[site])]
+    return [site for site in log.sites if VirtualWall.list_of_site(log.scenario.sites[site])]
 
 
 @draws(
@@ -806,10 +804,11 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             records = log[site]
             arm_rows = build_arm_rows(log.scenario, site)
             end_effector = arm_rows.place_end_effector(records.q, records.qd)
-            for wall_number, wall in enumerate(list_walls(log.scenario.sites[site])):
+            walls = VirtualWall.list_of_site(log.scenario.sites[site])
+            for wall_number, wall in enumerate(walls):
                 dashes = style.DASHES[wall_number % len(style.DASHES)]
-                force_n = wall_force(wall, records.t_s, end_effector)
-                depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
+                force_n = wall.find_force(records.t_s, end_effector)
+                depth_mm = 1e3 * np.maximum(wall.find_depth(end_effector), 0.0)
                 plot.trace(force_panel, site, force_n, 1.1, linestyle=dashes)
                 plot.trace(depth_panel, site, depth_mm, 1.1, linestyle=dashes)
 

@@ -30,11 +30,10 @@ from trilat_net.analysis import (
     BodyTurns,
     EndEffectorRows,
     TorqueSplit,
+    VirtualWall,
     build_arm_rows,
     joint_positions_m,
-    list_walls,
     upright_axes,
-    wall_force,
 )
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
@@ -81,7 +80,7 @@ class _ArmFrames:
         self._site = site
         self._model = scenario.arms[site]
         self._spec = scenario.sites[site]
-        self._walls = list_walls(self._spec)
+        self._walls = VirtualWall.list_of_site(self._spec)
         self._hand = self._spec.find_live_hand()
         limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
         joint_count = self._model.counts.joints
@@ -114,8 +113,8 @@ class _ArmFrames:
         body_sizes_m = self._scenario.bodies_m(self._site).values()
         walls: list[Json] = []
         for wall in self._walls:
-            point_m = list(wall.a)
-            normal = list(wall.b)
+            point_m = list(wall.source.a)
+            normal = list(wall.source.b)
             walls.append({"at": point_m, "normal": normal})
 
         return {
@@ -357,9 +356,8 @@ class _ArmFrames:
         """
         total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
-            size_n = wall_force(wall, records.nominal_s, split.end_effector)
-            normal = np.array(wall.b)
-            total = total + size_n[:, np.newaxis] * normal
+            size_n = wall.find_force(records.nominal_s, split.end_effector)
+            total = total + size_n[:, np.newaxis] * wall.normal
         return total
 
 

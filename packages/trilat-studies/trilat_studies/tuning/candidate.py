@@ -45,9 +45,9 @@ from trilat_net.analysis import (
     DominancePlan,
     EndBehaviour,
     RunEnd,
+    SourceRows,
     Stability,
     build_arm_rows,
-    compute_target_motion,
     find_closed_groups,
     find_hanging_sites,
     left_perron_vector,
@@ -231,7 +231,7 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
             if not isinstance(hand, JointSpring):
                 continue
             acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
-            target_rad, _ = compute_target_motion(hand.actor, t_s)
+            target_rad, _ = SourceRows(hand.actor).find_target_motion(t_s)
             yield _SpringHistory(
                 site=name,
                 stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
