@@ -48,15 +48,10 @@ __all__ = [
     "measure_amplitude",
     "twin",
     # Metrics
-    "FrequencyResponse",
     "LogMetrics",
     "Metric",
     "Quantity",
-    "compute_log_metrics",
-    "find_quantity",
-    "measure_run",
     "measure_undelayed_error",
-    "quantities",
     # The linearised loop
     "MAX_COMMON_DELAY_S",
     "QUOTED_AT_HZ",
@@ -132,9 +127,8 @@ if TYPE_CHECKING:
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
     from .link_summary import DelayDistribution, measure_delay_distributions, sample_ages_ns
-    from .metrics.log_metrics import LogMetrics, compute_log_metrics, find_quantity, measure_run
-    from .metrics.measured_impedance import FrequencyResponse
-    from .metrics.measures import Metric, Quantity, quantities
+    from .metrics.log_metrics import LogMetrics
+    from .metrics.measures import Metric, Quantity
     from .metrics.motion_metrics import measure_undelayed_error
     from .run_end import (
         FORCE_NM,
@@ -200,9 +194,8 @@ else:
             "link_summary": (
                 "DelayDistribution link_summary measure_delay_distributions sample_ages_ns"
             ),
-            "metrics.log_metrics": "LogMetrics compute_log_metrics find_quantity measure_run",
-            "metrics.measured_impedance": "FrequencyResponse",
-            "metrics.measures": "Metric Quantity quantities",
+            "metrics.log_metrics": "LogMetrics",
+            "metrics.measures": "Metric Quantity",
             "metrics.motion_metrics": "measure_undelayed_error",
             "run_end": (
                 "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "

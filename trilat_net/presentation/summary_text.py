@@ -23,7 +23,6 @@ from itertools import groupby
 from typing import Any
 
 from ..analysis import (
-    FrequencyResponse,
     LogMetrics,
     Metric,
     Quantity,
@@ -31,7 +30,6 @@ from ..analysis import (
     Timeline,
     link_summary,
     measure_undelayed_error,
-    quantities,
 )
 from ..errors import count_nouns
 from ..execution import LinkEffect, LogCheckReport, Rerun, SiteEffect, describe_rerun_changes
@@ -759,7 +757,9 @@ def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
         metrics: The measured numbers.
     """
     reasons: dict[str, list[str]] = {}
-    tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
+    tables = groupby(
+        LogMetrics.list_quantities(), key=lambda quantity: (quantity.group, quantity.of)
+    )
     for (group, _), group_quantities in tables:
         yield from _compose_group(group, list(group_quantities), metrics, reasons)
     yield from _compose_sharing(metrics)
@@ -919,30 +919,22 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
         axis = f"{direction} {metrics.label(response.joint)}"
         title = f"{response.kind}{source_text} at {response.at}, {axis}"
         unit = metrics.unit(response.unit, response.joint)
-        listed_ratios: Sequence[FrequencyResponse] = [response.ratio]
-        if len(response.spectrum) > 1:
-            # Every step-th ratio is listed. The step is rounded up, so that at most
-            # _MAX_FREQUENCIES ratios are listed.
-            step = math.ceil(len(response.spectrum) / _MAX_FREQUENCIES)
-            listed_ratios = response.spectrum[::step]
-        for index, ratio in enumerate(listed_ratios):
+        listed_ratios = response.spectrum if len(response.spectrum) > 1 else [response.ratio]
+        # Every step-th ratio is listed. The step is rounded up, so that at most
+        # _MAX_FREQUENCIES ratios are listed.
+        step = math.ceil(len(listed_ratios) / _MAX_FREQUENCIES)
+        for index, ratio in enumerate(listed_ratios[::step]):
             shown_title = title if index == 0 else ""
-            rows.append([shown_title, unit, *_list_response_cells(ratio)])
+            # If the ratio could not be estimated, the last cell has the reason.
+            cells = ["", "", "", "", ratio.why]
+            if ratio.gain is not None:
+                numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
+                cells = [_format_value(number or 0.0) for number in numbers]
+                error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
+                cells.append(f"+- {error}")
+            rows.append([shown_title, unit, *cells])
     headers = ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""]
     yield from _tabulate(headers, rows, text_columns=2)
-
-
-def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
-    """Returns the table cells of one frequency: frequency, gain, phase, coherence and error.
-
-    If the ratio could not be estimated, the last cell has the reason, and the others are empty.
-    """
-    if ratio.gain is None:
-        return ["", "", "", "", ratio.why]
-    numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
-    cells = [_format_value(number or 0.0) for number in numbers]
-    error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
-    return [*cells, f"+- {error}"]
 
 
 def _apply_any(metrics: Iterable[Metric]) -> bool:

@@ -24,14 +24,13 @@ import numpy as np
 from trilat_net import process
 from trilat_net.analysis import (
     NO_BUCKETS,
+    LogMetrics,
     Metric,
     RunEnd,
     RunTrace,
     Stability,
     VirtualWall,
     build_arm_rows,
-    find_quantity,
-    measure_run,
 )
 from trilat_net.core import BUCKETS_PER_S, Array, Site, compute_fingerprint
 from trilat_net.errors import ScenarioError
@@ -1227,7 +1226,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
         late_samples=late_samples,
         missing=missing,
     )
-    expected_metrics = measure_run(log, scenario.expect.metrics)
+    expected_metrics = LogMetrics.measure_run(log, scenario.expect.metrics)
     return msgspec.structs.replace(metrics, metrics=expected_metrics)
 
 
@@ -1433,7 +1432,7 @@ def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
     for key, limits in expect.metrics.items():
         value, reason, _ = metrics.metrics[key]
         measured = None if value is None else Range(value, value)
-        quantity = find_quantity(key)
+        quantity = LogMetrics.find_quantity(key)
         yield _compare_with_range(
             name=f"metrics.{key}",
             measured=measured,

@@ -34,7 +34,7 @@ from trilat_net.analysis.certificate.energy_balance import (
 )
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
-from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.presentation.premise_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -307,7 +307,7 @@ def check_six_joints(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
     certificate = certify(log)
-    metrics = compute_log_metrics(log)
+    metrics = LogMetrics.of_log(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None
     assert find_unexplained_share(certificate.balance) <= BAR
@@ -386,7 +386,7 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
 
 
 def test_friction_and_stops_stand_in_arm_energies() -> None:
-    metrics = compute_log_metrics(make_rough_log())
+    metrics = LogMetrics.of_log(make_rough_log())
     for site in metrics.sites.values():
         assert site["friction_j"].value > 1.0
         assert site["unaccounted_j"].value <= 0.02

@@ -50,7 +50,6 @@ from .measures import (
     Metric,
     MetricValues,
     Quantity,
-    list_shared_quantities,
     measure_shared,
     measures,
     metric,
@@ -84,7 +83,7 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     "site",
     TRACKING,
     Quantity("settle_s", "settling time", "s"),
-    *list_shared_quantities(_ERRORS),
+    *Quantity.list_shared(_ERRORS),
 )
 def _measure_tracking(view: RunView, site: str) -> MetricValues:
     """Measures how well an arm tracks its reference: settling time, RMS and peak of the error.
@@ -115,7 +114,7 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
     return metrics
 
 
-@measures("site", UNDELAYED, *list_shared_quantities(_UNDELAYED_ERRORS))
+@measures("site", UNDELAYED, *Quantity.list_shared(_UNDELAYED_ERRORS))
 def measure_undelayed_error(
     view: RunView, site: str, other: RunView | None = None
 ) -> MetricValues:
@@ -212,7 +211,7 @@ def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
     }
 
 
-@measures("run", SPREAD, *list_shared_quantities(_SPREADS))
+@measures("run", SPREAD, *Quantity.list_shared(_SPREADS))
 def _measure_spread(view: RunView, _run: str) -> MetricValues:
     """Measures the spread of a run: how far the sites are apart at the same instant.
 
@@ -258,7 +257,7 @@ def _measure_spread(view: RunView, _run: str) -> MetricValues:
     )
 
 
-@measures("link", FOLLOWING, *list_shared_quantities(_DELAYED_DISTANCES))
+@measures("link", FOLLOWING, *Quantity.list_shared(_DELAYED_DISTANCES))
 def _measure_following(view: RunView, link: str) -> MetricValues:
     """Measures how far a slave is from the delayed motion of its master.
 
