@@ -34,7 +34,7 @@ from tests.scenario.builders import make_overrides
 from tests.theory import delay_equations, energy
 from tests.theory.figures_of_runs import find_value, measure_run
 from tests.theory.loops import RODS
-from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance
 from trilat_net.analysis.theory import (
     analyse_linear_loop,
     find_equilibrium,
@@ -243,7 +243,7 @@ def compute_pi() -> Any:
 
 
 def compute_lyapunov_balance(ones: bool = False, **changes: Any) -> EnergyBalance:
-    return compute_energy_balance(
+    return EnergyBalance.of_energies(
         make_run("lyapunov", make_overrides(**changes)).energies, paper_weights=ones
     )
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 import trilat_net
 from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.analysis.dominance_history import (
+    DominanceHistory,
     DominancePlan,
     compute_lyapunov_weights,
     find_closed_groups,
     find_kd_scales,
     find_lost_peers,
     left_perron_vector,
-    trace_dominance,
 )
 from trilat_net.core.links.dominance import apply_ramps
 from trilat_net.core.links.link import link_dtype
@@ -71,7 +71,7 @@ def ramped():
 
 def test_a_ramp_begins_where_the_previous_ends(ramped):
     part = ramped["s"]
-    alpha = trace_dominance(ramped, "s", part.t_s).alpha
+    alpha = DominanceHistory.of_log(ramped, "s", part.t_s).alpha
     at = [0.5, 1.0, 1.5, 2.0, 2.75, 3.5, 4.9, 5.1]
     assert np.interp(at, part.t_s, alpha[:, 0]) == pytest.approx(
         [0.5, 0.5, 0.625, 0.75, 0.375, 0.0, 0.0, 0.5]
@@ -82,7 +82,7 @@ def test_a_ramp_begins_where_the_previous_ends(ramped):
 def test_shares_give_the_recorded_references(ramped):
     """Eq. (6) with the shares and the samples in use gives the recorded reference."""
     part = ramped["s"]
-    alpha = trace_dominance(ramped, "s", part.t_s).alpha
+    alpha = DominanceHistory.of_log(ramped, "s", part.t_s).alpha
     reference = np.zeros_like(part.q)
     for peer, factor in zip(part.peers, alpha.T, strict=True):
         used = part.used[peer]

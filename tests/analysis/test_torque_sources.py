@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.analysis.builders import make_run
-from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.torque_sources import (
     SourceRows,
@@ -67,7 +67,7 @@ def test_every_torque_equals_the_cores(
 
 def test_hand_and_environment_torques_sum_to_the_record() -> None:
     log = make_run("rich").log
-    for site, track in align_records(log).items():
+    for site, track in AlignedRecords.by_site(log).items():
         by = TorqueSplit.with_script(track, log.scenario)
         np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
         assert (site == "s") == by.environment_now.any() == by.environment.any()
@@ -78,7 +78,7 @@ def test_hand_and_environment_torques_sum_to_the_record() -> None:
 
 def test_an_unscripted_hand_has_no_script() -> None:
     log = make_run("rich").log
-    track = align_records(log)["m2"]
+    track = AlignedRecords.by_site(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
     assert TorqueSplit.with_script(other, log.scenario).script is None
 

@@ -76,7 +76,6 @@ __all__ = [
     "PlacedArm",
     "RunView",
     "TorqueSplit",
-    "align_records",
     "build_arm_rows",
     "SourceRows",
     "joint_positions_m",
@@ -98,12 +97,12 @@ __all__ = [
     "Timeline",
     "sample_ages_ns",
     "summarise_run",
-    "trace_dominance",
+    "DominanceHistory",
 ]
 
 if TYPE_CHECKING:
     from . import decision_facts, link_summary, run_remarks, site_signals
-    from .aligned import AlignedRecords, Bools, align_records
+    from .aligned import AlignedRecords, Bools
     from .arm_rows import (
         EndEffectorRows,
         PlacedArm,
@@ -119,10 +118,10 @@ if TYPE_CHECKING:
     from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
     from .certificate.stability_certificate import certify
     from .dominance_history import (
+        DominanceHistory,
         DominancePlan,
         find_closed_groups,
         left_perron_vector,
-        trace_dominance,
     )
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
@@ -173,7 +172,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "aligned": "AlignedRecords Bools align_records",
+            "aligned": "AlignedRecords Bools",
             "arm_rows": (
                 "EndEffectorRows PlacedArm build_arm_rows joint_positions_m upright_axes"
             ),
@@ -187,7 +186,7 @@ else:
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
             "dominance_history": (
-                "DominancePlan find_closed_groups left_perron_vector trace_dominance"
+                "DominanceHistory DominancePlan find_closed_groups left_perron_vector"
             ),
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",

@@ -58,6 +58,42 @@ class DominanceHistory(NamedTuple):
         has_ramps = bool(self.rate.any())
         return not has_steps and not has_ramps
 
+    @classmethod
+    def of_log(cls, log: Log, site: str, t_s: Array) -> "DominanceHistory":
+        """Returns the dominance factors of a site at successive ticks.
+
+        They change by the timeline of the scenario and by commands during the run. If the site
+        lost a peer and continues without it, the factors of the others are scaled so that their
+        sum is 1.
+
+        Args:
+            log: The log of the run.
+            site: Name of the site.
+            t_s: Times of the ticks, shape (K,), in s.
+
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        history = DominancePlan.of_log(log, site).evaluate(t_s)
+        is_present = ~find_lost_peers(log, site, t_s)
+        if is_present.all():
+            return history
+
+        # the factors of the remaining peers are divided by their sum
+        alpha = history.alpha * is_present
+        rate = history.rate * is_present
+        before = history.before * is_present[:-1]
+        total = alpha.sum(axis=1, keepdims=True)
+        total_rate = rate.sum(axis=1, keepdims=True)
+        total_before = before.sum(axis=1, keepdims=True)
+        # derivative of alpha / total by the quotient rule
+        numerator = rate * total - alpha * total_rate
+        return cls(
+            alpha=alpha / total,
+            rate=numerator / total**2,
+            before=before / total_before,
+        )
+
 
 class DominancePlan(NamedTuple):
     """Changes of the weights (dominance factors) with which a site follows its P peers.
@@ -170,42 +206,6 @@ class DominancePlan(NamedTuple):
         return DominanceHistory(alpha, rate, at_period_ends)
 
 
-def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
-    """Returns the dominance factors of a site at successive ticks.
-
-    They change by the timeline of the scenario and by commands during the run. If the site lost
-    a peer and continues without it, the factors of the others are scaled so that their sum is
-    1.
-
-    Args:
-        log: The log of the run.
-        site: Name of the site.
-        t_s: Times of the ticks, shape (K,), in s.
-
-    Raises:
-        LogError: A record names a change that is not valid.
-    """
-    history = DominancePlan.of_log(log, site).evaluate(t_s)
-    is_present = ~find_lost_peers(log, site, t_s)
-    if is_present.all():
-        return history
-
-    # the factors of the remaining peers are divided by their sum
-    alpha = history.alpha * is_present
-    rate = history.rate * is_present
-    before = history.before * is_present[:-1]
-    total = alpha.sum(axis=1, keepdims=True)
-    total_rate = rate.sum(axis=1, keepdims=True)
-    total_before = before.sum(axis=1, keepdims=True)
-    # derivative of alpha / total by the quotient rule
-    numerator = rate * total - alpha * total_rate
-    return DominanceHistory(
-        alpha=alpha / total,
-        rate=numerator / total**2,
-        before=before / total_before,
-    )
-
-
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """Finds the times at which an arm continued without another arm that it had lost.
 
@@ -255,39 +255,39 @@ class PeerLoss(NamedTuple):
     from_s: float
     to_s: float
 
+    @classmethod
+    def list_of_log(cls, log: Log) -> "list[PeerLoss]":
+        """Lists when sites continued without a peer that they no longer heard.
 
-def list_losses(log: Log) -> list[PeerLoss]:
-    """Lists when sites continued without a peer that they no longer heard.
+        In these times the dominance factors differ from the planned ones, because a site gives
+        the share of the lost peer to the others.
 
-    In these times the dominance factors differ from the planned ones, because a site gives the
-    share of the lost peer to the others.
+        Args:
+            log: The log of the run.
 
-    Args:
-        log: The log of the run.
+        Returns:
+            Each span of time, by site and peer. Empty if no peer was lost.
+        """
+        losses = []
+        for site in log.sites:
+            site_log = log[site]
+            is_lost = find_lost_peers(log, site, site_log.t_s)
+            lost = is_lost.astype(int)
+            times_s = site_log.t_s
+            if len(site_log):
+                end_s = site_log.t_s[-1] + 1.0 / site_log.rate_hz
+                times_s = np.append(site_log.t_s, end_s)
 
-    Returns:
-        Each span of time, by site and peer. Empty if no peer was lost.
-    """
-    losses = []
-    for site in log.sites:
-        site_log = log[site]
-        is_lost = find_lost_peers(log, site, site_log.t_s)
-        lost = is_lost.astype(int)
-        times_s = site_log.t_s
-        if len(site_log):
-            end_s = site_log.t_s[-1] + 1.0 / site_log.rate_hz
-            times_s = np.append(site_log.t_s, end_s)
-
-        for j, peer in enumerate(site_log.peers):
-            # +1 where a loss begins, and -1 where it ends
-            changes = np.diff(lost[:, j], prepend=0, append=0)
-            start_rows = np.flatnonzero(changes > 0)
-            end_rows = np.flatnonzero(changes < 0)
-            starts_s = times_s[start_rows].tolist()
-            ends_s = times_s[end_rows].tolist()
-            for from_s, to_s in zip(starts_s, ends_s, strict=True):
-                losses.append(PeerLoss(site, peer, from_s, to_s))
-    return losses
+            for j, peer in enumerate(site_log.peers):
+                # +1 where a loss begins, and -1 where it ends
+                changes = np.diff(lost[:, j], prepend=0, append=0)
+                start_rows = np.flatnonzero(changes > 0)
+                end_rows = np.flatnonzero(changes < 0)
+                starts_s = times_s[start_rows].tolist()
+                ends_s = times_s[end_rows].tolist()
+                for from_s, to_s in zip(starts_s, ends_s, strict=True):
+                    losses.append(PeerLoss(site, peer, from_s, to_s))
+        return losses
 
 
 KD_SHAPE_TOLERANCE = 1e-9

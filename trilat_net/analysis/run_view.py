@@ -20,9 +20,9 @@ import numpy as np
 from ..core import POSE, POSITION
 from ..log import Log, compute_continuous_vectors
 from ..scenario import Scenario
-from .aligned import AlignedRecords, align_records
+from .aligned import AlignedRecords
 from .arm_rows import build_arm_rows
-from .dominance_history import DominanceHistory, trace_dominance
+from .dominance_history import DominanceHistory
 from .following import JointFollowing, build_following
 from .link_summary import LinkSummary, summarise_links
 from .torque_sources import TorqueSplit, VirtualWall
@@ -85,11 +85,11 @@ class RunView:
         Metrics of the other arms have a reason in place of a value.
         """
         runs = {}
-        for site, records in align_records(self.log).items():
+        for site, records in AlignedRecords.by_site(self.log).items():
             runs[site] = SiteRun(
                 records=records,
                 torque=TorqueSplit.with_script(records, self.scenario),
-                dominance=trace_dominance(self.log, site, records.t_s),
+                dominance=DominanceHistory.of_log(self.log, site, records.t_s),
             )
         return runs
 

@@ -23,7 +23,7 @@ import numpy as np
 from ..core import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
 from ..log import Log
 from ..scenario import ActorBase, Scenario, SiteSpec
-from .aligned import AlignedRecords, Bools, align_records
+from .aligned import AlignedRecords, Bools
 from .arm_rows import EndEffectorRows, build_arm_rows
 from .row_reductions import sum_rows
 
@@ -559,7 +559,7 @@ class WallEnergy(NamedTuple):
             The energies in scenario order, for the walls that were touched.
         """
         energies = []
-        for site, records in align_records(log).items():
+        for site, records in AlignedRecords.by_site(log).items():
             spec = log.scenario.sites[site]
             arm = build_arm_rows(log.scenario, site)
             end_effector = arm.place_end_effector(records.q, records.qd)

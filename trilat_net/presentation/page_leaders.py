@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import DominancePlan, Timeline, trace_dominance
+from ..analysis import DominanceHistory, DominancePlan, Timeline
 from ..core import Array
 from ..errors import join_words
 from ..log import Log
@@ -115,7 +115,7 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
         times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
     t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
 
-    factors = trace_dominance(log, slave, t_s).alpha
+    factors = DominanceHistory.of_log(log, slave, t_s).alpha
     followed = np.flatnonzero(factors.max(axis=0) > 0.0)
     peers = [log.scenario.peers(slave)[index] for index in followed]
     factors_of_followed = factors[:, followed]

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from trilat_net.analysis import AlignedRecords, Complex, SourceRows, TorqueSplit, align_records
+from trilat_net.analysis import AlignedRecords, Complex, SourceRows, TorqueSplit
 from trilat_net.core import SCRIPTED_KINDS, Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.log import Log, open_log
@@ -242,7 +242,7 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     scenario = log.scenario
     find_site(scenario, site)
     sines = _find_sines(scenario)
-    records = align_records(log)[site]
+    records = AlignedRecords.by_site(log)[site]
     force, position = _compute_hand_force(records, scenario)
 
     # A segment lasts two periods of the smallest spacing between frequencies (or of the lowest

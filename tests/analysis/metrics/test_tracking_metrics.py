@@ -7,8 +7,8 @@ import pytest
 
 from tests.analysis.builders import make_pair_log, make_short_log
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.aligned import align_records, find_latest_rows
-from trilat_net.analysis.dominance_history import trace_dominance
+from trilat_net.analysis.aligned import AlignedRecords
+from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_view import RunView
@@ -94,7 +94,7 @@ def test_undelayed_error_weighs_peers_by_dominance() -> None:
     """During a handover, the slave's undelayed error is q_s - sum_j alpha_sj(t) q_j, at every tick."""
     log = make_short_log("handover")
     sites = LogMetrics.of_log(log).sites
-    alpha = trace_dominance(log, "s", log["s"].t_s).alpha
+    alpha = DominanceHistory.of_log(log, "s", log["s"].t_s).alpha
     peers = log.scenario.peers("s")
     mean = sum(alpha[:, n, np.newaxis] * log[peer].q for n, peer in enumerate(peers))
     error = np.abs(log["s"].q - mean)
@@ -142,7 +142,7 @@ def test_instants_with_a_missing_record_do_not_count() -> None:
 
 
 def test_the_latest_record_is_the_last_tick() -> None:
-    track = align_records(make_pair_log(lambda _, __: {}))["m"]
-    row, exists = find_latest_rows(track, np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
+    track = AlignedRecords.by_site(make_pair_log(lambda _, __: {}))["m"]
+    row, exists = track.find_latest_rows(np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
     assert row.tolist() == [0, 0, 1, 799, 799, 0]
     assert exists.tolist() == [True, True, True, True, False, False]

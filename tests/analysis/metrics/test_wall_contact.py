@@ -6,7 +6,7 @@ import pytest
 
 from tests.analysis.builders import make_pair_log, make_run
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.torque_sources import VirtualWall
@@ -92,7 +92,7 @@ def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
     log = make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log
     spec = log.scenario.sites["s"]
-    track = align_records(log)["s"]
+    track = AlignedRecords.by_site(log)["s"]
     end_effector = build_arm_rows(log.scenario, "s").place_end_effector(track.q, track.qd)
     (wall,) = VirtualWall.list_of_site(spec)
     force = wall.find_force(track.nominal_s, end_effector)

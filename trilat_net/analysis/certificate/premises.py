@@ -31,10 +31,10 @@ from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
 from ..aligned import Bools, find_unlimited_rows
 from ..dominance_history import (
+    PeerLoss,
     compute_lyapunov_weights,
     find_closed_groups,
     find_kd_scales,
-    list_losses,
 )
 from ..following import TaskFollowing
 from ..row_reductions import any_in_rows
@@ -44,12 +44,10 @@ from .energy_balance import (
     ZERO_ENERGY_J,
     EnergyBalance,
     SiteEnergy,
-    compute_energy_balance,
-    compute_site_energies,
     find_dominance_matrices,
     rise_above_minimum,
 )
-from .energy_terms import SiteConstants, derive_site_constants
+from .energy_terms import SiteConstants
 from .premise_quantities import (
     AbsentSpan,
     AgeRange,
@@ -169,11 +167,11 @@ def gather_facts(log: Log) -> _RunFacts:
     if missing:
         return _RunFacts(log, {}, unknown=NoFunctional(tuple(missing)))
 
-    constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
-    energies = compute_site_energies(log)
+    constants = {site: SiteConstants.derive(log.scenario, site) for site in log.sites}
+    energies = SiteEnergy.by_site(log)
     if not energies:
         return _RunFacts(log, constants, unknown=RecordGap.NO_COMMON_TIME)
-    balance = compute_energy_balance(energies)
+    balance = EnergyBalance.of_energies(energies)
     absent = find_absent_spans(log)
     if not balance.judged.any():
         return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
@@ -305,7 +303,7 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         site for site, energy in energies.items() if not energy.motion.dominance.constant
     ]
     if changing:
-        losses = tuple(list_losses(run.log))
+        losses = tuple(PeerLoss.list_of_log(run.log))
         quantities = DominanceQuantities(changing=tuple(changing), losses=losses)
         return Premise("shares", False, quantities)
 

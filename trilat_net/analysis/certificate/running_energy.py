@@ -31,9 +31,8 @@ from ..aligned import (
 )
 from ..dominance_history import DominanceHistory, DominancePlan, find_closed_groups
 from .energy_balance import (
+    EnergyBalance,
     SiteEnergy,
-    compute_energy_balance,
-    derive_site_energies,
     find_common_times,
     find_dominance_matrices,
 )
@@ -361,7 +360,7 @@ class RunningEnergy:
                 return None
 
         is_known = len(find_common_times(energies)) > 1
-        balance = compute_energy_balance(energies) if is_known else None
+        balance = EnergyBalance.of_energies(energies) if is_known else None
 
         ramps_from_s = begin_s - _RAMP_MARGIN_S
         for site, plan in self._dominance.items():
@@ -409,7 +408,7 @@ class RunningEnergy:
             _, last = tick_spans[site]
             past_records = window.rows(first, last)
             pasts[site] = PeerTrajectory(past_records)
-        return derive_site_energies(self._scenario, records, pasts, self._trace_dominance)
+        return SiteEnergy.derive_all(self._scenario, records, pasts, self._trace_dominance)
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
         """Returns the dominance factors of a site, its weights of the peers, at times in s."""

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Array
-from ..aligned import Bools, find_latest_rows
+from ..aligned import Bools
 from ..run_view import RunView, SiteRun
 
 Complex = NDArray[np.complex128]
@@ -339,7 +339,7 @@ def _estimate_joints(
     records = runs[site].records
     torque = runs[site].torque
     is_usable = _find_still_rows(runs, site, alone=not environment)
-    rows, is_recorded = find_latest_rows(runs[environment or site].records, records.t_s)
+    rows, is_recorded = runs[environment or site].records.find_latest_rows(records.t_s)
 
     for joint in range(records.qd.shape[1]):
         responses = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
@@ -405,7 +405,7 @@ def _find_still_rows(
         if plan is None:
             return None
         if len(plan) > 1:
-            rows, _ = find_latest_rows(run.records, t_s)
+            rows, _ = run.records.find_latest_rows(t_s)
             changes_nm = np.abs(np.gradient(plan, axis=0))
             rate_nm_s = changes_nm.max(axis=1) * run.records.rate_hz
             is_still &= rate_nm_s[rows] < STILL_SCRIPT_NM_S

@@ -29,7 +29,7 @@ import numpy as np
 from ...core import Array, Law, TorqueKind
 from ...log import Ints
 from ...scenario import Scenario, identify_law
-from ..aligned import Bools, find_latest_rows
+from ..aligned import Bools
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector
 from ..row_reductions import any_in_rows, max_rows
@@ -99,7 +99,7 @@ def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
     rows_by_site = {}
     is_still = first_records.known.copy()
     for site, run in runs.items():
-        row, recorded = find_latest_rows(run.records, first_records.t_s)
+        row, recorded = run.records.find_latest_rows(first_records.t_s)
         rows_by_site[site] = row
         is_still &= recorded & _find_resting_rows(run)[row]
 

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from ...core import POSITION
-from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
+from ..aligned import AlignedRecords, find_common_rows
 from ..dominance_history import RAMP_TIME_TOLERANCE_S, DominancePlan
 from ..run_view import RunView, SiteRun
 from ..shared_slave import SharedSlave, UserShares
@@ -106,7 +106,7 @@ def _measure_authority(view: RunView, site: str) -> MetricValues:
     records = view.sites[site].records
     torque = view.sites[site].torque
     user = slave.users.index(site)
-    slave_row, is_slave_recorded = find_latest_rows(view.sites[slave.name].records, records.t_s)
+    slave_row, is_slave_recorded = view.sites[slave.name].records.find_latest_rows(records.t_s)
 
     share = shared.shares[slave_row, user]
     squared_torque = np.square(torque.operator).sum(axis=1)

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...analysis import SharedSlave, build_arm_rows, trace_dominance
+from ...analysis import DominanceHistory, SharedSlave, build_arm_rows
 from ...core import POSITION, Array
 from ...errors import LogError, UsageError, count_nouns, join_words
 from ...files import import_extra
@@ -608,7 +608,7 @@ def _read_columns(
     slave_records = log[slave]
     slave_rows = rows[slave]
     frame_times_s = slave_records.t_s[slave_rows]
-    dominance = trace_dominance(log, slave, frame_times_s)
+    dominance = DominanceHistory.of_log(log, slave, frame_times_s)
     has_program = settings.program != NO_PROGRAM
     program = settings.program if has_program else ""
     shared = shared_slave.find_shares(dominance.alpha, program)

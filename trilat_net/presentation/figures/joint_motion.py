@@ -24,11 +24,11 @@ from matplotlib.figure import Figure
 
 from ...analysis import (
     SETTLED_ERROR_RAD,
+    DominanceHistory,
     Timeline,
     VirtualWall,
     build_arm_rows,
     site_signals,
-    trace_dominance,
 )
 from ...core import LINK_PARAMETERS, Array
 from ...execution import simulate_without_operators
@@ -751,7 +751,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         share_panels = panels[: len(changing_sites)]
         joint_panels = panels[len(changing_sites) :]
         for site, axes in zip(changing_sites, share_panels, strict=True):
-            factors = trace_dominance(log, site, log[site].t_s).alpha
+            factors = DominanceHistory.of_log(log, site, log[site].t_s).alpha
             for peer, factor in zip(log.scenario.peers(site), factors.T, strict=True):
                 plot.trace(axes, site, factor, **style.site_line(log, peer))
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
