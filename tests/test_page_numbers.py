@@ -40,7 +40,7 @@ from trilat_net.analysis.theory import (
     find_equilibrium,
     iterate_linear_edges,
 )
-from trilat_net.analysis.theory.port_analysis import PortAnalysis, analyse_ports
+from trilat_net.analysis.theory.port_analysis import PortAnalysis
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
@@ -137,7 +137,7 @@ def common_motion() -> tuple[float, float, float]:
 
 def analyse_shipped_ports(name: str, **changes: Any) -> PortAnalysis:
     scenario = load_scenario(name, make_overrides(**changes))
-    return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
+    return PortAnalysis.of_scenario(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
 
 def find_felt_impedance(port_analysis: PortAnalysis) -> Any:

@@ -14,7 +14,7 @@ import trilat_net
 from tests.scenario.builders import rough_arm_text
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
-from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
@@ -116,7 +116,7 @@ def test_small_motions_see_a_larger_kp() -> None:
 
     def static(law: str, more: str) -> np.ndarray:
         scenario = parse_scenario(SHAKEN.format(law=law, more=more))
-        return linearise_loop(
+        return LinearLoop.of_conditions(
             OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.3, 0.2))
         ).A
 

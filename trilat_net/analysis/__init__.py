@@ -91,7 +91,6 @@ __all__ = [
     "info",
     "left_perron_vector",
     "link_summary",
-    "measure_delay_distributions",
     "DominancePlan",
     "SharedSlave",
     "Timeline",
@@ -125,7 +124,7 @@ if TYPE_CHECKING:
     )
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
-    from .link_summary import DelayDistribution, measure_delay_distributions, sample_ages_ns
+    from .link_summary import DelayDistribution, sample_ages_ns
     from .metrics.log_metrics import LogMetrics
     from .metrics.measures import Metric, Quantity
     from .metrics.motion_metrics import measure_undelayed_error
@@ -190,9 +189,7 @@ else:
             ),
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
-            "link_summary": (
-                "DelayDistribution link_summary measure_delay_distributions sample_ages_ns"
-            ),
+            "link_summary": "DelayDistribution link_summary sample_ages_ns",
             "metrics.log_metrics": "LogMetrics",
             "metrics.measures": "Metric Quantity",
             "metrics.motion_metrics": "measure_undelayed_error",

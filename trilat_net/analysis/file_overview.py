@@ -42,11 +42,10 @@ from ..results import JsonObject, Result, finite_or_none
 from ..scenario import END_WINDOW_S, list_arm_notes
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
+    ClockSummary,
     LinkSummary,
     ValueStatistics,
     sample_ages_ns,
-    summarise_clock,
-    summarise_links,
 )
 from .site_signals import (
     SETTLED_ERROR_RAD,
@@ -491,7 +490,7 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
     Returns:
         The facts as plain values, ready for JSON.
     """
-    clock_summary = summarise_clock(log, peer, site)
+    clock_summary = ClockSummary.of_link(log, peer, site)
     one_way_us = np.zeros(0, dtype=np.int64)  # not measured in virtual time
     version = _parse_number(log.session.get("schema_version", "")) or 0
     if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
@@ -633,7 +632,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         "records": sum(site["records"] for site in sites.values()),
         "missing": sum(site["missing"] for site in sites.values()),
         "sites": sites,
-        "links": {link.name: _summarise_link(log, link) for link in summarise_links(log)},
+        "links": {
+            link.name: _summarise_link(log, link) for link in LinkSummary.list_of_log(log)
+        },
         "changes": changes,
     }
 
@@ -699,7 +700,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
 def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
     """Returns the numbers of a link for `summary.json`, such as its delays and losses."""
     counts = link.counts
-    clock = summarise_clock(log, link.peer, link.site)
+    clock = ClockSummary.of_link(log, link.peer, link.site)
 
     stated = []
     for model in link.stated.models:

@@ -35,7 +35,7 @@ from ..hooks import find_hook
 from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
-from .site_signals import SETTLED_ERROR_RAD, find_last_error
+from .site_signals import SETTLED_ERROR_RAD, JointError
 from .timeline import Timeline
 from .torque_sources import SourceRows
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
@@ -252,7 +252,7 @@ class RunEnd(NamedTuple):
             log: The log of the run.
         """
         end = RunTrace.of_log(log).classify_end(log.scenario)
-        error = find_last_error(log)
+        error = JointError.find_last_of_all(log)
         if error is not None:
             end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
         if end.behaviour is EndBehaviour.DIVERGED:

@@ -24,7 +24,7 @@ from .aligned import AlignedRecords
 from .arm_rows import build_arm_rows
 from .dominance_history import DominanceHistory
 from .following import JointFollowing, build_following
-from .link_summary import LinkSummary, summarise_links
+from .link_summary import LinkSummary
 from .torque_sources import TorqueSplit, VirtualWall
 
 T = TypeVar("T")
@@ -117,7 +117,7 @@ class RunView:
 
         The name "m1->s" denotes the link from arm m1 to arm s.
         """
-        return {link.name: link for link in summarise_links(self.log)}
+        return {link.name: link for link in LinkSummary.list_of_log(self.log)}
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, VirtualWall]]:

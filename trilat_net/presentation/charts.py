@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..analysis import Timeline, joint_positions_m, measure_delay_distributions, site_signals
+from ..analysis import DelayDistribution, Timeline, joint_positions_m, site_signals
 from ..core import Array
 from ..log import Ints, Log, SiteLog
 from . import plot_signals, style
@@ -652,7 +652,7 @@ class ChartBuilder:
         A curve at x shows the percentage of ages, or of delays, that are at most x ms. The age
         of a message is its delay plus the time until a newer message replaces it.
         """
-        distributions = measure_delay_distributions(self._log)
+        distributions = DelayDistribution.list_of_log(self._log)
         x_ms = age_and_lateness.choose_delay_axis_ms(distributions)
         for site in self._log.sites:
             series = []

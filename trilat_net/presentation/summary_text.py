@@ -132,7 +132,7 @@ def format_link_lines(log: Log) -> list[str]:
         The lines. Empty if all links have a constant delay and no losses.
     """
     lines = []
-    for link in link_summary.summarise_links(log):
+    for link in link_summary.LinkSummary.list_of_log(log):
         if link.plain:
             continue
         is_measured = any(model.link.measured for model in link.stated.models)
@@ -204,7 +204,7 @@ def format_clock_lines(log: Log) -> list[str]:
     lines = []
     for site in log.sites:
         for peer in log[site].peers:
-            clock = link_summary.summarise_clock(log, peer, site)
+            clock = link_summary.ClockSummary.of_link(log, peer, site)
             if clock is not None and not clock.shared:
                 lines.append(f"clock of {peer} seen by {site}: {_format_clock(clock)}")
     return _limit_lines(lines)

@@ -8,7 +8,7 @@ from scipy import signal
 
 from tests.analysis.builders import make_run
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse, estimate_responses
+from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse
 
 RATE_HZ = 200
 EVERYTHING = np.ones(60 * RATE_HZ, dtype=np.bool_)
@@ -28,7 +28,7 @@ def estimate_strongest(
     rate_hz: int,
     least: float,
 ) -> FrequencyResponse:
-    return estimate_responses(drive, x, y, usable, rate_hz, least)[0]
+    return FrequencyResponse.estimate(drive, x, y, usable, rate_hz, least)[0]
 
 
 def test_a_known_filter_is_identified() -> None:

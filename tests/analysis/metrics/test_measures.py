@@ -10,7 +10,7 @@ import trilat_net
 from tests import metric_labels
 from tests.dropped_files import run_in_folder
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.metrics.measures import list_measures, measures
+from trilat_net.analysis.metrics.measures import Measure, measures
 from trilat_net.analysis.run_view import RunView
 
 METRIC = """
@@ -67,7 +67,7 @@ def test_duplicate_keys_are_refused_with_both_files() -> None:
 @pytest.mark.parametrize("name", ["free", "contact"])
 def test_a_measure_gives_its_declared_quantities(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
-    for measure in list_measures():
+    for measure in Measure.list_all():
         for subject in view.list_subjects(measure.of):
             assert set(measure.measure(view, subject)) == {
                 quantity.key for quantity in measure.quantities

@@ -29,9 +29,9 @@ from ...scenario import TASK_AXES, Scenario
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
 from . import static_windows
-from .measured_impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
-from .measures import Measure, Metric, MetricValues, Quantity, list_measures
-from .motion_metrics import ParameterEstimates, read_all_estimates
+from .measured_impedance import FrequencyResponse, ImpedanceEstimate
+from .measures import Measure, Metric, MetricValues, Quantity
+from .motion_metrics import ParameterEstimates
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
 # every file of this folder declares its metrics when it is imported
@@ -116,7 +116,7 @@ class LogMetrics(Result):
         """
         view = RunView(log)
         scenario = log.scenario
-        values = _measure_subjects(view, list_measures())
+        values = _measure_subjects(view, Measure.list_all())
 
         axes: tuple[str, ...] = ()
         if follows_in_task_space(log):
@@ -133,12 +133,12 @@ class LogMetrics(Result):
             sites=values["site"],
             links=values["link"],
             walls=values["wall"],
-            estimates=view.compute_once(read_all_estimates),
+            estimates=view.compute_once(ParameterEstimates.by_site),
             static_windows=static_windows.count_static_windows(view),
-            joint_loads=view.compute_once(static_windows.find_joint_loads),
-            sharing_ratios=view.compute_once(static_windows.find_sharing_ratios),
-            stiffness=static_windows.estimate_stiffness(view),
-            responses=estimate_impedances(view),
+            joint_loads=view.compute_once(static_windows.JointLoad.list_of_run),
+            sharing_ratios=view.compute_once(static_windows.SharingRatio.list_of_run),
+            stiffness=static_windows.StiffnessEstimate.list_of_run(view),
+            responses=ImpedanceEstimate.list_of_run(view),
             axes=axes,
             joint_names=_find_common_joint_names(scenario),
         )
@@ -149,7 +149,7 @@ class LogMetrics(Result):
 
         Tables and docs/reference/metrics.md list them in this order.
         """
-        return [quantity for measure in list_measures() for quantity in measure.quantities]
+        return [quantity for measure in Measure.list_all() for quantity in measure.quantities]
 
     @classmethod
     def find_quantity(cls, key: str) -> Quantity:
@@ -191,7 +191,7 @@ class LogMetrics(Result):
         """
         requested = {key: LogMetrics.find_quantity(key) for key in keys}
         needed_measures = []
-        for measure in list_measures():
+        for measure in Measure.list_all():
             measured_keys = {quantity.key for quantity in measure.quantities}
             if not measured_keys.isdisjoint(requested):
                 needed_measures.append(measure)

@@ -81,7 +81,7 @@ def unavailable(
     """
     return {
         quantity.key: Metric(None, why, applies)
-        for measure in list_measures()
+        for measure in Measure.list_all()
         for quantity in measure.quantities
         if quantity.group == group and of in ("", quantity.of)
     }
@@ -230,6 +230,16 @@ class Measure(NamedTuple):
     quantities: tuple[Quantity, ...]
     measure: Measuring
 
+    @classmethod
+    def list_all(cls) -> "list[Measure]":
+        """Returns all registered functions that measure quantities, ordered by group.
+
+        The groups have the order in which they are shown to the user. Groups that are not in
+        this order, such as those of a new file, are last.
+        """
+        rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
+        return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
+
 
 _MEASURES: list[Measure] = []
 TRACKING = "tracking"
@@ -294,13 +304,3 @@ def measures(
         return measure
 
     return declare
-
-
-def list_measures() -> list[Measure]:
-    """Returns all registered functions that measure quantities, ordered by group.
-
-    The groups have the order in which they are shown to the user. Groups that are not in this
-    order, such as those of a new file, are last.
-    """
-    rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
-    return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))

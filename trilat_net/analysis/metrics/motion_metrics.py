@@ -460,6 +460,23 @@ class ParameterEstimates(NamedTuple):
             content["base"] = self.base._asdict()
         return content
 
+    @classmethod
+    def by_site(cls, view: RunView) -> "dict[str, ParameterEstimates]":
+        """Reads what adaptive control laws learnt about their arms during a run.
+
+        The result compares first and last estimates of masses and inertias with the true ones.
+
+        Args:
+            view: The run.
+
+        Returns:
+            The estimates, by name of the site. Sites without records are missing.
+        """
+        return {
+            site: _read_parameter_estimates(view.scenario, run.records)
+            for site, run in view.sites.items()
+        }
+
 
 def _read_parameter_estimates(
     scenario: Scenario, records: AlignedRecords
@@ -506,23 +523,6 @@ def _read_parameter_estimates(
         slope_per_s=slopes,
         base=base,
     )
-
-
-def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Reads what adaptive control laws learnt about their arms during a run.
-
-    The result compares first and last estimates of masses and inertias with the true ones.
-
-    Args:
-        view: The run.
-
-    Returns:
-        The estimates, by name of the site. Sites without records are missing.
-    """
-    return {
-        site: _read_parameter_estimates(view.scenario, run.records)
-        for site, run in view.sites.items()
-    }
 
 
 def _estimate_base_parameters(
@@ -585,7 +585,7 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
         rigid body can have. A metric without a value contains the reason.
     """
     scenario = view.scenario
-    estimates = view.compute_once(read_all_estimates).get(site)
+    estimates = view.compute_once(ParameterEstimates.by_site).get(site)
     if estimates is None:
         return unavailable(LEARNING, "no records of the site")
 

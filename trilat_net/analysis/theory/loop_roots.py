@@ -43,11 +43,11 @@ from ..delay_period import find_final_link, is_ending_trace
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace
 from ..shared_slave import has_program_hand, list_program_sites
 from ..timeline import Timeline
-from .characteristic_roots import Spectrum, compute_delay_spectrum
+from .characteristic_roots import Spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
 from .floquet import DRAWN_SPAN_S, SampledLoop, SamplesInUse
 from .linear_edge import find_deepest_contact
-from .linear_loop import linearise_loop
+from .linear_loop import LinearLoop
 from .operating_point import Equilibrium, OperatingConditions
 
 _SAME_POSE_RAD = 1e-6
@@ -370,7 +370,7 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
             leaves_out=_name_left_out(loop.programs),
             is_numerical=has_imported_law,
         )
-    continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
+    continuous = Spectrum.of_loop(LinearLoop.of_conditions(loop.conditions, loop.rest), _ROOTS)
     span = ", in continuous time"
     if loop.conditions.varying or loop.has_mean_ages:
         span += ", of the mean ages"

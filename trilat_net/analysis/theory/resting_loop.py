@@ -16,7 +16,7 @@ import numpy as np
 from ...core import Array
 from ...scenario import Scenario
 from .characteristic_roots import CharacteristicRoot
-from .floquet import find_samples_in_use
+from .floquet import SamplesInUse
 from .linear_edge import find_rightmost_root
 from .operating_point import Equilibrium, OperatingConditions
 
@@ -68,7 +68,7 @@ class RestingLoop:
         Args:
             quantile: The share, from 0 to 1.
         """
-        used = find_samples_in_use(self.conditions).used.values()
+        used = SamplesInUse.predict(self.conditions).used.values()
         ages_by_link = [np.arange(len(samples)) - samples for samples in used]
         ages = np.concatenate(ages_by_link)
         age_ticks = float(np.quantile(ages, quantile, method="higher"))

@@ -23,11 +23,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import (
-    DelayDistribution,
-    Timeline,
-    measure_delay_distributions,
-)
+from ...analysis import DelayDistribution, Timeline
 from ...core import Array
 from ...log import Ints, Log
 from .. import style
@@ -160,7 +156,7 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    links = measure_delay_distributions(log)
+    links = DelayDistribution.list_of_log(log)
     x_ms = choose_delay_axis_ms(links)
     with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
         grid, panels = _add_link_panels(figure, log)
