@@ -390,7 +390,7 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
         an empty text.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution import group_runs
+    from trilat_net.core import group_runs
 
     for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]

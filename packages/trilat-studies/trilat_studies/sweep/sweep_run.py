@@ -19,6 +19,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -464,16 +465,18 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     if plan.judge == "linear" or (runs < 2 and not is_large):
         return False
     # A sweep of single runs must not load the code of lanes.
-    from trilat_net.execution import prepare_lanes
+    from trilat_net.core import prepare_lanes
+    from trilat_net.execution import FusedRun
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
     except ScenarioError:
         return is_large  # the workers compile the code of other cells
+    make_run = partial(FusedRun, scenario)
     if is_large:
-        prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
+        prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
         return True
-    return prepare_lanes(scenario, runs, least_site_ticks=math.inf)
+    return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
 
 
 def estimate_sweep(
