@@ -58,14 +58,7 @@ from ..errors import LawFailed, ScenarioError, count_nouns
 from ..log import Log
 from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
-from ..scenario import (
-    PlantPlayer,
-    Scenario,
-    Wall,
-    draw_link_samples,
-    make_hand_players,
-    refuse_external_arms,
-)
+from ..scenario import PlantPlayer, Scenario, Wall, draw_link_samples, make_hand_players
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
@@ -165,7 +158,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
         ScenarioError: Another arm is external, or the tick rates differ so much that too many
             samples (sent states) would arrive in one tick (control period) of the slowest site.
     """
-    refuse_external_arms(scenario, plants)
+    scenario.refuse_external_arms(plants)
     ratio = _find_largest_ratio(scenario)
     if ratio > MAX_ARRIVALS:
         raise ScenarioError(
