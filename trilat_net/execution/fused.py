@@ -30,7 +30,6 @@ from ..scenario import (
     Scenario,
     draw_link_samples,
     make_hand_players,
-    refuse_external_arms,
 )
 
 
@@ -49,7 +48,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
         ScenarioError: Another arm is external, or the tick rates differ so much that too many
             samples (sent states) would arrive in one tick (control period) of the slowest site.
     """
-    refuse_external_arms(scenario, plants)
+    scenario.refuse_external_arms(plants)
     ratio = _find_largest_ratio(scenario)
     if ratio > MAX_ARRIVALS:
         raise ScenarioError(

@@ -501,7 +501,7 @@ def allocate_words(rows: int, row_length: int) -> Words:
 
     Args:
         rows: Number of rows.
-        word_count: Count of numbers in a row of one run.
+        row_length: Count of numbers in a row of one run.
     """
     count = rows * row_length * LANES
     room = np.zeros(count + _ALIGNMENT // _WORD, np.int64)

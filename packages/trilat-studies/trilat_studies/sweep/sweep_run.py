@@ -39,7 +39,7 @@ from trilat_net.execution import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
-from trilat_net.scenario import Scenario, identify_law
+from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
@@ -418,7 +418,7 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
         measured = measure_run(simulate_scenario(scenario), log_metrics)
         metrics = {key: measured[key].value for key in log_metrics}
 
-    laws = dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
+    laws = dict.fromkeys(site.law_name for site in scenario.sites.values())
     return CellRun(
         cell=task.cell.number,
         seed=task.seed,
