@@ -20,14 +20,7 @@ from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
 from ..net import MODES, ModeMeaning
-from ..scenario import (
-    Change,
-    LinkBase,
-    describe_change,
-    describe_event,
-    find_owner,
-    find_requester,
-)
+from ..scenario import Change, LinkBase, describe_event, find_requester
 
 
 class _AppliedChange(NamedTuple):
@@ -198,7 +191,7 @@ class Timeline:
         """
         log = self._log
         applied_changes = [
-            _AppliedChange(change, find_owner(change), None, describe_change(change))
+            _AppliedChange(change, change.owner, None, change.describe())
             for change in log.scenario.timeline
         ]
 
@@ -217,7 +210,7 @@ class Timeline:
                     change = msgspec.json.decode(text, type=Change)
                     event = change_events.get((site, text))
                     if event is None:
-                        sentence = describe_change(change)
+                        sentence = change.describe()
                     else:
                         sentence = describe_event(event.kind, event.text, event.command)
                     applied_changes.append(_AppliedChange(change, site, tick, sentence))

@@ -16,6 +16,7 @@ Invariant:
 """
 
 from collections.abc import Iterable
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -40,11 +41,15 @@ class VirtualWall:
     Attributes:
         source: Description of the wall.
         normal: Unit vector along which the wall pushes, shape (2,) or (3,).
+        may_generate_energy: True if the wall is stiff, and its force is computed once per tick
+            (period of the control loop) and held. Other walls cannot generate energy, because
+            their force follows the motion of the arm.
     """
 
     def __init__(self, source: TorqueSource) -> None:
         self.source = source
         self.normal: Array = np.array(source.b)
+        self.may_generate_energy = source.sampled and any(source.K)
 
     @classmethod
     def list_of_site(cls, spec: SiteSpec) -> list["VirtualWall"]:
@@ -55,15 +60,6 @@ class VirtualWall:
         """
         actors = [source.actor for source in spec.environment]
         return [cls(actor) for actor in actors if actor.kind is TorqueKind.WALL]
-
-    @property
-    def may_generate_energy(self) -> bool:
-        """True if the wall is stiff, and its force is computed once per tick and held.
-
-        A tick is a period of the control loop. Only such walls can generate energy, because the
-        arm moves while their force is constant.
-        """
-        return self.source.sampled and any(self.source.K)
 
     def find_depth(self, end_effector: EndEffectorRows) -> Array:
         """Returns how deep the end effector (tip of the arm) is inside the wall, in m.
@@ -543,6 +539,16 @@ class WallEnergy(NamedTuple):
     generated_j: float
     required_damping_n_s_m: float
     arm_damping_n_s_m: float
+
+    @staticmethod
+    def count_walls(scenario: Scenario) -> int:
+        """Returns the number of walls in a scenario that may generate energy.
+
+        Args:
+            scenario: The description of the experiment.
+        """
+        walls = map(VirtualWall.list_of_site, scenario.sites.values())
+        return sum(wall.may_generate_energy for wall in chain.from_iterable(walls))
 
     @classmethod
     def list_of_log(cls, log: Log) -> list["WallEnergy"]:

@@ -58,7 +58,6 @@ __all__ = [
     "list_export_formats",
     "open_rerun",
     "write_foxglove_layout",
-    "write_rviz_config",
 ]
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ if TYPE_CHECKING:
         compose_topic_delays,
     )
     from .terminal_output import err, print_error, print_json, print_line, print_table
-    from .viewer_files import write_foxglove_layout, write_rviz_config
+    from .viewer_files import write_foxglove_layout
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -107,7 +106,7 @@ else:
             "terminal_output": (
                 "err print_error print_json print_line print_table terminal_output"
             ),
-            "viewer_files": "write_foxglove_layout write_rviz_config",
+            "viewer_files": "write_foxglove_layout",
         },
     )
 
@@ -121,6 +120,7 @@ register_hooks(
         "head a certificate": "certificate_text:compose_headline",
         "describe a push": "twin_text:describe_push",
         "describe a finding": "finding_text:describe_finding",
+        "describe what roots leave out": "decision_text:describe_left_out",
         "list the sentences of a finding": "finding_text:list_finding_sentences",
         "describe a premise": "premise_text:describe_quantities",
         "name the theorem": "verdict_text:name_theorem",

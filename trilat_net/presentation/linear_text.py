@@ -19,6 +19,7 @@ import numpy as np
 from ..analysis import QUOTED_AT_HZ, LinearAnalysis, Passivity, PortAnalysis, TwoPort
 from ..core import Array
 from ..errors import count_nouns
+from .decision_text import describe_tick_span
 from .result_text import Block, MarkedText, TextTable
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
@@ -251,8 +252,11 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
         growth += f" at {rightmost.s.imag:.4g} rad/s"
     is_of_sampled_loop = analysis.sampled is not None
     if is_of_sampled_loop:
-        # If ticks differ, the basis is a phrase such as ", over the period of 0.05 s".
-        ticks = analysis.decisive.basis.removeprefix(",") or " tick by tick"
+        spectrum = analysis.decisive
+        span = describe_tick_span(
+            spectrum.span_s, spectrum.deviation_per_s, repeats=spectrum.is_exact
+        )
+        ticks = span.removeprefix(",") or " tick by tick"
         growth += f", as computed{ticks}"
 
     motion = "the slowest motion"

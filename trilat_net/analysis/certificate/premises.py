@@ -22,7 +22,6 @@ Invariant:
 """
 
 from collections.abc import Mapping
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +38,7 @@ from ..dominance_history import (
 from ..following import TaskFollowing
 from ..row_reductions import any_in_rows
 from ..timeline import Timeline
-from ..torque_sources import VirtualWall, WallEnergy
+from ..torque_sources import WallEnergy
 from .energy_balance import (
     ZERO_ENERGY_J,
     EnergyBalance,
@@ -283,8 +282,7 @@ def _check_walls(log: Log) -> Premise | None:
     Returns:
         The premise. None if the scenario contains no such wall.
     """
-    walls = map(VirtualWall.list_of_site, log.scenario.sites.values())
-    if not any(wall.may_generate_energy for wall in chain.from_iterable(walls)):
+    if not WallEnergy.count_walls(log.scenario):
         return None
     quantities = WallQuantities(tuple(WallEnergy.list_of_log(log)))
     return Premise("walls", not quantities.active, quantities)

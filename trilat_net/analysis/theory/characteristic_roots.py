@@ -329,23 +329,6 @@ class Spectrum(NamedTuple):
     is_exact: bool = True
 
     @property
-    def basis(self) -> str:
-        """A phrase for the user that names the span of time for which the roots were computed.
-
-        If the controllers compute in ticks (periods of the control loop) that are not all
-        alike, the roots belong to a span of several ticks. The phrase is empty if the roots do
-        not belong to such a span.
-        """
-        if self.span_s is None:
-            return ""
-        if self.is_exact:
-            return f", over the period of {self.span_s:.6g} s"
-        if self.deviation_per_s is None:
-            return f", over {self.span_s:.6g} s, after which the delays nearly repeat"
-        deviation = f"+- {self.deviation_per_s:.1g} /s"
-        return f", over {self.span_s:.4g} s of the delays in use, {deviation}"
-
-    @property
     def rightmost(self) -> CharacteristicRoot | None:
         """The characteristic root with the largest real part, which determines stability.
 

@@ -31,7 +31,7 @@ import msgspec
 import numpy as np
 
 from ...core import BUCKETS_PER_S, Array
-from ...errors import ScenarioError, join_words
+from ...errors import ScenarioError
 from ...execution import FusedRun
 from ...log import Ints, Log
 from ...own_code import ImportedLaw
@@ -364,34 +364,22 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
             exact = _has_same_sign(sampled_loop, sampled, loop.last_pose)
-        roots = _summarise_roots(sampled, sampled.basis, exact=exact)
+        roots = _summarise_roots(sampled, exact=exact)
         return roots._replace(
             distance_rad=loop.distance_rad,
-            leaves_out=_name_left_out(loop.programs),
+            programs=loop.programs,
             is_numerical=has_imported_law,
+            span_s=sampled.span_s,
+            repeats=sampled.is_exact,
+            deviation_per_s=sampled.deviation_per_s,
         )
     continuous = Spectrum.of_loop(LinearLoop.of_conditions(loop.conditions, loop.rest), _ROOTS)
-    span = ", in continuous time"
-    if loop.conditions.varying or loop.has_mean_ages:
-        span += ", of the mean ages"
-    roots = _summarise_roots(continuous, span, exact=False)
-    return roots._replace(leaves_out=_name_left_out(loop.programs))
-
-
-def _name_left_out(programs: Sequence[str]) -> str:
-    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
-
-    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
-    if there is no such program.
-
-    Args:
-        programs: Sites whose arms a program of the user moves.
-    """
-    if not programs:
-        return ""
-    if len(programs) == 1:
-        return f"how the program at {programs[0]} reacts to the arms"
-    return f"how the programs at {join_words(programs)} react to the arms"
+    roots = _summarise_roots(continuous, exact=False)
+    return roots._replace(
+        programs=loop.programs,
+        is_continuous=True,
+        has_mean_ages=loop.conditions.varying or loop.has_mean_ages,
+    )
 
 
 def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium) -> bool:
@@ -415,12 +403,11 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
     return grows_at_last == (rate_per_s > 0.0)
 
 
-def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots:
+def _summarise_roots(spectrum: Spectrum, *, exact: bool) -> LoopRoots:
     """Returns the fastest growing root, and what it says about the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.
-        span: A phrase that states over which ticks the roots are computed.
         exact: True if no delay is averaged or assumed to repeat.
     """
     root = spectrum.rightmost
@@ -434,7 +421,6 @@ def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots
         swing_rate_per_s=max(swing_rates_per_s, default=None),
         omega_rad_s=abs(root.s.imag),
         drifting=spectrum.drifting,
-        span=span,
     )
 
 

@@ -47,7 +47,7 @@ _BINS_PER_DECADE = 20
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
-def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the age of the sample in use on every link over time, in ms.
 
     The age of a sample of a peer's state is the time from its sending until its use. The figure

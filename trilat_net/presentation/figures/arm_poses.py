@@ -3,7 +3,7 @@
 A planar arm is drawn in its plane. An arm in space, called a chain, is drawn as seen from one
 fixed direction, in parallel projection. Up in the picture is opposite to gravity.
 
-`draw_arms` returns a Matplotlib figure, and `render_arms_svg` returns SVG for the page. Both
+The figure "arms" is one of Matplotlib, and `render_arms_svg` returns SVG for the page. Both
 draw the same poses, which `find_pose` computes.
 
 Invariant:
@@ -291,7 +291,7 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
 
 
 @draws("arms", "the arms at a few instants", in_report=True)
-def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the poses of all arms at a few times, with a row per site and a column per time.
 
     A reader sees at one glance how the arms moved, and how closely they followed each other.
