@@ -355,14 +355,14 @@ def replay_command(
     """
     from trilat_net.app.play.play_process import PlayOptions, play_log
     from trilat_net.app.play.player import parse_rate
-    from trilat_net.app.play.session_reader import parse_selection, preload_messages
+    from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 
     from ...net import default_endpoint
 
     if preload < 0:
         raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
 
-    selection = parse_selection(
+    selection = PlaySelection.parse(
         include=include or (),
         exclude=exclude or (),
         start_s=start,

@@ -691,7 +691,7 @@ class Reach(NamedTuple):
         return connection.require(OPERATOR) if operates else connection
 
 
-class LawFiles(NamedTuple):
+class LawFileOptions(NamedTuple):
     """Options that permit a log's control laws, written by a user, to be executed.
 
     A log may come from somebody else. Code that it names runs only with the permission of the

@@ -130,7 +130,7 @@ def verify_command(
     virtual: Annotated[bool, flag("--virtual")] = False,
     resume_every: Annotated[int, value("--resume-every", "N", min=0)] = 0,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -209,7 +209,7 @@ def certify_command(
     ] = False,
     everything: options.AllOption = False,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     as_json: options.JsonOption = False,
 ) -> None:
     """Judges whether a run was stable, and says why.
@@ -278,7 +278,7 @@ def twin_command(
         Path | None, value("-o --out --output", "FILE", options.FIGURE_HELP)
     ] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -337,7 +337,7 @@ def figure_command(
     folder: Annotated[Path | None, value("--out -o", "DIR")] = None,
     others: Annotated[list[Path] | None, value("--with", "FILE")] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     listed: Annotated[bool, flag("--list", "Only list the figures.")] = False,
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
@@ -433,7 +433,7 @@ def report_command(
         ),
     ] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     force: options.ForceOption = False,
     png: options.PngOption = False,
@@ -479,7 +479,7 @@ def rerun_command(
     ] = False,
     overrides: options.SetOption = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     output: Annotated[
         Path | None, value("-o --out --output", "FILE", "Write the result as a log.")
     ] = None,

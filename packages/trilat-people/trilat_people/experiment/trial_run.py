@@ -39,7 +39,7 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_scenario
 
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
-from .protocol import ExperimentProtocol, PlannedTrial, limit_forces
+from .protocol import ExperimentProtocol, PlannedTrial
 from .synthetic_participant import ParticipantModel, SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
@@ -199,7 +199,7 @@ class ExperimentTrial:
             f"protocol sha256 {digest}"
         )
 
-        limited_sites = limit_forces(scenario, protocol, planned.group)
+        limited_sites = protocol.limit_forces(scenario, planned.group)
         self.scenario = replace(
             scenario,
             duration_s=self.longest_s + REST_S,
