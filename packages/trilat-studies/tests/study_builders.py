@@ -31,8 +31,8 @@ from trilat_studies.tuning.tuning_plan import ObjectivePoint
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
-from trilat_net.execution.lanes import run_groups
-from trilat_net.execution.lanes.lane_run import LaneRun
+from trilat_net.core.lanes import run_groups
+from trilat_net.core.lanes.lane_run import LaneRun
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 

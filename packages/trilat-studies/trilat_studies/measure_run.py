@@ -54,7 +54,6 @@ from trilat_net.scenario import (
     ExpectWindow,
     Scenario,
     field_names,
-    refuse_external_arms,
 )
 
 BATCH_RECORDS = 1000
@@ -395,7 +394,7 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
         an empty text.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution import group_runs
+    from trilat_net.core import group_runs
 
     for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
@@ -1225,7 +1224,7 @@ class _MeasuredRun:
         receivers = {name: batches.add for name, batches in self._batches.items()}
         self.obstacle = ""
         self.compiled: _CompiledRun | None = None
-        refuse_external_arms(scenario)
+        scenario.refuse_external_arms()
         try:
             check_fusable(scenario)
         except ScenarioError:
@@ -1522,7 +1521,7 @@ def refuse_live_only(scenario: Scenario) -> None:
         ScenarioError: An arm is external, or a link has the model "measured": it injects no
             delay: the real network decides. In virtual time there is no real network.
     """
-    refuse_external_arms(scenario)
+    scenario.refuse_external_arms()
     if scenario.measured:
         measured_links = [name for name, link in scenario.links.items() if link.measured]
         path = f"links.{measured_links[0]}.model" if measured_links else "timeline"

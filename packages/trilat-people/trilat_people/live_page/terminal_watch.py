@@ -19,7 +19,7 @@ from trilat_net.core import LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net import Bus, Clock, Connection, connect_to_session
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import embedded_names_reader, find_site
+from trilat_net.scenario import embedded_names_reader
 from trilat_net.signals import Interrupt
 
 from .page_orders import OrderDesk
@@ -127,7 +127,7 @@ class SessionWatch:
         view.poll()
         if self._as_site and view.scenario is not None:
             # Called only for the error that it raises if there is no such site.
-            find_site(view.scenario, self._as_site)
+            view.scenario.find_site(self._as_site)
 
         course = view.advance_energy()  # energies at the new ticks, None without new ticks
         if course is not None:

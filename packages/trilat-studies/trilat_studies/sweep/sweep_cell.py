@@ -40,7 +40,7 @@ from trilat_net.scenario import Scenario, parse_scenario
 from ..measure_run import refuse_live_only
 
 if TYPE_CHECKING:
-    from trilat_net.execution import RunGroup
+    from trilat_net.core import RunGroup
 
 
 class CellClass(StrEnum):
@@ -363,7 +363,7 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution import group_runs
+    from trilat_net.core import group_runs
 
     cells = [_CellInProgress(scenario, longest_s) for scenario in scenarios]
     runs = [cell.run for cell in cells]

@@ -28,14 +28,7 @@ from trilat_net.analysis import find_quantity
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
 from trilat_net.fields import split_unit
 from trilat_net.own_code import allow_own_code, name_law_classes
-from trilat_net.scenario import (
-    LAWS,
-    ExperimentText,
-    Scenario,
-    apply_overrides,
-    identify_law,
-    is_number,
-)
+from trilat_net.scenario import LAWS, ExperimentText, Scenario, apply_overrides, is_number
 
 from ..run_commands import format_command, format_toml_value, set_options
 from . import sweep_cell
@@ -794,7 +787,7 @@ def _list_law_overrides(
         The overrides. Empty if all sites already have the law, so that they keep its gains.
     """
     sites = base.scenario.sites.values()
-    if not base.forced and all(identify_law(spec.control) == law for spec in sites):
+    if not base.forced and all(spec.law_name == law for spec in sites):
         return ()
     return _force_law(written, overrides, law)
 

@@ -19,6 +19,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,7 +39,7 @@ from trilat_net.execution import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
-from trilat_net.scenario import Scenario, identify_law
+from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
@@ -497,7 +498,7 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
         measured = measure_run(simulate_scenario(scenario), log_metrics)
         metrics = {key: measured[key].value for key in log_metrics}
 
-    laws = dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
+    laws = dict.fromkeys(site.law_name for site in scenario.sites.values())
     return CellRun(
         cell=task.cell.number,
         seed=task.seed,
@@ -544,16 +545,18 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     if plan.judge == "linear" or (runs < 2 and not is_large):
         return False
     # A sweep of single runs must not load the code of lanes.
-    from trilat_net.execution import prepare_lanes
+    from trilat_net.core import prepare_lanes
+    from trilat_net.execution import FusedRun
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
     except ScenarioError:
         return is_large  # the workers compile the code of other cells
+    make_run = partial(FusedRun, scenario)
     if is_large:
-        prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
+        prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
         return True
-    return prepare_lanes(scenario, runs, least_site_ticks=math.inf)
+    return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
 
 
 def run_sweep(
