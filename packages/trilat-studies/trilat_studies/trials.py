@@ -39,7 +39,7 @@ from msgspec.structs import asdict
 from trilat_net.analysis import find_quantity
 from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
-from trilat_net.execution import check_virtual, execute_virtual, verify
+from trilat_net.execution import check_virtual, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
@@ -198,7 +198,7 @@ class Trial(NamedTuple):
             if not any(len(log[name]) for name in log.sites):
                 raise LogError(f"{log_file}: no records")
             result = self.evaluate(RunMetrics.of_log(log, self.scenario.expect), wall_s)
-            verdict = verify(log)
+            verdict = verify_log(log)
         except LogError as error:
             text = "; ".join([*problems, str(error)])
             return TrialResult(self, wall_s=wall_s, error=text, log=existing_log)

@@ -32,7 +32,7 @@ from trilat_net.analysis import (
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
-from trilat_net.execution import FusedRun, record_virtual, verify
+from trilat_net.execution import FusedRun, record_virtual, verify_log
 from trilat_net.files import digest_file
 from trilat_net.log import Ints, Log, SiteLog, open_log
 from trilat_net.records import NS_PER_S
@@ -321,7 +321,7 @@ class ExperimentTrial:
             LogError: The records are not those of a run, or they end before the trial does.
         """
         log = open_log(path)
-        if not verify(log).passed:
+        if not verify_log(log).passed:
             raise LogError(f"{path}: the records differ from those of a repeated run")
 
         outcome = self._judge_log(log)
