@@ -178,7 +178,7 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
             {"law": "wave"},
             {"dominance": ONE_WAY},
             [
-                "m1, m2, s: lines share as b_ij / sum b_ik, as the shares of sites are not reversible"
+                "m1, m2, s: lines share as b_ij / sum b_ik, because the shares of the sites are not reversible"
             ],
         ),
         (

@@ -7,7 +7,7 @@ disturbance, which shows whether they are stable.
 
 Invariant:
     - The results equal the results of `execution.virtual` with its default network, bit for
-      bit. Scenarios that the compiled loop cannot execute are refused.
+      bit. Scenarios that the compiled loop cannot execute are rejected.
     - A run with the inputs of a log (arrived states and applied changes) equals the recorded
       run, bit for bit. The state that a site receives may carry a time stamp in the future,
       because the clocks of two computers may differ. It is then delivered in the first tick
@@ -91,7 +91,7 @@ def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 def scale_differences(x: Array, y: Array, factor: float) -> Array:
     """Scales the difference between the states of two simulations: y + factor (x - y).
 
-    With a factor below 1, for example, the first one comes closer to the second one.
+    With a factor below 1, for example, the first state moves closer to the second.
 
     Args:
         x: Numbers of a run.
@@ -105,9 +105,9 @@ def scale_differences(x: Array, y: Array, factor: float) -> Array:
 class _RunState:
     """The complete state of a simulated run: all arrays that change, viewed as 64-bit integers.
 
-    With this object, the state of a run can be copied to another run, or brought closer to it.
-    The views share the memory of the run, so a change of the object changes the run. Integers
-    are used because equal integers mean equal bits.
+    With this object, the state of a run can be copied to another run, or moved closer to that
+    of another run. The views share the memory of the run, so a change of the object changes the
+    run. Integers are used because equal integers mean equal bits.
 
     Args:
         arrays: The arrays that contain the state. Their memory is shared, not copied.
@@ -169,7 +169,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     ratio = _find_largest_ratio(scenario)
     if ratio > MAX_ARRIVALS:
         raise ScenarioError(
-            f"the fastest site makes {count_nouns(ratio, 'tick')} within one tick of the "
+            f"the fastest site executes {count_nouns(ratio, 'tick')} within one tick of the "
             f"slowest, but at most {MAX_ARRIVALS} samples can arrive in a tick; choose tick "
             "rates that differ less",
             path="rate_hz",
@@ -215,13 +215,13 @@ class RunTotals(NamedTuple):
 
     Attributes:
         rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
-            is the difference between the angle of a joint and its reference. The value is that
-            of the joint of all sites (arm controllers) for which it is largest.
+            is the difference between the angle of a joint and its reference. The value is the
+            largest over all joints of all sites (arm controllers).
         effort_nm: Root mean square of tau - G(q) over sites and joints, in N m. tau is the
             control torque, and G(q) is the torque that compensates gravity in the pose q.
         force_peak_n: Largest force of a wall on an arm, in N. None if there is no wall.
         walls_j: Work of the environments on the arms, in J. An environment is a wall or another
-            body that acts on an arm. None if there is none.
+            body that acts on an arm. None if there is no environment.
     """
 
     rms_error_rad: float
@@ -231,16 +231,16 @@ class RunTotals(NamedTuple):
 
 
 class RunInputs(NamedTuple):
-    """Everything that a recorded run received from outside, so that it can be repeated.
+    """All external inputs of a recorded run, with which the run can be repeated.
 
     `read_run_inputs` reads the inputs from a log, and `FusedRun` uses them.
 
     Attributes:
         feed: Ticks (control periods) in which samples of other sites (arm controllers) arrived,
             and actions of live operators.
-        changes: Changes of links or sites during the run, in the order of time. Each entry
-            contains the tick before which the site applies the change, the index of the site,
-            and the change.
+        changes: Changes of links or sites during the run, in order of time. Each entry contains
+            the tick before which the site applies the change, the index of the site, and the
+            change.
         late_ns: Largest time from the stamp of a sample to its arrival, in ns. The loop needs
             it to decide how long samples are stored.
         longest_us: Longest delay that a change gave to a link, in us.
@@ -282,15 +282,15 @@ class RunMemory(NamedTuple):
 
     Attributes:
         tables: Arrays of all sites.
-        progress: How far each site is, shape (N,), see `ProgressRow`.
-        next_samples: For each site and peer the next sample to accept, shape (N, P).
+        progress: Progress of each site, shape (N,), see `ProgressRow`.
+        next_samples: Next sample to accept, for each site and peer, shape (N, P).
         sent: Latest records (results of control periods) of the sites.
         peaks: Peaks in intervals of 50 ms, see `run_until`.
         sums: Sums over the records, shape (N,), see `SumsRow`.
         settled_rad: Position error below which an arm counts as settled, rad.
-        laws: Numbers of compiled laws that are not a part of the kernel. None if no site has
-            such a law.
-        compiled_laws: These laws, by the index of their site.
+        laws: Gains and memory of compiled laws that are not part of the kernel. None if no site
+            has such a law.
+        compiled_laws: The compiled laws themselves, by the index of their site.
         has_plain_law: True if a site has a law in plain Python.
         feed: Inputs of a recorded run.
     """
@@ -401,7 +401,8 @@ class FusedRun:
 
         Returns:
             Ring buffers for at least as many records per site as are needed. Their length is a
-            power of two, so that the compiled loop finds the place of a tick with a bit mask.
+            power of two, so that the compiled loop finds the position of a tick with a bit
+            mask.
         """
         site_count = len(self._layouts)
         fastest_hz = int(self._progress["rate_hz"].max())
@@ -423,8 +424,8 @@ class FusedRun:
         """Connects live operators to their sites, and allocates memory for their actions.
 
         A live operator is a person or program that moves an arm while the run is in progress.
-        The compiled loop reads the actions from `self._inputs`. There is space for no tick
-        (control period) yet; `plan` adds it.
+        The compiled loop reads the actions from `self._inputs`. There is no space for actions
+        yet; `plan` allocates it for all planned ticks (control periods).
 
         Args:
             hands: Live operators, by site.
@@ -507,7 +508,7 @@ class FusedRun:
         )
 
     def _update_links(self) -> None:
-        """Brings the links up to date, if the run was advanced together with other runs."""
+        """Updates the state of the links, if the run was advanced together with other runs."""
         deliver = self.pending_deliveries
         self.pending_deliveries = None
         if deliver is not None:
@@ -561,12 +562,12 @@ class FusedRun:
             self._step_piece(next_pause_ns - 1)  # up to the last tick before the pause
         if self.diverged_s is None:
             self._step_piece(last_ns)
-        # The arms of plants move on by the last tick, as all other arms did within the loop.
+        # Plants advance their arms by the last tick, as all other arms did within the loop.
         for i in self._plants:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
-        """Lets a user's own program compute the motion of an arm in one control period.
+        """Calls a user's program to compute the motion of an arm in one control period.
 
         Such a program is called a plant, and a control period a tick. The plant moves once per
         tick, by the control torque of the last executed tick. The new state of the arm is
@@ -665,7 +666,7 @@ class FusedRun:
             # A compiled law may raise any error. Each law knows whether the error is its own.
             failures = [law.find_failure(error) for law in compiled]
             law_failures = filter(None, failures)
-            # An error that comes from no law is raised unchanged.
+            # An error that no law caused is raised unchanged.
             raise next(law_failures, error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
@@ -730,8 +731,8 @@ class FusedRun:
         """Sets how many ticks each site will execute in total, and allocates memory for them.
 
         A tick is a period of a site's control loop. The memory for the largest values in
-        intervals of 50 ms (buckets), and for the actions of live operators, becomes longer. The
-        values in it are kept.
+        intervals of 50 ms (buckets), and for the actions of live operators, is enlarged. Values
+        that it contains are kept.
 
         Args:
             ticks: Total number of ticks of each site (arm controller), in the order of the
@@ -778,8 +779,8 @@ class FusedRun:
     def has_programs(self) -> bool:
         """True if users' own programs act as operators, or compute the motion of an arm.
 
-        The run cannot be copied then, because the state of such programs is not part of its
-        state.
+        The run cannot be copied then, because the state of such programs is not part of the
+        state of the run.
         """
         return bool(self._hands or self._plants)
 
@@ -843,7 +844,7 @@ class FusedRun:
     def displace(self, field: str, offsets: Array) -> None:
         """Adds offsets to one field of the state of all sites, for example to the joint angles.
 
-        Repeated runs with a small disturbance are disturbed in this way.
+        Twins, repeated runs with a small disturbance, are disturbed in this way.
 
         Args:
             field: Name of the field, for example "q" for the joint angles or "qd" for the
@@ -854,7 +855,7 @@ class FusedRun:
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
-        """Returns how far the state of this simulation is from that of another, in one field.
+        """Returns the distance between the states of this simulation and another, in one field.
 
         Args:
             other: The other run of the same scenario.
@@ -910,7 +911,7 @@ class FusedRun:
 
     @property
     def buckets(self) -> tuple[Array, ...]:
-        """Course of the run in intervals of 50 ms, with one array for each site.
+        """Largest errors and speeds in intervals of 50 ms, with one array for each site.
 
         Each array has the shape (intervals, 3 n), where n is the number of joints. A row
         contains the largest synchronisation error |e| of each joint in rad, the largest speed
@@ -998,7 +999,7 @@ class FusedRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """External torque on each arm in the last control period, in N m, not of the motors.
+        """External torque on each arm in the last control period, in N m, without the motors.
 
         The list has one array of the shape (n,) per site, for n joints. Operators and
         environments exert the torque.
@@ -1031,14 +1032,14 @@ class FusedRun:
 
     @property
     def is_finished(self) -> bool:
-        """True if the run has the whole duration of its scenario, or if an arm has diverged."""
+        """True if the run has reached the end of its scenario, or if an arm has diverged."""
         return self.ran_s >= self.scenario.duration_s or self.diverged_s is not None
 
     def find_batch_end(self) -> float:
-        """Returns the time up to which the run may go on before its records are read, in s.
+        """Returns the time up to which the run may continue before its records are read, in s.
 
-        In this time no site (arm controller) produces more records than the run stores, see
-        `keep` of the constructor. The time is at most the duration of the scenario.
+        Up to this time, no site (arm controller) produces more records than the run stores, see
+        `keep` of the constructor. The result is at most the duration of the scenario.
         """
         fastest_hz = int(self._progress["rate_hz"].max())
         return min(self.ran_s + (self._keep - 1) / fastest_hz, self.scenario.duration_s)
@@ -1061,7 +1062,7 @@ class FusedRun:
 
         A sample is the state that a peer, another site, sent in one of its ticks. The samples
         follow from the delays of the links alone, so they are computed again and not stored.
-        The run must not be one that repeats a log, whose samples arrived as recorded.
+        The run must not repeat a log, because its samples would then arrive as recorded.
 
         Args:
             i: Index of the site.
@@ -1166,7 +1167,7 @@ def read_run_inputs(log: Log) -> RunInputs:
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
-    """Returns the changes of all sites in the order of time, in the form of `RunInputs`."""
+    """Returns the changes of all sites in order of time, in the form of `RunInputs`."""
     timed_changes = []
     for i, name in enumerate(log.scenario.names):
         rate_hz = log[name].rate_hz

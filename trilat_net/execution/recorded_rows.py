@@ -84,7 +84,7 @@ def _find_samples(
     counts: IntArray, entries: IntArray, peers: IntArray, rows: IntArray, arrivals: IntArray,
     is_complete: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Finds out for which ticks the log contains the content of all samples that arrived.
+    """Determines the ticks for which the log contains the content of all arrived samples.
 
     A sample is the state that another site (arm controller), a peer, sent. The record of a tick
     (control period) lists only the senders of the samples and the ticks in which they were
@@ -125,10 +125,10 @@ class PlainRows:
 
     Args:
         site_log: Records of the site (arm controller).
-        indexed: The same records with the places of their values.
+        indexed: The same records with the positions of their values.
         samples: Samples of all sites.
-        resume_every: Every how many ticks a record does not count as plain, because the site is
-            restored from its records there. 0 means never.
+        resume_every: Interval, in ticks, at which the site is restored from its records. The
+            record there does not count as plain. 0 means never.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class PlainRows:
 
         Args:
             row: Index of the first record.
-            before_tick: Tick before which the records end. None for no such tick.
+            before_tick: Tick before which the records end. None if there is no such limit.
         """
         # `_stops` has the indices of the records that are not plain. The block ends before the
         # next one of them.
@@ -234,7 +234,7 @@ class PlainRows:
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads some records as arrays, to execute their control periods by compiled code.
+        """Reads consecutive records as arrays, to execute their ticks in compiled code.
 
         Args:
             first: Index of the first record (result of a control period).
@@ -259,7 +259,7 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes control periods of some records again in compiled code, to verify them.
+        """Executes the control periods of records again in compiled code, to verify them.
 
         Args:
             repeater: Executes the ticks (control periods) of the site (arm controller).

@@ -1,8 +1,8 @@
-"""Executes arms of a log again with changed settings, and refuses changes without effect.
+"""Executes arms of a log again with changed settings, and rejects changes without effect.
 
 A log has one record per control period (tick) for each arm. `what_if` uses this module to
 compute some or all arms again, for example with another gain at the slave. A setting that
-concerns only arms that are not executed is refused, because it would have no effect. A setting
+concerns only arms that are not executed is rejected, because it would have no effect. A setting
 that concerns both kinds of arms changes only the executed ones, and the result reports this.
 
 Below, a site is the control process of an arm, and a sample is the state that a site sends to
@@ -174,9 +174,9 @@ def resolve_rerun_request(
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Refuses to repeat the run of a site whose arm is a real robot or a user's program.
+    """Rejects the repetition of a site whose arm is a real robot or a user's program.
 
-    How this arm would have reacted to other torques is not known.
+    The log does not show how such an arm would have reacted to other torques.
 
     Raises:
         ScenarioError: A site that is to be executed again has such an arm.
@@ -185,8 +185,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
         if name not in replaced:
             continue
         problem = (
-            "is external: how this arm would have moved otherwise is not known; execute other "
-            "sites"
+            "is external: the log does not show how it would have moved; execute other sites"
         )
         others = [other for other in original.names if other not in original.external]
         if others:
@@ -195,7 +194,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
-    """Refuses a changed setting that cannot have an effect in a rerun.
+    """Rejects a changed setting that cannot have an effect in a rerun.
 
     A rerun executes some sites (arm controllers) of a log again, and copies the records
     (results of control periods) of the others. For example, a setting of a site whose records
@@ -235,10 +234,10 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 def _check_recorded_limits(
     original: Scenario, requested: Scenario, recorded: Sequence[str]
 ) -> None:
-    """Refuses changes of a rerun that the recorded arrivals of samples do not cover.
+    """Rejects changes of a rerun that the recorded arrivals of samples do not cover.
 
-    These are other sites (arm controllers), a longer duration, and other tick rates if some
-    sites are not executed.
+    Such changes are other sites (arm controllers), a longer duration, and other tick rates if
+    some sites are not executed.
 
     Args:
         original: Scenario of the log.
@@ -373,10 +372,10 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 def _describe_replacement(
     request: RerunRequest, group: str, owner: str, key: str
 ) -> tuple[str, str, str] | None:
-    """Describes a change that replaces a link or a control law as a whole.
+    """Describes a change that replaces an entire link or control law.
 
-    A link is described as a whole if its short description differs, and a law if its kind
-    differs.
+    The entire link is described if its short description differs, and the entire law if its
+    kind differs.
 
     Args:
         request: The request.
@@ -574,7 +573,7 @@ class RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of an incomplete log, as earlier inputs are unknown.
+        """Continues at the next record of an incomplete log, without the unknown ticks before.
 
         If there is no further record, the site (arm controller) is done.
         """
@@ -587,8 +586,8 @@ class RerunSite:
     def _execute(self, row: int | None) -> RerunTick:
         """Executes the next tick (control period), and compares it with the record of the log.
 
-        Its inputs are the samples that arrive according to `deliveries`, and the changes and
-        the operator's actions in the log.
+        The inputs of the tick are the samples that arrive according to `deliveries`, and the
+        changes and the operator's actions in the log.
 
         Args:
             row: Index of the record. None if the log does not contain a record of the tick.
@@ -768,7 +767,7 @@ class RerunExecution:
 
         Args:
             progress: Function that is called now and then with the number of executed ticks,
-                and an upper bound of their total. None for no calls.
+                and an upper bound on their total. None if progress is not reported.
 
         Yields:
             The result of each tick.

@@ -25,7 +25,7 @@ from ..net import MODES, RESTING_MODES, State
 from ..records import NS_PER_S, Arrival, TickRecord
 
 _LOOK_BACK = 100
-"""Number of records before a gap in which the newest arrived sample is searched."""
+"""Number of records before a gap that are searched for the newest arrived sample."""
 
 Change = TypeVar("Change")
 
@@ -124,7 +124,7 @@ def select_peer_channels(
 ) -> list[Arrival]:
     """Returns copies of arrivals that contain only what one receiver gets.
 
-    A control law may send different numbers to different receivers. Those for the other
+    A control law may send different numbers to different receivers. The numbers for other
     receivers are removed.
 
     Args:
@@ -171,7 +171,7 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 
 
 class RecordedInputs(Generic[Change]):
-    """Everything that one site received according to a log: samples and changes of settings.
+    """All inputs of one site according to a log: received samples and changes of settings.
 
     With these inputs, the site (arm controller) can be executed again. A sample is the state
     that another site (a peer) published in one tick (control period).
@@ -182,7 +182,8 @@ class RecordedInputs(Generic[Change]):
         ends: Last tick of each site.
         changes: Changes that took effect at the site, by tick.
         links: Links over which the site receives, in the order of its peers.
-        states: Records of the site, if they are not to be decoded as those of `site_log` are.
+        states: Records of the site, if they are decoded in another way than those of
+            `site_log`.
 
     Attributes:
         samples: Samples of each peer, by the tick in which the peer published them.
@@ -230,8 +231,8 @@ class RecordedInputs(Generic[Change]):
             tick: Last tick whose changes are returned.
 
         Returns:
-            Pairs of the tick of a change and the change, in the order of time. Empty if there
-            are no further changes.
+            Pairs of the tick of a change and the change, in order of time. Empty if there are
+            no further changes.
         """
         popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
@@ -287,8 +288,8 @@ class RecordedInputs(Generic[Change]):
         (period of its control loop). There are two conditions:
 
         - The records of the two ticks before must exist. The last one contains the state of the
-          arm and of the control law. The control torque of the tick before it is needed too,
-          because it is part of the state of the control loop.
+          arm and of the control law. The first one contains a control torque that is part of
+          the state of the control loop.
         - The log must contain the samples (states of other sites) that the site used in the
           last tick, because it may use them again. This does not matter for a site that rests
           at a position of its own, because such a site ignores the samples.

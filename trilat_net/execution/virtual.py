@@ -103,8 +103,8 @@ class SiteChannels:
     """Channels of one site in a log that is being written: records, statistics and events.
 
     The `make_…` methods convert ticks (control periods) and messages to entries, and `write`
-    writes an entry to the log. An account for each channel counts the messages, so that the log
-    can state whether any are missing.
+    writes an entry to the log. For each channel, an account counts the messages, so that the
+    log can state whether messages are missing.
 
     Args:
         scenario: Scenario of the log.
@@ -137,9 +137,7 @@ class SiteChannels:
     def make_tick_entries(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the messages that follow the record of a control period in a log.
-
-        They are statistics and events.
+        """Returns the statistics and events that follow the record of a tick in a log.
 
         Args:
             output: Record of the tick (control period): the stored result.
@@ -293,7 +291,7 @@ class SiteChannels:
             event: The event.
             number: Number of the event. It is used only if the event itself has none.
         """
-        has_number = event.n >= 0  # events of the oldest versions have none
+        has_number = event.n >= 0  # events of the oldest versions have no number
         numbered = event if has_number else msgspec.structs.replace(event, n=number)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
         t_ns = max(event.t_ns, 0)  # a log has no times before the epoch
@@ -373,7 +371,7 @@ def check_virtual(scenario: Scenario) -> None:
     """Checks that a scenario can run in virtual time, before anything is written.
 
     In virtual time, all sites (simulated processes that each run one arm) run in one process. A
-    real robot cannot take part. An arm whose motion a user's program computes can.
+    real robot cannot take part, but an arm whose motion a user's program computes can.
 
     Args:
         scenario: Description of the experiment.
@@ -428,9 +426,9 @@ def execute_virtual(
 
     In virtual time, the sites run in one process, as fast as possible. A tick is one period of
     a site's control loop. Ticks are executed in the order of their nominal times, and ticks of
-    the same time in the order of the sites. A site for which samples have not been sent yet
-    waits while other sites are executed. If the arm of a site leaves its limits, the run ends
-    with the ticks of that time.
+    the same time in the order of the sites. A site waits while other sites are executed, as
+    long as samples that it needs have not been sent. If the arm of a site leaves its limits,
+    the run ends with the ticks of that time.
 
     Args:
         scenario: Description of the experiment, with its sites and links.
@@ -571,7 +569,7 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes to the log what an operator's connection has reported, and empties the list.
+        """Writes the reports of an operator's connection to the log, and empties the list.
 
         Args:
             news: The reports, as pairs of a tick (number of a period of the control loop) and a

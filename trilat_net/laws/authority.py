@@ -42,7 +42,7 @@ class Authority(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        leads: True if the other arms follow this arm. This is so for a user, not for the slave.
+        leads: True if the other arms follow this arm: for a user, but not for the slave.
         gravity: Ratio of the compensated gravity torque to the true gravity torque. 1 is exact.
     """
 

@@ -238,7 +238,7 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates the stability of this law as far as the gains alone decide it.
+        """Evaluates the stability of this law in the cases that the gains alone decide.
 
         If the feedforward gain `acceleration` is 1, high frequencies are undamped, and the
         condition is not met. In all other cases it is undecided (`holds` is None), because it

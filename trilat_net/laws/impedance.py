@@ -36,7 +36,7 @@ from .conditions import (
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningRun, TuningSite
 
 MOST_HANDS = 4
-"""Largest number of hands at the masters whose selections are tried one by one."""
+"""Largest number of hands at the masters for which all combinations are tried."""
 
 
 @compiled
@@ -64,7 +64,7 @@ class Impedance(ControlLaw):
     }
     remembers: ClassVar = ("start",)
     tune: ClassVar = {"M": INERTIA, "B": DAMPING, "K": STIFFNESS}
-    known_facts: ClassVar = "gravity AND inertia exactly: more than the others"
+    known_facts: ClassVar = "gravity and the exact inertia: more than most laws"
     needs_theta: ClassVar = True
     needs_model: ClassVar = True
 
@@ -139,8 +139,8 @@ class Impedance(ControlLaw):
         """Returns the part of this law that the linear analysis can express by gains: gravity.
 
         The linear analysis considers small motions about a pose at rest. The gains compensate
-        the torque of gravity. The spring, the damper and the forces of this law are no such
-        gains; `linear_form` describes them as matrices.
+        the torque of gravity. The spring, the damper and the forces of this law cannot be
+        expressed by gains; `linear_form` describes them as matrices.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
@@ -212,9 +212,9 @@ class Impedance(ControlLaw):
 
         Only a slave that touches something sends forces and thereby closes a loop. The loop is
         then judged by the small-gain theorem: it is stable for constant delays of any length if
-        its gain is below 1 at every frequency. A hand at a master changes the gain. Therefore
-        the gain is computed with each selection of the scenario's hands at the masters, from
-        none to all, because a person may let go.
+        its gain is below 1 at every frequency. A hand at a master changes the gain. A person
+        may also let go. Therefore the gain is computed with each combination of the scenario's
+        hands at the masters, from none to all.
 
         The condition is undecided in two cases:
 
@@ -287,7 +287,7 @@ class Impedance(ControlLaw):
     def target_motion(self, run: TuningRun) -> Array | None:
         """Computes the motion of the impedances that the user has chosen, without any delay.
 
-        The outside torques of the run drive the model
+        The external torques of the run drive the model
 
             M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j
 
@@ -372,7 +372,7 @@ def _find_stiffest_wall(
 
     Args:
         laws: Settings of the law of each arm.
-        dominance_factors: a_i, those of the slave, shape (N,).
+        dominance_factors: Dominance factors a_i of the slave, shape (N,).
         slave: Index of the slave.
         hands: Springs and dampers that act on the arm of each site. By default, none act.
 
@@ -456,18 +456,18 @@ def _compute_loop_gain(
 def _select_master_hands(
     hands: Sequence[Sequence[ArmLoad] | None], slave: int
 ) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
-    """Returns each selection of the persons who hold the masters, from nobody to all of them.
+    """Returns all combinations of the persons who hold the masters, from nobody to everybody.
 
     A person may let go of an arm at any time. Therefore stability is checked for each
-    selection.
+    combination.
 
     Args:
         hands: Springs and dampers that act on the arm of each site.
         slave: Index of the slave, whose hands are left out.
 
     Returns:
-        Per selection the hands of each site. None if a hand at a master is not a spring and a
-        damper per joint, or if there are more than `MOST_HANDS` hands.
+        For each combination, the hands of each site. None if a hand at a master is not a spring
+        and a damper per joint, or if there are more than `MOST_HANDS` hands.
     """
     selections_by_site: list[list[tuple[ArmLoad, ...]]] = []
     count = 0
@@ -555,7 +555,7 @@ def _exponentiate(matrix: Array) -> Array:
     """Computes the exponential of a small matrix by scaling and squaring of its power series.
 
     Source: Moler and Van Loan, "Nineteen dubious ways to compute the exponential of a matrix",
-    SIAM Review 45, 2003. SciPy is not imported for it, because a session does not need SciPy.
+    SIAM Review 45, 2003. SciPy is not used, because a session should not depend on SciPy.
 
     Args:
         matrix: The matrix, shape (n, n).

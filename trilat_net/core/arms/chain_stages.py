@@ -162,7 +162,7 @@ def update_torque(s: Row, chain: RowArray) -> None:
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
     """Computes the torque that holds the chain against gravity, for the given parameters.
 
-    It is the torque of the inverse dynamics without motion. `place_joints` must have been
+    This torque is that of the inverse dynamics without motion. `place_joints` must have been
     called for the present positions.
 
     Args:
@@ -227,8 +227,9 @@ def put_source_torque(
     """Computes the joint torque that operators and environments exert on an arm.
 
     An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some are sampled: their torque is evaluated once per period of the control loop and constant
-    until the next period. All others act continuously. One call covers one of the two groups.
+    Some of them are sampled: their torque is evaluated once per period of the control loop, and
+    is constant until the next period. All others act continuously. One call covers one of the
+    two groups.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -236,7 +237,7 @@ def put_source_torque(
         chain: Data of the n joints, one row per joint; their frames are updated.
         state: Joint positions, followed by joint velocities, shape (2 n,).
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
         sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
         torque: Receives the torque on the arm, shape (n,), N m.
     """
@@ -270,7 +271,7 @@ def update_external_torque(
         s: State of the site (the process that runs the arm); written.
         chain: Data of the joints, one row per joint; their frames are updated.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     place_joints(chain, s.q)
     held_n = put_torque_on_chain(
@@ -319,7 +320,7 @@ def put_stage_torque(
             velocities `stage_qd` of the stage; `stage_torque` is written.
         chain: Data of the joints, one row per joint, placed at the angles `stage_q`.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     put_torque_on_chain(
         t_s=t_s,
@@ -376,9 +377,9 @@ def _put_acceleration(
             velocities `stage_qd` of the stage. The accelerations are written into `stage_qdd`.
         chain: Data of the joints, one row per joint.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
-    # The torques and the dynamics depend on where the links are.
+    # The torques and the dynamics depend on the positions of the links.
     place_joints(chain, s.stage_q)
     put_stage_torque(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     put_stage_acceleration(s, chain)
@@ -486,7 +487,7 @@ def advance_arm(
             written.
         chain: Data of the joints, one row per joint.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
         True if the result is finite. Otherwise False, and positions and velocities are

@@ -1,4 +1,4 @@
-"""Computes with rotation vectors (axis times angle, rad), with equal bits on any machine.
+"""Converts and combines rotation vectors (axis times angle, rad), bit for bit alike anywhere.
 
 The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
 the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation

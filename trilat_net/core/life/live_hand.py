@@ -45,7 +45,7 @@ GRIP_NS = 100_000_000
 GLIDE_NS = 50_000_000
 """Longest time of a glide to the goal, unless a limit of the target prolongs it."""
 
-ANOTHER_HOLDS = "hand: another operator holds the arm"
+ANOTHER_HOLDS = "hand: another one holds the arm"
 OUT_OF_ORDER = "hand: out of order"
 TAKEN = "takes hold"
 RELEASED = "lets go"

@@ -26,7 +26,7 @@ LEAST_RUNS = 4
 LANE_SITE_TICKS = 100_000_000
 """Number of site ticks from which a study compiles the code for several runs side by side.
 
-The compilation takes some ten seconds per kind of site. The code then saves about 0.4 us per
+The compilation takes about ten seconds per kind of site. The code then saves about 0.4 us per
 site tick.
 """
 
@@ -41,13 +41,13 @@ class RunGroup:
         runs: The runs before their first tick (control period).
         in_lanes: True to compute them together, each in a lane of the vector registers. They
             must have the same structure.
-        obstacle: Property because of which the runs cannot be computed together, or empty.
+        obstacle: Property that prevents computing the runs together. Empty if there is none.
         record_rows: Number of latest records of each site (arm controller) that are kept, a
             power of two.
 
     Attributes:
         members: Indices of the runs that are left in the group.
-        obstacle: As the argument.
+        obstacle: The value of the argument.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class RunGroup:
         self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the simulated runs of the group up to a time. Calls may follow one another.
+        """Continues the simulated runs of the group up to a time. It may be called repeatedly.
 
         Args:
             until_s: The time, s, later than that of the previous call.
@@ -74,8 +74,9 @@ class RunGroup:
             try:
                 self._lanes.advance_to(until_s)
             except Exception:
-                # The law of some run failed, which ends the tick of all runs. Each run still
-                # has the state of the previous call. Now only the run whose law fails ends.
+                # The law of one run failed, which ended the tick of all runs. Each run still
+                # has the state of the previous call. Computed one by one, only the run whose
+                # law fails ends.
                 self._lanes = None
             else:
                 return
@@ -127,13 +128,13 @@ def prepare_lanes(
 def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGroup]:
     """Divides runs into groups, each of which can be simulated together.
 
-    Runs that differ in numbers only, such as gains, come into the same group. A run that must
-    be computed alone gets a group of its own.
+    Runs that differ in numbers only, such as gains, are in the same group. A run that must be
+    computed alone gets a group of its own.
 
     Args:
         runs: The runs before their first tick (control period).
-        record_rows: Number of ticks, a power of two, of which `FusedRun.pop_records` must find
-            the records (results of control periods) after each call of `RunGroup.advance_to`.
+        record_rows: Number of ticks whose records (results of control periods) are kept for
+            `FusedRun.pop_records` after each call of `RunGroup.advance_to`, a power of two.
 
     Yields:
         The groups, each when the work on the previous one has ended.
