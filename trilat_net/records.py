@@ -232,7 +232,8 @@ class Layout(NamedTuple):
         `core.life.session_life`. The state of this rule is at the start of the field `mem` of
         the log:
 
-        - the values that every such arm stores, for example when each other arm was heard last,
+        - the values that every such arm stores, for example the last time of a sample from each
+          other arm,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
         - if the arm may continue without a lost arm, one value per other arm: whether it is
           lost.

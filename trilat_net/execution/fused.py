@@ -126,10 +126,10 @@ class _RunState:
             self._floats.append(np.tile(mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "_RunState", factor: float) -> None:
-        """Multiplies the difference between this state and another one by a factor.
+        """Multiplies the difference between this state and another state by a factor.
 
         Every floating-point number x of this state becomes x_other + factor (x - x_other). With
-        the factor 0, this state becomes an exact copy of the other one. Integers, and results
+        the factor 0, this state becomes an exact copy of the other state. Integers, and results
         that would not be finite, are copied from the other state.
 
         Args:
@@ -159,7 +159,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     Args:
         scenario: Description of the experiment.
         plants: Names of the sites for which the caller provides a user's program that computes
-            the motion of the arm. By default, there are none.
+            the motion of the arm. By default, there are no such sites.
 
     Raises:
         ScenarioError: Another arm is external, or the tick rates differ so much that too many
@@ -604,7 +604,7 @@ class FusedRun:
         return tick_ns(next_tick + 1, plant.rate_hz)
 
     def _request_actions(self, i: int) -> int:
-        """Requests the next actions of an operator, if the site has executed the previous ones.
+        """Requests the next actions of an operator, if the previous actions were executed.
 
         The operator is a program that answers with its actions for some ticks (periods of the
         control loop) in advance. They are written to the inputs of the compiled loop.
@@ -630,9 +630,9 @@ class FusedRun:
     def _step_piece(self, last_ns: int) -> None:
         """Executes the planned ticks up to a time for which no user's program is needed.
 
-        These programs are those of operators and plants (simulated arms). Control laws are
-        called. If a user's law is plain Python, the loop over the ticks (control periods) runs
-        in Python too. Otherwise the whole loop is compiled.
+        Such programs are operators and plants (simulated arms). Control laws are called. If a
+        user's law is plain Python, the loop over the ticks (control periods) runs in Python
+        too. Otherwise the whole loop is compiled.
 
         Args:
             last_ns: Time of the last tick to be executed, in ns after the epoch, the common
@@ -672,8 +672,8 @@ class FusedRun:
     def _run_plain_until(self, last_ns: int) -> None:
         """Executes ticks in a Python loop, because a control law is not compiled.
 
-        The loop equals that of the compiled function `run_until`. Within each tick, the law is
-        called after the measurements (`sense_site`) and before the motion (`finish_site`).
+        The loop does the same as the compiled function `run_until`. Within each tick, the law
+        is called after the measurements (`sense_site`) and before the motion (`finish_site`).
 
         Args:
             last_ns: Time of the last tick, in ns after the epoch.
@@ -715,10 +715,10 @@ class FusedRun:
                     last_ns = t_ns
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the run until it is as long as a run with a duration of `until_s` seconds.
+        """Continues the run up to the last tick of a run that lasts `until_s` seconds.
 
         Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
-        its limits. Nothing happens either if the run is already that long.
+        its limits. Nothing happens either if the run has already passed this tick.
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -876,8 +876,8 @@ class FusedRun:
 
         Returns:
             The joint angles q in rad, shape (100, N, n), and the estimated parameters
-            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n that of
-            joints, and P that of parameters.
+            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n the
+            number of joints, and P the number of parameters.
         """
         q = []
         theta_hat = []
@@ -1011,7 +1011,7 @@ class FusedRun:
         """Returns the records that each site (arm controller) has produced since the last call.
 
         A record is the stored result of one tick (control period). Only a limited number of
-        recent records is stored (see `keep` of the constructor); older ones are lost.
+        recent records is stored (see `keep` of the constructor). Older records are lost.
 
         Returns:
             For each site, the nominal times of the records in ns, shape (K,), and the records,

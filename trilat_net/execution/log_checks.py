@@ -160,7 +160,7 @@ def check_log_files(
         sources: Paths of the files that the log consists of.
         min_coverage: Smallest fraction of the ticks (control periods) of every site that must
             be compared.
-        allowed: Permissions to run code of users, which are added to those of this process.
+        allowed: Permissions to run users' code, in addition to the permissions of this process.
 
     Returns:
         One finding for each check.
@@ -208,7 +208,7 @@ def _check_log(
         )
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield Finding(
-            "scenario", "is not the one whose hash the log names: it was changed", False
+            "scenario", "does not have the hash that the log states: it was changed", False
         )
 
     if not virtual:
@@ -368,7 +368,7 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     """Adds advice about user-defined control laws with hidden state to a finding.
 
     A law may store something outside of the records (results of control periods), such as an
-    attribute of its object. A run that is executed again as a whole repeats this hidden state,
+    attribute of its object. If an entire run is executed again, it repeats this hidden state,
     so that all records agree. Only a site (arm controller) that is restored from its records
     lacks the hidden state. The advised command tests this.
 
@@ -402,7 +402,7 @@ def _join_names(names: Sequence[str]) -> str:
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of control periods (ticks) of each site that a log lacks, as text.
+    """Returns the ranges of missing control periods (ticks) of each site as text.
 
     An example is "m1 3-7, 12; s 5". At most `_MAX_GAPS_NAMED` ranges are listed. Further ones
     are counted.
@@ -430,7 +430,7 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
 def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Returns whether a log equals another execution of its run, with the number of records.
+    """Returns the finding that states whether a log equals another execution of its run.
 
     Args:
         label: Name of the check.

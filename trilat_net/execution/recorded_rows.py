@@ -156,16 +156,16 @@ class PlainRows:
     def count_plain(self, row: int, before_tick: int | None) -> int:
         """Counts the records that compiled code can execute next in one block.
 
-        The caller makes sure that the first of them belongs to the present start of the site's
-        process, and to the next tick (control period). A block has at most `BLOCK_ROWS`
-        records (results of control periods).
+        The caller makes sure that the first record is from the present start of the site's
+        process, and is the record of the next tick (control period). A block has at most
+        `BLOCK_ROWS` records (results of control periods).
 
         Args:
             row: Index of the first record.
             before_tick: Tick before which the records end. None if there is no such limit.
         """
         # `_stops` has the indices of the records that are not plain. The block ends before the
-        # next one of them.
+        # next of these records.
         stops = self._stops
         index = int(np.searchsorted(stops, row))
         is_plain = index == len(stops) or stops[index] > row
@@ -182,7 +182,8 @@ class PlainRows:
     def _is_first_of_run(self, row: int) -> bool:
         """True if a record is complete although it does not follow the record before it.
 
-        Compiled code can execute a series of recorded control periods from such a record on.
+        Compiled code can execute a series of recorded control periods that starts at such a
+        record.
         """
         return bool(self._is_complete[row])
 
@@ -265,10 +266,10 @@ class PlainRows:
             repeater: Executes the ticks (control periods) of the site (arm controller).
             first: Index of the first record.
             count: Number of records, all of which must be plain (see `PlainRows`).
-            external: True if the motion of the arm was measured, as that of a real robot is.
+            external: True if the motion of the arm was measured, as with a real robot.
 
         Returns:
-            The number of records before the first one that differs from its execution.
+            The number of records before the first record that differs from its execution.
         """
         rows = self.read_rows(first, count)
         if external:

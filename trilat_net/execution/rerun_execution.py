@@ -346,8 +346,8 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 
     The keys of changed values have the form group.owner.key, for example "sites.m1.control.Kd",
     "links.m1->s.delay_ms" or "dominance.s.m1". Keys without an owner, such as "duration_s",
-    concern the whole scenario. If another link model or control law replaces the one of the
-    log, several values of the same owner differ. They are described together, once.
+    concern the whole scenario. If another link model or control law replaces that of the log,
+    several values of the same owner differ. They are described together, once.
 
     Yields:
         The subject ("link" or the name of a key), its owner (a link or site, or empty for the
@@ -463,7 +463,7 @@ class RerunSite:
         k: Number of the next tick.
         output: Record of the last tick.
         deliveries: The ticks in which samples of other sites arrive at this one.
-        first: First difference from the records of the log. None if there is none so far.
+        first: First difference from the records of the log. None if no record differs so far.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         diverged: True after the arm of the site has left its limits.
     """
@@ -761,9 +761,9 @@ class RerunExecution:
         """Executes all ticks of the requested sites, and yields the result of each tick.
 
         A site is a simulated process that runs one arm, and a tick is a period of its control
-        loop. Ticks are executed in the order of time, but a site waits for the data that it
-        receives. A site stops when its arm leaves its limits. If settings were changed, all
-        sites stop at this time.
+        loop. Ticks are executed in order of time, but a site waits until the data that it
+        receives exists. A site stops when its arm leaves its limits. If settings were changed,
+        all sites stop at this time.
 
         Args:
             progress: Function that is called now and then with the number of executed ticks,
@@ -798,7 +798,7 @@ class RerunExecution:
     def _keep_sample(self, site: RerunSite) -> None:
         """Stores the newest state of an executed site, which its peers will receive.
 
-        A state that is so old that it cannot arrive any more is removed.
+        States that are too old to arrive are removed.
         """
         output = site.output
         recent = self._recent[site.name]
@@ -811,9 +811,9 @@ class RerunExecution:
 
         A tick (control period) can be executed once all samples that arrive in it are known.
         The earliest such tick is chosen. If no tick is ready, because each site (arm
-        controller) waits for a sample of another one, the earliest tick is chosen all the same:
-        the execution must go on, and the missing samples then count as not contained in the
-        log.
+        controller) waits for a sample of another site, the earliest tick is chosen
+        nevertheless, because the execution must continue. The missing samples then count as not
+        contained in the log.
 
         Args:
             pending: Next tick of each executed site that has not finished, as (time in ns,

@@ -341,13 +341,14 @@ class VerifyResult:
         """Counts one more record that differs from the repetition of its control period.
 
         Args:
-            difference: The difference. It is stored as `first` if it is the earliest one.
+            difference: The difference. It is stored as `first` if it is the earliest
+                difference.
         """
         self.differing += 1
         self._keep_first(difference)
 
     def _keep_first(self, difference: RecordDifference | None) -> None:
-        """Stores a difference as the first one, if it is in the earliest tick so far."""
+        """Stores a difference as `first`, if it is in the earliest tick so far."""
         if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
 
@@ -366,9 +367,9 @@ class _SiteVerifier:
     the log does not contain. Two consecutive records make it certain again.
 
     The log does not say which samples arrived during a gap. A sample that no record lists is
-    assumed to have arrived there. While a sample with an assumed arrival is in use, a record
-    that differs does not count as different, but as impossible to judge. The same applies to a
-    sample that arrived, but whose content is missing from the log.
+    assumed to have arrived during the gap. While a sample with an assumed arrival is in use, a
+    record that differs does not count as different, but as impossible to judge. The same
+    applies to a sample that arrived, but whose content is missing from the log.
 
     Most records are plain: their state is certain, and all of their inputs are in the log. A
     compiled loop executes their ticks (control periods). It ends before the first record that
@@ -527,7 +528,7 @@ class _SiteVerifier:
             next_tick: Tick (control period) whose record is expected next.
 
         Returns:
-            Tick whose record is expected after this one.
+            Tick whose record is expected after this record.
         """
         result = self._result
         state = self._states[row]
@@ -598,7 +599,7 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _can_resume(self, row: int) -> bool:
-        """True if the records before a given one suffice to restore the state of the site."""
+        """True if the records before the given row suffice to restore the state of the site."""
         if self._law_failed or row - 2 < self._start_row:
             return False
         return self._inputs.can_resume(row, detached=self._detached)
@@ -655,19 +656,19 @@ class _SiteVerifier:
         return self._states[row].boot
 
     def _set_site(self, site: Site) -> None:
-        """Replaces the executed site by another one."""
+        """Replaces the executed site by another site."""
         self._site = site
         self._repeater = None
 
     def _replace_site(self, row: int, state: State) -> None:
-        """Replaces the simulated site by a new one, to find control laws with hidden state.
+        """Replaces the simulated site by a new site, to find control laws with hidden state.
 
         A control law must keep all its state in its `memory`, which the records contain. Any
         other state is lost by the replacement, so that the following records differ and the
         fault is found.
 
-        This method only marks the state as uncertain. The caller then restores it from the two
-        records before the next one, as after a gap of the log. Nothing happens if the state is
+        This method only marks the state as uncertain. The caller then restores the state from
+        the two preceding records, as after a gap of the log. Nothing happens if the state is
         uncertain already, or cannot be restored.
 
         Args:
@@ -783,8 +784,8 @@ class _SiteVerifier:
             tick: Last tick whose changes are returned.
 
         Returns:
-            The changes before the first invalid one, and the difference that reports the
-            invalid one. None in place of the difference if all changes are valid.
+            The changes before the first invalid change, and the difference that reports the
+            invalid change. The difference is None if all changes are valid.
         """
         changes: list[CoreChange] = []
         for change_tick, text in self._inputs.pop_changes(tick):
@@ -813,8 +814,8 @@ class _SiteVerifier:
         never executed such a tick.
 
         Returns:
-            The arrivals before the first impossible one, and the difference that reports it.
-            None in place of the difference if all arrivals are possible.
+            The arrivals before the first impossible arrival, and the difference that reports
+            the impossible arrival. The difference is None if all arrivals are possible.
         """
         samples = self._inputs.samples
         ends = self._inputs.ends
@@ -849,7 +850,7 @@ def verify(
             their total.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         resume_every: In every tick that is divisible by this number, the site is replaced by a
-            new one that is restored from the records. This reveals state that a law keeps
+            new site that is restored from the records. This reveals state that a law keeps
             outside of its `memory`. 0 means never.
 
     Raises:
@@ -987,7 +988,7 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def _open_rerun_source(log: Log) -> Log | None:
-    """Opens the log of which another log is a repetition with changed settings (rerun).
+    """Opens the source log of a rerun, a repetition with changed settings.
 
     It must be in the same folder as the rerun.
 

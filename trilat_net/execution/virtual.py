@@ -227,7 +227,7 @@ class SiteChannels:
 
         Args:
             state: The record: the stored result of the tick.
-            payload: The same record as it was encoded.
+            payload: The encoded form of the same record.
         """
         self._exclude_skipped_ticks(state.tick, state.cmd)
         # Old versions did not store the time of sending.
@@ -498,7 +498,7 @@ def _find_ready(
 
     A site, the simulated process of one arm, can execute its next tick (period of the control
     loop) as soon as the samples (sent states) that it needs are in the simulated network. Of
-    the sites that are ready, the one with the earliest tick is selected.
+    the sites that are ready, the site with the earliest tick is selected.
 
     Args:
         pending: Next tick of each site, as (time in ns, index of the site, tick), in order of
@@ -594,8 +594,8 @@ def write_virtual_log(
 ) -> bool:
     """Simulates a scenario in virtual time, and writes the log of the run to a stream.
 
-    The log is completed in any case: after the last tick, after `stopped` returns True, and
-    after an error.
+    The log is always completed: after the last tick, after `stopped` returns True, and after an
+    error.
 
     Args:
         scenario: Description of the experiment, with its sites and links.
@@ -607,7 +607,7 @@ def write_virtual_log(
         hands: Actions of live operators, see `execute_virtual`. They replace the programs that
             the scenario names as operators.
         commands: Changes that take effect during the run.
-        policies: Sites whose live operator is a trained program. An event of each says so.
+        policies: Sites whose live operator is a trained program. The log has an event for each.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
@@ -694,7 +694,7 @@ def record_virtual(
             returns True.
         views_hz: Rate of the additional channels for viewers, in Hz.
         hands: Actions of live operators, see `execute_virtual`.
-        policies: Sites whose live operator is a trained program. An event of each says so.
+        policies: Sites whose live operator is a trained program. The log has an event for each.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
@@ -767,7 +767,8 @@ def simulate_scenario(
 
     Args:
         scenario: Description of the experiment.
-        hands: Actions of live operators, see `execute_virtual`. By default, there are none.
+        hands: Actions of live operators, see `execute_virtual`. By default, nobody moves the
+            arms.
 
     Raises:
         ScenarioError: The scenario cannot run in virtual time.

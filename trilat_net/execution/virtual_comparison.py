@@ -130,7 +130,7 @@ def find_absent_samples(log: Log) -> list[_LateSample]:
 
     If records (results of control periods) of the receiver are missing, the log does not show
     whether a sample was lost or arrived in these ticks. The sample counts as lost if the
-    receiver still uses an older sample in the first recorded tick from the due tick on.
+    receiver still uses an older sample in its first recorded tick at or after the due tick.
 
     Args:
         log: Log of a live session.
@@ -279,8 +279,8 @@ class _VirtualComparison(NamedTuple):
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> _VirtualComparison:
     """Compares a log with two simulations of its scenario in virtual time.
 
-    In the first simulation, samples arrive as in the log; in the second one, they arrive at
-    once. Both end at the last record of the log.
+    In the first simulation, samples arrive as in the log. In the second simulation, they arrive
+    at once. Both end at the last record of the log.
 
     Args:
         log: Log of a live session, which contains its scenario.

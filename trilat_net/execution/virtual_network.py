@@ -229,14 +229,14 @@ def read_deliveries(site_log: SiteLog) -> Deliveries:
 def complete_deliveries(
     site_log: SiteLog, rates_hz: Sequence[int], last_ticks: Sequence[int]
 ) -> Deliveries:
-    """Returns the arrivals at a site for every tick from its first record to its last one.
+    """Returns the arrivals at a site for every tick from its first to its last record.
 
     If the record of a tick is missing, the log does not say which samples arrived in it. A
     sample that no record lists is assumed to have arrived in a tick of this kind, if such a
     tick is possible. Three conditions must hold: the tick is after the sample was sent; it is
     after the arrival of the last earlier sample that a record lists; and it is before the
-    arrival of the first later sample. Of several possible ticks, the one whose delay is nearest
-    to the median delay of the link is chosen.
+    arrival of the first later sample. Of several possible ticks, the tick whose delay is
+    nearest to the median delay of the link is chosen.
 
     Args:
         site_log: Records of the site, each of which lists the samples that arrived in its tick.

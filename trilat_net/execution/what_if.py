@@ -439,7 +439,7 @@ class Rerun(Result):
         This indicates an error of the program or a damaged log. The bits should be the same
         under three conditions:
 
-        - The log was made on this platform.
+        - The log was written on this platform.
         - No setting was changed.
         - The log contains everything that its sites received. This is not the case if the log
           is itself a rerun in which some sites were copied from another log.

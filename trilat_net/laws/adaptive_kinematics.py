@@ -317,9 +317,9 @@ class AdaptiveKinematics(ControlLaw):
         """Evaluates whether this control law is proved to be stable in an experiment.
 
         The proof in docs/theory/laws-lengths.md that the errors e and the velocities qd go to
-        zero requires that all delays are constant, that each arm follows every other one at
-        least through others (irreducible matrix of weights), that the elbows stay bent, and
-        that the true lengths of the links lie between the bounds `least_m` and `most_m`.
+        zero requires that all delays are constant, that each arm follows every other arm,
+        directly or through others (irreducible matrix of weights), that the elbows stay bent,
+        and that the true lengths of the links lie between the bounds `least_m` and `most_m`.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.

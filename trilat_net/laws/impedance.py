@@ -210,10 +210,10 @@ class Impedance(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the loop between the masters and the slave is stable.
 
-        Only a slave that touches something sends forces and thereby closes a loop. The loop is
-        then judged by the small-gain theorem: it is stable for constant delays of any length if
-        its gain is below 1 at every frequency. A hand at a master changes the gain. A person
-        may also let go. Therefore the gain is computed with each combination of the scenario's
+        Only a slave that touches something sends forces, which closes a loop. The loop is then
+        judged by the small-gain theorem: it is stable for constant delays of any length if its
+        gain is below 1 at every frequency. A hand at a master changes the gain. A person may
+        also let go. Therefore the gain is computed with each combination of the scenario's
         hands at the masters, from none to all.
 
         The condition is undecided in two cases:

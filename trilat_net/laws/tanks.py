@@ -160,7 +160,7 @@ class Tanks(EnergyLaw):
         """Computes the energies that show whether the law was passive in a run.
 
         Each arm has an energy tank, the amount of energy that its controller may still spend.
-        All energies are in J. In the records, of which there is one per control period,
+        All energies are in J. In the records (one per control period),
 
         - "E" is the sum of the energy sent to a peer (another arm) so far;
         - "E_seen" is the sum of the energy received so far, one column per peer;

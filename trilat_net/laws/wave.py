@@ -88,10 +88,10 @@ def _replay_wave(
 
     A wave acts on the arm (is played) like a force that also carries energy. If messages are
     lost, the arm would end at a wrong position. Later messages contain the integral of all
-    waves, so that the integral of the lost ones is known. The line owes this integral to the
-    arm. It is played in addition to the wave of this control period, at the mean rate of the
-    lost waves or slower. The known energy is divided evenly over the owed integral: each unit
-    of the integral may cost only its part of the energy.
+    waves, so that the integral of the lost waves is known. The line owes this integral to the
+    arm. The owed integral is played in addition to the wave of this control period, at the mean
+    rate of the lost waves or slower. The known energy is divided evenly over the owed integral:
+    each unit of the integral may cost only its part of the energy.
 
     Args:
         law: The law, whose owed integral and owed time are reduced by the part that is played.
@@ -162,7 +162,7 @@ def _conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     bounded_above = min(largest_wave, last_wave)
     held = max(-largest_wave, bounded_above)
     played: float = held
-    # The product is positive if the owed waves have the sign of the repeated one.
+    # The product is positive if the owed waves have the sign of the repeated wave.
     if law.owed_U[index] * held > 0.0:
         spent = 0.5 * held * held * h
         remaining = energy - spent
@@ -199,8 +199,8 @@ def _receive_wave(
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer, the site at the other end of the line.
         i: Index of the joint.
-        missed: Number of samples between the sample in use and the previous one; -1 if there
-            is no new sample.
+        missed: Number of samples between the sample in use and the previously used sample. -1
+            if there is no new sample.
 
     Returns:
         The wave to play, sqrt(W).
@@ -631,7 +631,7 @@ class Wave(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        All energies are in J. In the records, of which there is one per control period,
+        All energies are in J. In the records (one per control period),
 
         - "E" is the energy of all waves so far, sent to or received from a peer (another arm);
         - "W" is the part of the received energy whose waves have not acted on the arm yet, so
@@ -772,8 +772,8 @@ class Wave(EnergyLaw):
         impedances = np.zeros(len(situation.names))
         for index, peer in enumerate(situation.names):
             if peer != site:
-                # The first joint stands for all. Impedances that are computed from dominance
-                # factors have the same ratios at every joint.
+                # The first joint represents all joints. Impedances that are computed from
+                # dominance factors have the same ratios at every joint.
                 joint_impedances = self.find_impedances(site, peer)
                 impedances[index] = joint_impedances[0]
         total_impedance = impedances.sum()
@@ -918,7 +918,7 @@ class Wave(EnergyLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the law keeps the coupled arms passive.
 
-        Passive means that they never give more energy than they received. This holds for any
+        Passive means that they never give more energy than they received. This is true for any
         delays and lost messages, if persons and environments are passive. The text also states
         with which weight each arm follows the others. The weights are proportional to the
         impedances of the lines, the virtual connections over which arms exchange waves.

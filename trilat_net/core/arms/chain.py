@@ -816,8 +816,8 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
     """Computes the inertia matrix M(q) of the arm, with the inertia of its drives.
 
     Only the lower triangle of M is written into the field `M` of the rows, because M is
-    symmetric. The method is that of composite rigid bodies (Featherstone). `place_joints` must
-    have been called for the same positions.
+    symmetric. The method uses composite rigid bodies (Featherstone). `place_joints` must have
+    been called for the same positions.
 
     Args:
         chain: Data of the joints, one row per joint; written.

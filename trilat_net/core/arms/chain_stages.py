@@ -162,7 +162,7 @@ def update_torque(s: Row, chain: RowArray) -> None:
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
     """Computes the torque that holds the chain against gravity, for the given parameters.
 
-    This torque is that of the inverse dynamics without motion. `place_joints` must have been
+    This is the torque of the inverse dynamics without motion. `place_joints` must have been
     called for the present positions.
 
     Args:
@@ -263,8 +263,8 @@ def update_external_torque(
     """Computes the torque that operators and environments exert on the arm at time t.
 
     An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    The row `s` of the arm receives the whole torque, the part that stays constant until the
-    next period of the control loop, and the largest force of a wall.
+    The row `s` of the arm receives the total torque, the part of it that stays constant until
+    the next period of the control loop, and the largest force of a wall.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -395,8 +395,8 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
         q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
         q_{n+1}  = q(t) + ahead_s qd_n                               and the same for qd, qdd
 
-    The first line is the result, of which this function adds up the sum in brackets. The second
-    line is the state at which stage n + 1 evaluates the derivatives.
+    The first line is the result. This function adds up the sum in its brackets. The second line
+    is the state at which stage n + 1 evaluates the derivatives.
 
     Args:
         s: State of the site (the process that runs the arm). `q` and `qd` are the state at the

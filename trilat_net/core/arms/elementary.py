@@ -70,7 +70,7 @@ def sincos(x: float) -> tuple[float, float]:
 
 _LOG_2_HIGH = 6.93145751953125e-1
 _LOG_2_LOW = 1.42860682030941723212e-6
-"""The natural logarithm of 2 in two parts, of which the first has few bits."""
+"""The natural logarithm of 2 in two parts. The first part has few bits."""
 _LOG_2_OF_E = 1.4426950408889634
 _SMALL = 0.625
 _LARGE = 20.0
@@ -106,7 +106,7 @@ def tanh(x: float) -> float:
         return x + x * square * (P / Q)
     if magnitude >= _LARGE:
         return 1.0 if x > 0.0 else -1.0
-    # NaN fails both this comparison and the previous one.
+    # NaN fails both this comparison and the previous comparison.
     is_nan = not magnitude < _LARGE
     if is_nan:
         return math.nan

@@ -320,8 +320,8 @@ def advance_stage(
         ahead_s: Time of the stage after the beginning of the period, s.
         q: Joint angles at the beginning of the period, rad.
         qd: Joint velocities at the beginning of the period, rad/s.
-        qd_before: Joint velocities at the stage before, rad/s.
-        qdd_before: Joint accelerations at the stage before, rad/s^2.
+        qd_before: Joint velocities at the previous stage, rad/s.
+        qdd_before: Joint accelerations at the previous stage, rad/s^2.
         u: Held torque, shape (2,), N m.
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.

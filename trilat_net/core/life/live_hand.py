@@ -384,7 +384,7 @@ def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
     message is expected, so that it moves evenly instead of jumping with each message.
 
     Args:
-        between_messages_ns: Time from the previous message to the new one, ns.
+        between_messages_ns: Time from the previous message to the new message, ns.
         rate_hz: Rate of the control loop, Hz.
     """
     period_ns = 1_000_000_000 // rate_hz

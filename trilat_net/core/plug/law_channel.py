@@ -165,8 +165,8 @@ class LawChannel(NamedTuple):
             peers: Names of the sites that run the other arms, in the order of the scenario.
 
         Yields:
-            The vector to which the number belongs, its receiver, and its position in the
-            vector.
+            The vector that contains the value, the receiver, and the position of the value in
+            the vector.
         """
         to_each = self.select_vectors(per_peer=True)
         vectors_by_receiver = [("", self.select_vectors(per_peer=False))]

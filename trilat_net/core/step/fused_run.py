@@ -115,7 +115,7 @@ class ReplayedInputs(NamedTuple):
             coordinates of the target, and the target one second later. If K is 0, nobody holds
             the arms.
         hand_indices: For each site the index of this person or program among its operators and
-            environments, shape (N,). -1 if there is none.
+            environments, shape (N,). -1 if nobody moves the arm.
     """
 
     first: IntArray
@@ -521,7 +521,7 @@ def _compute_torque(
 def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
     """Writes the numbers that a control law sends to other arms into the record of its arm.
 
-    The other arms of the simulation read them from there.
+    The other arms of the simulation read the values from this record.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -549,7 +549,7 @@ def sense_site(
 
     This part accepts the messages (states) of the other arms, and computes the reference, which
     is the position to follow, the errors and the parameter estimate. The messages arrive as in
-    a recorded run, or without delay if there is none.
+    a recorded run, or without delay if no run is repeated.
 
     Args:
         i: Index of the site.

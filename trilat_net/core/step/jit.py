@@ -219,7 +219,7 @@ def _hash_folder(folder: Path) -> str:
     """Returns a hash of all Python files of a folder, to detect outdated machine code.
 
     It is used for functions outside the core. If a file changes, so does the hash, and machine
-    code that was stored with the old hash is not used any more.
+    code that was stored with the old hash is no longer used.
     """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):
@@ -424,8 +424,8 @@ class _LeafCache(FunctionCache):
     def save_inner(self, argument_types: Any, result: Any) -> None:
         """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
 
-        The code is kept in files of its own, besides those of the machine code that Python
-        calls. Nothing is stored if there is no cache directory in which files can be written.
+        The code is kept in its own files, separate from the machine code that Python calls.
+        Nothing is stored if there is no cache directory in which files can be written.
 
         Args:
             argument_types: Numba's types of the arguments.
@@ -526,7 +526,7 @@ class _LeafCompiler(Compiler):
             state.flags.no_cpython_wrapper = True
             state.flags.no_cfunc_wrapper = True
 
-        # A leaf that Numba compiles meanwhile is an inner leaf.
+        # A leaf that Numba compiles during this compilation is an inner leaf.
         with _compiling_caller():
             result = super().compile_extra(function)
 
@@ -727,8 +727,8 @@ class _Leaf(CPUDispatcher):
     def _load_or_compile_inner(self, argument_types: Any, return_type: Any) -> Any:
         """Returns the function as LLVM code, which becomes a part of a compiled caller.
 
-        The code is loaded from the cache on disk if it is there. Otherwise the function is
-        compiled, and its code is stored.
+        The code is loaded from the cache on disk if the cache contains it. Otherwise the
+        function is compiled, and its code is stored.
         """
         # The types of several runs side by side (lanes) are defined outside of the core, and
         # the name of the cache directory contains a hash of the core only.

@@ -159,7 +159,7 @@ def updates_estimate(k: int, s: SiteRow) -> bool:
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds the adaptation rate Y' r of this control period to that of the previous one.
+    """Adds the adaptation rate Y' r of the previous control period to the present rate.
 
     The estimate of the arm's parameters is integrated by the trapezoid rule, which needs this
     sum. It is written into `Yr_before`, see `_update_estimate`.
@@ -221,7 +221,8 @@ def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
     - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
     - The arm comes to rest or is at rest: damping and an integral term are added, see
       `resting`. If the law cannot hold the arm, the gravity torque replaces that of the law.
-    - The arm has just left its rest: the torque blends from that at rest to that of the law.
+    - The arm has just left its rest: the torque blends from the torque at rest to the torque of
+      the law.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -349,8 +350,8 @@ def _advance_arm(
 def hold_motor_torque(k: int, s: SiteRow) -> None:
     """Computes the motor torque u that is held during the whole control period.
 
-    The constant torque that represents the period best is that of its middle. It is
-    extrapolated from the torques of this tick and the previous tick:
+    The constant torque that represents the period best is the torque in the middle of the
+    period. It is extrapolated from the torques of this tick and the previous tick:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
@@ -374,7 +375,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
 @leaf
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
-    """Stores the torque and the adaptation rate Y' r of this control period for the next one.
+    """Stores the torque and the adaptation rate Y' r of this tick for the next tick.
 
     Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
     estimate itself is advanced here.

@@ -456,7 +456,7 @@ class TickRepeater:
 
         repeated, has_differed = self._run(first_tick, rows, samples)
         if has_differed:
-            # Restore the state, and compute only the ticks before the one that differs.
+            # Restore the state, and compute only the ticks before the tick that differs.
             for saved, array in zip(self._saved, arrays, strict=True):
                 array[...] = saved
             self._parts.calendar_sizer.newest[:] = newest

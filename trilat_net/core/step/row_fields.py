@@ -3,8 +3,8 @@
 They are NumPy structured arrays, whose elements are called rows. Each class below describes the
 fields of one kind of row, for example `q` in `SiteRow`: their shape, unit and meaning, and the
 stage of a control period that writes them. The types of the attributes serve readers and mypy,
-and `row_dtype` derives the memory layout from the `Field` of each attribute. README.md of this
-folder shows the same information as tables.
+and `row_dtype` derives the memory layout from the `Field` of each attribute. `core/README.md`
+shows the same information as tables.
 
 Invariant:
     - The order of the attributes is the order of the fields in memory. Digests of runs, cached
@@ -353,7 +353,7 @@ class SampleRow(Protocol):
 
     A message (sample) is the state that the other arm sends once per control period. A ring
     buffer has one entry per control period of the receiver. The entry holds the newest message
-    that is used from that period on.
+    that is first used in that period.
     """
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]

@@ -439,15 +439,15 @@ class CalendarSizer:
 
         A sample is the state that a peer (another arm's process) sends in one of its ticks, the
         periods of its control loop. The sample waits in the buffer until its simulated delay
-        has passed. The buffer has one entry, called page, for each tick of the receiver from
-        the present one on. The sample fits if the last tick in which it may come into use has a
-        page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
-        `ahead` ticks after the present one (negative for an earlier sample), and then waits for
-        at most `longest_wait` ticks.
+        has passed. The buffer has one entry, called page, for the present tick and each later
+        tick of the receiver. The sample fits if the last tick in which it may come into use has
+        a page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
+        `ahead` ticks after the present tick (negative for an earlier sample), and then waits
+        for at most `longest_wait` ticks.
 
         If the clock of the peer is too far ahead, the buffer is not enlarged, and the sample is
         rejected later. Otherwise `newest` is updated: it is the newest sample of the peer that
-        fits into the buffer as it is now. Samples up to this one need no call of this method.
+        fits into the buffer as it is now. Samples up to `newest` need no call of this method.
 
         Args:
             arrays: Arrays of the site, the process that receives the sample.
@@ -548,11 +548,11 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
     - The message that the site missed ticks, the periods of its control loop. Their number is
       stored until the next tick.
     - An order, for example to stop the arm. The next tick carries it out. If several orders
-      come before this tick, the one with the highest number counts, see `LifeOrder`.
+      arrive before this tick, the order with the highest number counts, see `LifeOrder`.
     - A new model of the delay and loss of a link. It is added to the table of the link's
-      models, and applies from its start time on.
-    - A ramp of the dominance factors, the weights with which the arm follows the other arms.
-      It is added to the table of ramps, from which old ramps are removed before.
+      models, and applies from its start time.
+    - A ramp of the dominance factors, the weights with which the arm follows the other arms. It
+      is added to the table of ramps, after old ramps have been removed.
 
     Args:
         arrays: Arrays of the site; changed.
@@ -575,7 +575,7 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
             raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
         _add_model(arrays, change.peer, change.model)
     if change.ramp is not None:
-        # Remove the ramps that are over, to make room for the new one.
+        # Remove the ramps that are over, to make room for the new ramp.
         s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
         if s.ramps >= len(arrays.ramps):
             raise ValueError(

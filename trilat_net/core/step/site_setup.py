@@ -70,9 +70,9 @@ class StaleAction(IntEnum):
     A site is a process that runs one arm, and a peer is another site that it follows.
 
     USE follows the last known state of the peer. HOLD keeps the last reference, the position
-    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent.
-    GLIDE brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until all
-    peers are heard, see `session_life`.
+    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent. GLIDE
+    brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until samples
+    of all peers arrive, see `session_life`.
     """
 
     USE = 0
@@ -180,7 +180,7 @@ class LinkSetup(NamedTuple):
         q0: Start pose of the peer, rad, or of its end effector; in use until the first sample
             is due (L7).
         key: Key from which the random numbers of the link follow, see `link_key`.
-        models: Models of the delay in the order of their first stamps; the first one applies
+        models: Models of the delay in the order of their first stamps. The first model applies
             from stamp 0.
         traces: For each model the points of its trace, a table of delays by time, shape (n, 2),
             see `Points`. None for a model without a trace.
@@ -276,7 +276,7 @@ class ChainSetup(NamedTuple):
     """Settings of an arm that is a chain of joints, as read from a URDF file.
 
     Attributes:
-        joints: The joints, from the base on.
+        joints: The joints, starting at the base.
         gravity_m_s2: Gravitational acceleration in the frame of the base, m/s^2.
         tip_m: Position of the end effector in the frame of the last link, m.
         tip_rotation: Orientation of the end effector in that frame.
@@ -346,7 +346,8 @@ class SiteSetup(NamedTuple):
         scheme: The sampling of the law.
         gains: The law and its gains.
         theta: The true parameters of the arm, shape (P,).
-        g_m_s2: Gravitational acceleration, m/s^2; a chain has that of its setup instead.
+        g_m_s2: Gravitational acceleration, m/s^2. A chain uses the value of its `ChainSetup`
+            instead.
         lengths_m: Lengths of the two links, m; without effect for a chain.
         tau_limit_nm: Largest control torque of a joint, N m; one number, or one per joint.
         qd_limit_rad_s: Joint speed beyond which the run counts as diverged, rad/s.

@@ -79,7 +79,7 @@ class TickParts(NamedTuple):
         glides: True if the arm comes to rest while a peer is silent (the rule `glide`).
         degrades: True if the site continues without lost peers.
         hand_index: Index of the person or program that moves the arm among the operators and
-            environments. -1 if there is none.
+            environments. -1 if nobody moves the arm.
     """
 
     buffers: TickBuffers
@@ -213,9 +213,9 @@ class Site:
         arrays = self._arrays
         buffers = self._buffers
         self._law = plug_law(self._user_law, setup, arrays, self._sent)
-        # Compile now, and not within the time that the law has for a tick. The arguments serve
-        # for their types: the zeros stand for the tick, its time in ns, and the count of
-        # arrivals.
+        # Compile now, and not within the time that the law has for a tick. Only the types of
+        # the arguments matter: the zeros take the place of the tick, its time in ns, and the
+        # number of arrivals.
         self._law.bind()
         self._sense = bind_leaf(sense_stages, 0, 0, 0, arrays, buffers)
         self._act = bind_leaf(
@@ -247,11 +247,11 @@ class Site:
             self._sizer.add_model(command.peer, command.model)
 
     def start_at(self, k: int) -> None:
-        """Makes tick (control period) `k` the first one of an arm that joins a running session.
+        """Makes `k` the first tick (control period) of an arm that joins a running session.
 
-        No tick must have been computed before. The arm stands at its start pose, and no sample
-        (state) of another arm is in use or waits. The models of delay and loss of the links
-        process all samples that the other arms have sent until tick k - 1.
+        No tick must have been computed before. The arm is at rest in its start pose, and no
+        sample (state) of another arm is in use or waits. The models of delay and loss of the
+        links process all samples that the other arms have sent until tick k - 1.
 
         Args:
             k: Number of the first tick.
@@ -499,7 +499,7 @@ class Site:
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
         """Returns the checksum of the samples (states of other arms) that arrived, for the log.
 
-        A later verification of the log compares it. The checksum covers only what this site
+        A later verification of the log compares the checksum, which covers only what this site
         uses: sender, tick and motion of each sample, then the forces if the site reflects
         forces to its user, then the values that the other control laws send if the law of this
         site reads such values.
@@ -596,7 +596,7 @@ class Site:
         return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the rate of another arm's control loop, which may differ from this one's, Hz.
+        """Returns the rate of another arm's control loop, Hz, which may differ from this arm's.
 
         Args:
             peer: Index of the other arm (peer), in scenario order.

@@ -187,8 +187,8 @@ class PlantState(NamedTuple):
 class TickInput(NamedTuple):
     """All external inputs that may influence one period of the control loop.
 
-    `Site.step` receives it. Time, messages and measurements come in here, so that the same
-    input always gives the same results.
+    `Site.step` receives this object. It contains the time, the messages and the measurements,
+    so the same input always gives the same results.
 
     Attributes:
         k: Number of the period.
@@ -209,17 +209,17 @@ class TickInput(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """Counts of the messages on one network link since the start, such as late and lost ones.
+    """Counts of messages on one network link since the start, such as late and lost messages.
 
     A link leads from another arm's process (peer) to this one. A message is a sample, the state
     of the peer in one control period.
 
     Attributes:
         accepted: Samples that arrived.
-        late: Accepted samples that arrived after they were due.
-        duplicate: Accepted samples that had arrived before.
-        refused: Accepted samples whose stamp was out of range.
-        lost: Accepted samples that the link's model of losses dropped.
+        late: Arrived samples that came after they were due.
+        duplicate: Arrived samples that had already arrived before.
+        refused: Arrived samples whose stamp was out of range.
+        lost: Arrived samples that the link's model of losses dropped.
         superseded: Samples that were never used, because a newer sample was released before
             them or in the same tick.
         copies: Duplicates that the link's model produced.
@@ -315,7 +315,7 @@ class LifeAlarm(NamedTuple):
             mem: Numbers that the site keeps from tick to tick, the field `mem` of the record.
                 They contain the reason for the mode.
             shared: Number of coordinates that sites share, by which `mem` is divided.
-            lost: Names of the peers without which the site goes on.
+            lost: Names of the peers without which the site continues.
 
         Returns:
             The alarm. None if the site needs no attention, or if the record is not from a site
@@ -398,12 +398,11 @@ def describe_mode(
     """Writes the sentence with which a site reports a change of its mode in the log.
 
     A site is the process that runs one arm, and its peers are the other sites. The sentence
-    states what the arm does, from which time on, and why, for example "s holds its reference
-    from t = 1.250 s: a peer is stale". A peer is stale if no sample has arrived from it for too
-    long.
+    states what the arm does, since when, and why, for example "s holds its reference from t =
+    1.250 s: a peer is stale". A peer is stale if no sample has arrived from it for too long.
 
-    No reason is given for the modes RETURN and RUN, which follow as soon as the peers are
-    heard, unless the arm returns because a peer was dropped or restored.
+    No reason is given for the modes RETURN and RUN, which follow as soon as samples of all
+    peers arrive, unless the arm returns because a peer was dropped or restored.
 
     Args:
         site: Name of the site.

@@ -306,7 +306,7 @@ def _release_samples(
         count: Number of samples.
         rate_hz: Tick rate of the receiver, Hz.
         least_release: First tick that can still use a sample.
-        fresh: True if the first sample is the first one of the model.
+        fresh: True if the first sample is also the first sample of the model.
         stamps_ns: Stamps of the samples, ns since the epoch.
         link: Row of the link; changed.
         model: Model of the link.
@@ -530,8 +530,8 @@ def use_samples(
         ended: For each lane the number of ticks of a run that has ended, else -1.
         states: State of the links of the runs; changed.
         draws: Functions that draw random numbers.
-        used: Receives the index of the sample, or -1 before the first one, shape (N, P, LANES,
-            ticks).
+        used: Receives the index of the sample in use, or -1 before the first sample, shape (N,
+            P, LANES, ticks).
 
     Returns:
         The largest age of a sample in use, ticks. Before the first sample, it is the age that
@@ -697,7 +697,7 @@ def use_samples_of_rates(
                         first[i], count, newest, releases, used[i, p, lane]
                     )
                 states.newest[lane, i, p] = newest
-                # Before the next tick of the site, the peer goes on to the end of the block.
+                # Before the next tick of the site, the peer continues to the end of the block.
                 largest_age = max(largest_age, end[j] - 1 - newest)
                 for index in range(count):
                     age = states.made[index] - 1 - used[i, p, lane, index]
@@ -800,7 +800,7 @@ def use_recorded_samples(
                 made = first_tick_at(tick_ns(k, rate_hz) + 1, rates_hz[peer])
                 made = max(min(made, end[peer]), first[peer])
                 largest_age = max(largest_age, made - 1 - sample)
-            # Before the next tick of the site, the peer goes on to the end of the block.
+            # Before the next tick of the site, the peer continues to the end of the block.
             largest_age = max(largest_age, end[peer] - 1 - links[i, p].used)
     return largest_age
 

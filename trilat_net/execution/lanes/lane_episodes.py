@@ -1,9 +1,9 @@
 """Simulates several episodes at once that begin and end at different times.
 
 A training environment with many copies uses this module: when the episode of one copy has
-ended, a new one takes its lane (position in the vector registers), while the others continue.
-Therefore each lane has a clock of its own. In each run, a program may move one arm. The caller
-provides the actions of all programs as an array.
+ended, a new episode takes its lane (position in the vector registers), while the others
+continue. Therefore each lane has a clock of its own. In each run, a program may move one arm.
+The caller provides the actions of all programs as an array.
 
 Invariant:
     - After each call of `advance`, a run has the state that `FusedRun.step_to` gives it with
@@ -276,7 +276,7 @@ class LaneEpisodes(LaneRun):
         """Returns the properties in which runs must agree to be simulated side by side.
 
         Examples are the number of joints and the control laws. Durations may differ, because an
-        episode (simulated run) that ends is replaced by a new one.
+        episode (simulated run) that ends is replaced by a new episode.
         """
         return find_structure(run)._replace(duration_s=0.0)
 
@@ -290,7 +290,7 @@ class LaneEpisodes(LaneRun):
         Args:
             rules: Limits of the program's hand.
             period_ticks: Number of ticks of a step.
-            largest_action: Largest absolute value of a number of an action.
+            largest_action: Largest absolute value of any component of an action.
         """
         if period_ticks > BLOCK_TICKS:
             return f"steps of more than {BLOCK_TICKS} ticks"
@@ -313,7 +313,7 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
-        """Starts a new episode of reinforcement learning in place of one that has ended.
+        """Starts a new episode of reinforcement learning in place of an ended episode.
 
         Several episodes (simulated runs) advance side by side, and each has a place in common
         arrays (its lane). The function copies the initial state of the new run into the place.
@@ -549,10 +549,10 @@ class LaneEpisodes(LaneRun):
         """Returns one field of the state of all sites (arm controllers) or links, for each run.
 
         Several runs are stored side by side, each in a lane. The state of a run that has ended
-        is read from `ended`, because its lane contains no valid numbers any more.
+        is read from `ended`, because its lane no longer contains valid numbers.
 
         Args:
-            present: Present rows of all lanes, shape (rows, numbers of a row, LANES).
+            present: Present rows of all lanes, shape (rows, values per row, LANES).
             ended: The same rows at the end of each run that has ended.
             layout: Data type of a row.
             name: Name of the field.
@@ -569,7 +569,7 @@ class LaneEpisodes(LaneRun):
         return in_order.view(dtype.base)
 
     def read_new(self, i: int) -> NDArray[np.bool_]:
-        """Returns True for each peer of which site `i` used a new sample in its latest tick.
+        """Returns True for each peer whose new sample site `i` used in its latest tick.
 
         A sample is the state that a peer, one of P other sites (arm controllers), sent. The
         shape is (P, runs).

@@ -9,7 +9,7 @@ saves the call and the checks of the vector lengths, which are constants in this
 
 Invariant:
     - The method is not changed. It raises the same errors, and reads and writes the same
-      numbers, as in a run of its own.
+      numbers, as in a run that is computed alone.
     - A user's law is compiled in each process, because the other files that it uses are
       unknown. The code of a built-in law is stored under a hash of its sources.
 """

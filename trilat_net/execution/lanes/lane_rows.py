@@ -51,7 +51,7 @@ _ALIGNMENT = 64
 _NUMBA_KINDS = {"i8": types.int64, "f8": types.float64, "u8": types.uint64}
 
 Words = NDArray[np.int64]
-"""Rows in lanes as 64-bit words, shape (rows, words of a row, LANES)."""
+"""Rows in lanes as 64-bit words, shape (rows, words per row, LANES)."""
 Constants = tuple[tuple[str, int], ...]
 """Names and values of the fields that are equal in all lanes."""
 
@@ -59,7 +59,7 @@ Constants = tuple[tuple[str, int], ...]
 class LaneField(NamedTuple):
     """One field of a row, the state of one arm in one run, with its position in the row.
 
-    All numbers of a row have eight bytes.
+    All values per row have eight bytes.
 
     Attributes:
         name: Name of the field.
@@ -498,7 +498,7 @@ pointer_to: Any = _pointer_to
 def allocate_words(rows: int, row_length: int) -> Words:
     """Returns an array of zeros for the states of several runs side by side.
 
-    The shape is (rows, numbers of a row, LANES), and each run has one of the lanes. The array
+    The shape is (rows, values per row, LANES), and each run has one of the lanes. The array
     is aligned to a cache line, because vector instructions read an aligned array faster.
 
     Args:

@@ -5,8 +5,8 @@ advances them to a time. It is the counterpart of `FusedRun`, which simulates on
 
 Invariant:
     - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
-      for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries of
-      ring buffers that are not used any more, may differ.
+      for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and obsolete
+      entries of ring buffers, may differ.
     - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
@@ -221,7 +221,7 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
     Compiled code addresses this vector as the field `numbers` of a row.
 
     Args:
-        count: Count of numbers.
+        count: Number of values in each row.
         rows: Number of rows.
     """
     return LaneTable(np.dtype([("numbers", "f8", (count,))]), ((),) * rows)
@@ -270,7 +270,7 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
         clock: Type of the ticks, see `_list_argument_types`.
 
     Returns:
-        The reason. Empty if there is none.
+        The reason. Empty if all laws can be compiled.
     """
     try:
         _find_addresses(run, find_structure(run), clock)
@@ -303,7 +303,7 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
         first: First tick of each site, shape (N,).
         kept: Latest records of all sites, shape (N, rows, floats, LANES). The record of tick k
             is in row k modulo the number of rows.
-        records: Written, shape (runs, N, ticks, floats).
+        records: Receives the results, shape (runs, N, ticks, floats).
     """
     # The numbers of all lanes in a record are in few cache lines.
     for i in range(records.shape[1]):
@@ -397,7 +397,7 @@ def _pack_tables(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
         tables_of_runs: The same array of each run.
 
     Returns:
-        The numbers of all runs, shape (rows, numbers of a row, LANES).
+        The numbers of all runs, shape (rows, values per row, LANES).
     """
     tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
     rows, row_length = tables_of_lanes[0].shape
@@ -722,8 +722,8 @@ class LaneRun:
         states are needed than the longest delay of a link would require.
 
         Args:
-            ticks: Number of ticks (control periods) before the present one for which the states
-                are needed.
+            ticks: Number of ticks (control periods) before the present tick for which the
+                states are needed.
         """
         while self._pages <= ticks:
             old_pages = self._pages
@@ -738,7 +738,7 @@ class LaneRun:
     def keep(self, chosen: Sequence[int]) -> None:
         """Continues with some of the runs only, so that no time is spent on the others.
 
-        A search, for example, drops runs that cannot be the best any more.
+        A search, for example, drops runs that can no longer be the best.
 
         Args:
             chosen: Indices in `runs` of the runs that continue, in ascending order. No run
@@ -910,7 +910,7 @@ def _find_recorded_hands(
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
-    """Returns an array of floats as structured records whose fields have names.
+    """Returns an array of floats as structured records with named fields.
 
     The array has the shape (N, rows, columns) for N sites. The records share its memory, so
     that assigning to a field changes the array.

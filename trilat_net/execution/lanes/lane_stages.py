@@ -535,12 +535,12 @@ class EndedRuns(NamedTuple):
         ticks: Number of ticks that the first site of each run has executed, shape (LANES,). -1
             if the run has not ended.
         site_ticks: Number of ticks that each site has executed, shape (N, LANES).
-        site_rows: Rows of the sites, shape (N, words of a row, LANES).
-        links: Rows of the links, shape (N P, words of a row, LANES). Only `LaneEpisodes` keeps
+        site_rows: Rows of the sites, shape (N, words per row, LANES).
+        links: Rows of the links, shape (N P, words per row, LANES). Only `LaneEpisodes` keeps
             them, because copying them in `keep_ended_runs` makes all ticks slower by half.
         records: Records, shape (N, floats, LANES).
-        sums: Rows of the sums, shape (N, words of a row, LANES).
-        progress: Rows of the progress, shape (N, words of a row, LANES).
+        sums: Rows of the sums, shape (N, words per row, LANES).
+        progress: Rows of the progress, shape (N, words per row, LANES).
         laws: Gains and memory of compiled laws, shape (N, numbers, LANES).
         sent: Values that these laws send, shape (N, numbers, LANES).
         peaks: Peaks in the bucket of this time, shape (N, 3 n, LANES).
@@ -596,7 +596,7 @@ def keep_ended_runs(
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: Numbers of all runs now, with several rows of records per site. Its peaks are
             not used.
-        ended: Written.
+        ended: Receives the numbers of runs that end in this tick.
 
     Returns:
         The number of runs that have not ended.

@@ -13,8 +13,8 @@ A function that branches on such a value is rejected when it is compiled, becaus
 may need different branches. The function must use `choose` instead.
 
 Invariant:
-    - Each number of a result depends on the same numbers, by the same operations, as in a run
-      of its own.
+    - Each number of a result is computed by the same operations from the same numbers as in a
+      run that is computed alone.
 """
 
 import hashlib

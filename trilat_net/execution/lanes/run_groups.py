@@ -41,7 +41,7 @@ class RunGroup:
         runs: The runs before their first tick (control period).
         in_lanes: True to compute them together, each in a lane of the vector registers. They
             must have the same structure.
-        obstacle: Property that prevents computing the runs together. Empty if there is none.
+        obstacle: Property that prevents computing the runs together. Empty if nothing does.
         record_rows: Number of latest records of each site (arm controller) that are kept, a
             power of two.
 
@@ -137,7 +137,7 @@ def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGr
             `FusedRun.pop_records` after each call of `RunGroup.advance_to`, a power of two.
 
     Yields:
-        The groups, each when the work on the previous one has ended.
+        The groups. Each group is created when the work on the previous group has ended.
     """
     groups: dict[RunStructure, list[int]] = {}
     for index, run in enumerate(runs):

@@ -3,7 +3,7 @@
 The distance between a run and its twins shows whether small disturbances grow (`twins`). The
 run and the twins are computed at once, each in one lane of the vector registers. All of them
 receive the same samples (states of the other arms) at the same times, so the deliveries of the
-simulated network are computed once for all.
+simulated network are computed once for all runs.
 
 Invariant:
     - The states and the records are those of `FusedRun`, bit for bit, as long as no arm leaves
