@@ -127,8 +127,8 @@ class LawSettings(Frozen, frozen=True):
     def books_energy(self) -> bool:
         """True if the law keeps an account of the energy that the arms exchange.
 
-        Then all sites must use this law: each site adds up the energy that it sends, and the
-        receiving site subtracts what it uses.
+        In this case, all sites must use the law: each site adds up the energy that it sends,
+        and the receiving site subtracts what it uses.
         """
         return self.plugged and issubclass(self.kind, EnergyLaw)
 

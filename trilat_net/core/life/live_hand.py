@@ -159,8 +159,8 @@ class HandCommand(NamedTuple):
 class HandMemory(NamedTuple):
     """State of the pull of a person or program on an arm, stored between two control periods.
 
-    It states who holds the arm, how firmly, and how the target to which the arm is pulled
-    moves.
+    It states who holds the arm, how firmly, and the motion of the target to which the arm is
+    pulled.
 
     Attributes:
         source: Sender that holds the arm. 0 if nobody holds it; an earlier grip may still be

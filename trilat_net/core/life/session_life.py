@@ -127,7 +127,7 @@ def _alignment_s(site: SiteRow) -> float:
     """Returns the duration T of an alignment, s.
 
     An alignment is the smooth return of an arm to the arms that it follows, its peers, in the
-    mode RETURN. An offset is added to the reference, the position that the peers ask for, and
+    mode RETURN. An offset is added to the reference, the position computed from the peers, and
     falls from its start value to zero within the time T. The largest slope of its polynomial is
     1.5 times its mean slope, so with
 
@@ -138,8 +138,8 @@ def _alignment_s(site: SiteRow) -> float:
     Args:
         site: State of the site (the process that runs the arm). `q_held` is the start value of
             the offset, rad or m. For a pose, its last three coordinates are a rotation vector,
-            rad. `align_speed` counts for each linear coordinate, rad/s or m/s, and for the
-            angle of the rotation, rad/s.
+            rad. `align_speed` applies to each linear coordinate, rad/s or m/s, and to the angle
+            of the rotation, rad/s.
     """
     longest_distance = 0.0
     for i in range(count_linear_coordinates(site)):
@@ -453,10 +453,10 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns how far an arm that returns to its peers is still kept away from them.
+    """Returns the remaining offset of an arm that returns to its peers, and the offset's rate.
 
     The peers are the arms that it follows. During the smooth return (an alignment), an offset
-    is added to the position that the peers ask for. It falls to zero within the time T, and is
+    is added to the position computed from the peers. It falls to zero within the time T, and is
     the cubic Hermite polynomial with the start value D, the start rate D' and zero value and
     rate at the end:
 

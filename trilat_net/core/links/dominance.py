@@ -13,7 +13,7 @@ Invariant:
     - beta is the LEFT null vector of Upsilon.
     - Factors change along ramps. Every row sums to 1 during a ramp too. The factors at a time
       depend only on this time and the ramps.
-    - If samples from another site stay away, the reference stops. It later returns smoothly
+    - If samples from another site stop arriving, the reference stops. It later returns smoothly
       from the held pose along the polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
 
 Source: Eq. (6), (7), (20) of the paper on which this project is based

@@ -44,12 +44,12 @@ class SentVector(NamedTuple):
 
 
 class _SentEntry(NamedTuple):
-    """One of the numbers that a control law sends to other arms, with its name and unit.
+    """One of the values that a control law sends to other arms, with its name and unit.
 
     Attributes:
-        vector: Vector of the number.
+        vector: Vector that contains the value.
         peer: The only peer that gets the vector, or "" if all peers get it.
-        position: Position of the number in the vector, from 0.
+        position: Position of the value in the vector, from 0.
     """
 
     vector: SentVector

@@ -173,13 +173,13 @@ class SiteArrays(NamedTuple):
         """Creates the arrays for a simulation of several sites, stacked along a first axis.
 
         A site is a process that runs one arm. If the arrays of a site are shorter than those of
-        another site, they are filled up with rows that are never read. The ring buffers for
+        another site, they are padded with rows that are never read. The ring buffers for
         delayed samples (states of other sites) are long enough for all delays.
 
         Args:
             setups: Setups of the sites.
-            spare: Number of changes during the run for which there is room, for each link and
-                for the weights with which each site follows the others.
+            spare: Number of changes during the run for which the tables have free rows, for
+                each link and for the weights with which each site follows the others.
             longest_us: Longest delay that the changes can lead to, us.
             late_ns: Longest time by which a sample may arrive after its delivery time, ns.
         """
