@@ -1,9 +1,9 @@
 """Simulates an experiment about 1000 times faster than real time, without writing a log.
 
-All arms of the experiment are simulated in one compiled loop. It does not store every tick
-(period of the control loop), but the largest values of every interval of 50 ms, and sums over
-the run. Parameter sweeps use this module, and so does the repetition of runs with a small
-disturbance, which shows whether they are stable.
+All arms of the experiment are simulated in one compiled loop. The loop does not store every
+tick (period of the control loop). It stores the largest values of every interval of 50 ms, and
+sums over the run. Parameter sweeps use this module, and so does the repetition of runs with a
+small disturbance, which shows whether they are stable.
 
 Invariant:
     - The results equal the results of `execution.virtual` with its default network, bit for
@@ -135,8 +135,8 @@ class FusedRun(CompiledRun):
             count: Number of ticks, at most the number of executed ticks.
 
         Returns:
-            For each tick the tick in which each peer sent the sample. It is -1 before the first
-            sample.
+            For each tick of the site, the ticks in which the peers sent the samples. -1 before
+            the first sample of a peer.
         """
         stop = self.ticks[i]
         if i not in self._used or len(self._used[i]) < stop:

@@ -396,7 +396,7 @@ def _run_twins(
         inputs: Inputs of a recorded run that is repeated. None for a new run.
         log: Log of the recorded run, with which the repeated run is compared.
     """
-    # Imported late, so that programs that need no twins do not load this code.
+    # Imported here, so that programs that need no twins do not load this code.
     from ..core import LaneEndedError, suits_twins
 
     run = FusedRun(scenario, inputs=inputs)

@@ -83,11 +83,11 @@ class LinkStates(NamedTuple):
         releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
             R), a ring buffer. R is a power of two.
         newest: Sample in use at the last tick, or -1, shape (L, N, P).
-        uniforms: Room for two random numbers of each sample of a block.
-        delays_us: Room for the delay of each sample of a block, us.
-        stamps_ns: Room for the stamp of each sample of a block, ns.
-        times_ns: Room for the nominal time of each tick of a block, ns.
-        sample_counts: Room for the number of samples that a peer has sent before the end of
+        uniforms: Buffer for two random numbers of each sample of a block.
+        delays_us: Buffer for the delay of each sample of a block, us.
+        stamps_ns: Buffer for the stamp of each sample of a block, ns.
+        times_ns: Buffer for the nominal time of each tick of a block, ns.
+        sample_counts: Buffer for the number of samples that a peer has sent before the end of
             each tick of a block.
     """
 
@@ -580,7 +580,7 @@ def _use_after_delay(
         newest: Sample in use before the block, or -1.
         states: Contains for each tick its time and the number of samples that the peer has
             sent.
-        used: Written, one entry per tick.
+        used: Receives the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -791,7 +791,7 @@ def use_recorded_samples(
                 sample_count = first_tick_at(tick_ns(k, rate_hz) + 1, rates_hz[peer])
                 sample_count = max(min(sample_count, end[peer]), first[peer])
                 largest_age = max(largest_age, sample_count - 1 - sample)
-            # Before the next tick of the site, the peer goes on to the end of the block.
+            # Before the next tick of the site, the peer continues to the end of the block.
             largest_age = max(largest_age, end[peer] - 1 - links[i, p].used)
     return largest_age
 

@@ -295,7 +295,7 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: CompiledRun, hand_site: int) -> str:
-        """Explains why a run cannot be simulated side by side with others; "" if it can.
+        """Explains why a run cannot be simulated side by side with others. "" if it can.
 
         The function finds the answer by compiling the code of the simulation, which can take
         seconds.
@@ -310,7 +310,7 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: CompiledRun, rules: HandRules) -> None:
-        """Starts a new episode of reinforcement learning in place of one that has ended.
+        """Starts a new episode of reinforcement learning in place of an ended episode.
 
         Several episodes (simulated runs) advance side by side, and each has a place in common
         arrays (its lane). The function copies the initial state of the new run into the place.

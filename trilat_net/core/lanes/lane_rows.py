@@ -215,7 +215,7 @@ def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
 
 
 def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
-    """Generates LLVM code for an address that lies some numbers of a row behind a pointer.
+    """Generates LLVM code for the address a given number of words after a pointer.
 
     The rows of several runs are stored side by side, so that each number of a row occupies
     `LANES` numbers in memory.
@@ -223,7 +223,7 @@ def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
     Args:
         builder: Appends LLVM instructions.
         pointer: The pointer.
-        word_count: Count of numbers (64-bit words) in a row of one run.
+        word_count: Distance in 64-bit words of a row of one run.
     """
     word = ir.IntType(64)
     return _offset_pointer(builder, pointer, ir.Constant(word, word_count * LANES * _WORD))

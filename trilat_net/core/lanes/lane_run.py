@@ -5,8 +5,8 @@ advances them to a time. It is the counterpart of `CompiledRun`, which simulates
 
 Invariant:
     - After `advance_to`, each run has the numbers that `CompiledRun.advance_to` would give it,
-      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries
-      of ring buffers that are not used any more, may differ.
+      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and obsolete
+      entries of ring buffers, may differ.
     - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
@@ -271,7 +271,7 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
 
 
 def read_assembly(run: CompiledRun, i: int) -> str:
-    """Returns the machine code for one arm as text, in which tests look for vectors.
+    """Returns the machine code for one arm as text, for tests.
 
     The tests check that it contains vector instructions, because the simulation is slow without
     them.
@@ -306,7 +306,7 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
 
 
 def has_lane_code(run: CompiledRun) -> bool:
-    """Returns True if the code that simulates a run in lanes is stored on the disk already.
+    """Returns True if the code that simulates a run in lanes is already stored on disk.
 
     A lane is the position of one of several runs that are simulated at once. Without stored
     code, the compilation takes some time before the runs can start.
@@ -845,7 +845,7 @@ class LaneRun:
             )
 
     def _write_sent(self, lane: int, run: CompiledRun) -> None:
-        """Copies the latest sent states of one run from common arrays into its own records.
+        """Copies the latest sent states of one run from common arrays into its records.
 
         Several runs are simulated side by side, each in one lane. A slow site (arm controller)
         accepts several samples (sent states) of a faster peer at once. A run that continues

@@ -622,9 +622,10 @@ class RecordedHands(NamedTuple):
 
     Attributes:
         actions: Numbers of the operators, shape (N, ticks, C).
-        rows: Row of the operator of each site among all operators and environments; -1: none.
-        row_words: Words of the row that the numbers replace.
-        columns: Index of the number for each of these words.
+        rows: Row of the operator of each site among all operators and environments. -1 without
+            an operator.
+        row_words: Words of the row that the actions replace.
+        columns: Index of the action's number for each of these words.
     """
 
     actions: Array

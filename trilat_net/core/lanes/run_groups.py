@@ -133,9 +133,8 @@ def group_runs(runs: Sequence[CompiledRun], record_rows: int = 1) -> Iterator[Ru
 
     Args:
         runs: The runs before their first tick (control period).
-        record_rows: Number of ticks, a power of two, of which `CompiledRun.pop_records` must
-            find the records (results of control periods) after each call of
-            `RunGroup.advance_to`.
+        record_rows: Number of ticks whose records (results of control periods) are kept for
+            `CompiledRun.pop_records` after each call of `RunGroup.advance_to`, a power of two.
 
     Yields:
         The groups. Each group is created when the work on the previous group has ended.

@@ -180,8 +180,8 @@ class TwinLanes(LaneRun):
 class LaneTwin:
     """A run or a slightly displaced copy of it (twin), simulated side by side with others.
 
-    The class has those methods of `CompiledRun` with which the growth of the displacement is
-    measured, so that callers need not know how the runs are simulated.
+    The class has the methods of `CompiledRun` that are needed to measure the growth of the
+    displacement, so callers need not know how the runs are simulated.
 
     Args:
         lanes: The run and its twins.

@@ -730,8 +730,8 @@ class _Leaf(CPUDispatcher):
         The code is loaded from the cache on disk if the cache contains it. Otherwise the
         function is compiled, and its code is stored.
         """
-        # A leaf for several runs side by side (lanes) is a part of one function for each
-        # structure of runs, so its code would be stored without being loaded again.
+        # A leaf for several runs side by side (lanes) is compiled into one larger function for
+        # each structure of runs. Its own code is not stored, because it would never be loaded.
         is_stored = not any(map(_is_in_lanes, argument_types))
         if is_stored:
             loaded = self._cache.load_inner(argument_types, self.targetctx)
@@ -882,8 +882,8 @@ def set_lane_form(
 ) -> None:
     """Registers another version of a function, for code that computes several simulations.
 
-    For example, `compute_law` of `lanes.lane_laws` has a version for each control
-    law, because the simulations side by side all use the same law.
+    For example, `compute_law` of `core.lanes.lane_laws` has a version for each control law,
+    because all simulations that are computed side by side use the same law.
 
     Args:
         function: A function with the decorator `leaf`.

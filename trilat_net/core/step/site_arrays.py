@@ -181,8 +181,8 @@ class SiteArrays(NamedTuple):
 
         Args:
             setups: Setups of the sites.
-            changes: Changes during the run. There is room for all of them, for each link and
-                for the weights with which each site follows the others.
+            changes: Changes during the run. The tables of each link, and of the weights with
+                which each site follows the others, have free rows for all changes.
             late_ns: Longest time by which a sample may arrive after its delivery time, ns.
         """
         longest_us = 0

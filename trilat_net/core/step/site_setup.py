@@ -406,7 +406,7 @@ class SiteSetup(NamedTuple):
 
     @property
     def live_actor(self) -> int:
-        """Index of the live operator among the operators and environments; -1: there is none.
+        """Index of the live operator among the operators and environments. -1 without one.
 
         A live operator is a person or program that moves the arm during the run.
         """

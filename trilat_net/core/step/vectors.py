@@ -81,9 +81,9 @@ def put_five(a: Any, values: Five) -> None:
 def choose(condition: bool, if_true: float, if_false: float) -> float:
     """Returns one of two numbers, without a branch in the compiled code.
 
-    Both numbers are computed before. With `choose` in place of `if`, a function can also be
-    compiled for several simulations side by side (SIMD), where each may need another choice.
-    See `core/lanes`.
+    Both numbers are always computed. With `choose` in place of `if`, a function can also be
+    compiled for several simulations side by side (SIMD), each of which may need a different
+    choice. See `core/lanes`.
 
     Args:
         condition: The condition.
