@@ -517,7 +517,7 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
         LogRefused: The disk refused the data.
     """
     refuse_existing(path, force=force, manifest=manifest)
-    remedy = "nothing is left of it. Make room, or take another disk"
+    remedy = "no partial file was left. Free some space, or use another disk"
     try:
         # The temporary folder is in the same folder, because a rename works only within a file
         # system.

@@ -640,7 +640,7 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
             "the log was made with another platform's arithmetic: equal bits cannot be expected"
         )
     if not log.complete:
-        yield "the log was not finished: it is executed as far as it goes"
+        yield "the log is incomplete: it is executed up to its last record"
     for law in find_user_laws(request.scenario):
         if law.changed and any(site in request.replaced for site in law.sites):
             yield f"executed as its file is now: {law}"

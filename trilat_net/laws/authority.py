@@ -160,7 +160,7 @@ class Authority(ControlLaw):
         """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         For the arm of a user, the loop is a spring with a damper between the two users, whose
-        known condition is used. The slave follows the users, but nobody follows the slave. It
+        known condition is used. The slave follows the users, but no arm follows the slave. It
         closes no loop and is stable for every delay.
 
         Args:

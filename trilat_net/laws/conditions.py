@@ -179,7 +179,7 @@ def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityC
         return StabilityCondition(None, "known only for joints that follow joints")
     if not situation.alpha.any():
         text = (
-            "nobody follows anybody, which closes no loop: stable in continuous time at every "
+            "no arm follows another, so there is no loop: stable in continuous time for every "
             "delay and d > 0"
         )
         return StabilityCondition(True, text)

@@ -199,13 +199,13 @@ class Impedance(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user that the dominance factors of a master have no effect.
 
-        A master stays at its start pose and follows nobody. Therefore the weights of a master
-        do not matter.
+        A master stays at its start pose and does not follow other arms, so its weights have no
+        effect.
 
         Returns:
             A sentence. Empty for the slave.
         """
-        return "" if self.follows else "follows = false stays at its start pose"
+        return "" if self.follows else "an arm with follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the loop between the masters and the slave is stable.

@@ -132,7 +132,7 @@ class PF(ControlLaw):
         """
         if any(self.K) or any(self.k_f):
             return ""
-        return "K = 0 and k_f = 0 follow nobody"
+        return "with K = 0 and k_f = 0, an arm does not follow others"
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:

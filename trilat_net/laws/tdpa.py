@@ -926,13 +926,13 @@ class Tdpa(EnergyLaw):
         """Explains to the user that the dominance factors of an arm have no effect.
 
         A dominance factor is the weight with which an arm follows another arm. If the stiffness
-        K and the damping B are zero, the arm follows nobody.
+        K and the damping B are zero, the arm does not follow the others.
 
         Returns:
             A sentence for the user. Empty if K or B is not zero.
         """
         follows = any(self.K) or any(self.B)
-        return "" if follows else "K = 0 and B = 0 follow nobody"
+        return "" if follows else "with K = 0 and B = 0, an arm does not follow others"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """States under which assumptions the law keeps the session passive.

@@ -532,7 +532,7 @@ class Wave(EnergyLaw):
         self.held_s = [0.0] * ends  # time since the newest message, s
 
         # Per line.
-        self.stamp = [-1.0] * peers  # tick in which the newest message was sent, -1: none yet
+        self.stamp = [-1.0] * peers  # tick in which the newest message was sent, -1 before it
         self.rate = [1.0] * peers  # filtered increase of the stamp per tick
 
         # Constants.

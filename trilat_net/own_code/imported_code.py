@@ -530,7 +530,7 @@ PAGES = {
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Checks that a Python file defines a certain class with a certain method.
+    """Checks that a Python file defines a given class with a given method.
 
     The check parses the file and runs no code of it, because the code may not have been
     permitted to run yet.

@@ -341,8 +341,8 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
         or (order == _ORDER_RELEASED and site.reason == _STOP)
     ):
         # The brakes of a real arm close when the switch is released, and must not open again.
-        # An arm that was ordered to stop before that was held by a torque, which nobody
-        # supervises then.
+        # Until then, a torque held the arm that was ordered to stop, but with the switch
+        # released, nobody supervises this torque.
         site.reason = _STOP_RELEASED
     elif stops and mode != _FAULT and mode != _STOPPED:
         reason = _STOP if order == _ORDER_STOP else _RELEASED

@@ -346,7 +346,7 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments at the motion in an arm's record.
+    """Computes the torque of operators and environments for the motion in an arm's record.
 
     An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 

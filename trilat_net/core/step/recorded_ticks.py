@@ -39,8 +39,8 @@ def _list_checksums() -> NDArray[np.uint32]:
     """Returns tables with which a CRC-32 checksum is updated by eight bytes at once.
 
     CRC-32 is linear in the bits of the message, except for a constant. Therefore the effect of
-    a byte depends only on its value and on the number of bytes that follow, which are taken as
-    zeros here.
+    a byte depends only on its value and on the number of bytes that follow. The tables assume
+    that the following bytes are zero.
 
     Returns:
         The effect by number of following bytes and value of the byte, shape (8, 256).

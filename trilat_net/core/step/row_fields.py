@@ -81,7 +81,10 @@ class SiteRow(Protocol):
         ),
     ]
     order: Annotated[
-        int, Field("", "LifeOrder", "order to carry out at the next tick; 0: none", "input")
+        int,
+        Field(
+            "", "LifeOrder", "order to carry out at the next tick, 0 without an order", "input"
+        ),
     ]
     skipped: Annotated[int, Field("", "ticks", "ticks missed before this one", "input")]
     degrades: Annotated[int, Field("", "", "1: the site continues without lost peers", "setup")]

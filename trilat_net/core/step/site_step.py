@@ -689,7 +689,8 @@ class Site:
         if self._degrades:
             self._links["gone"] = remaining[:peers]
             remaining = remaining[peers:]
-        # Orders and missed ticks are inputs of the tick that applies them: none is waiting.
+        # Orders and missed ticks are inputs of the tick that applies them, so none are pending
+        # here.
         s.order = 0
         s.skipped = 0
         return remaining
