@@ -364,7 +364,7 @@ def _make_next_folder(name: str) -> Path:
         except OSError as error:
             raise describe_write_error(folder, error) from None
         return folder
-    raise AssertionError("the loop over all numbers does not end")
+    raise AssertionError("unreachable, because the loop tries numbers until it returns")
 
 
 def refuse_existing(

@@ -249,7 +249,7 @@ def _check_recorded_limits(
         )
     if requested.duration_s > original.duration_s:
         raise ScenarioError(
-            f"the experiment in the log lasts {original.duration_s:g} s: how the network would "
+            f"the experiment in the log lasts {original.duration_s:g} s; how the network would "
             f"behave from then until {requested.duration_s:g} s is not known",
             path="duration_s",
         )

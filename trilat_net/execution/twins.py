@@ -364,7 +364,7 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
     )
     all_descriptions = ", ".join(descriptions)
     return (
-        f"--push {target}: there is no such number; name a number as in {examples}, or q; "
+        f"--push {target}: the state has no such number; name a number as in {examples}, or q; "
         f"the sites are {all_descriptions}"
     )
 

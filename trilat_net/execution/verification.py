@@ -227,7 +227,7 @@ def _compare_fields(
         logged_count = len(logged_numbers)
         computed_count = len(computed_numbers)
         if logged_count != computed_count:
-            yield f"{vector} (how many numbers)", logged_count, computed_count, False
+            yield f"{vector} (number of values)", logged_count, computed_count, False
             continue
         names = [f"{vector}[{n}]" for n in range(logged_count)]
         if vector == "ch":

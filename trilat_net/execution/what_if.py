@@ -643,7 +643,7 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
         yield "the log is incomplete: it is executed up to its last record"
     for law in find_user_laws(request.scenario):
         if law.changed and any(site in request.replaced for site in law.sites):
-            yield f"executed as its file is now: {law}"
+            yield f"the law is executed as its file is now: {law}"
     yield from _describe_later_changes(result)
     for effect in result.sites.values():
         yield from _describe_site_limits(effect, log.absent_ticks(effect.site))
@@ -672,12 +672,12 @@ def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str
     name = effect.site
     if effect.stands:
         copied = count_nouns(
-            effect.stands, "record stands as it is", "records stand as they are"
+            effect.stands, "record is copied unchanged", "records are copied unchanged"
         )
-        yield f"{name}: {copied}: too little is known to execute more"
+        yield f"{name}: {copied}, because the log lacks inputs to execute more"
     if effect.assumed:
         unrecorded = count_nouns(effect.assumed, "tick has", "ticks have")
-        yield f"{name}: {unrecorded} no record in the log: the arrivals are assumed"
+        yield f"{name}: {unrecorded} no record in the log: their arrivals are assumed"
     if absent_ticks:
         ticks = count_nouns(absent_ticks, "tick")
         yield (
@@ -688,7 +688,7 @@ def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str
         missing = count_nouns(
             effect.lacking, "sample that arrived is", "samples that arrived are"
         )
-        yield f"{name}: {missing} not in the log: executed without"
+        yield f"{name}: {missing} not in the log, and therefore missing in the rerun"
     if not effect.executed:
         yield f"{name}: nothing could be executed"
 
@@ -728,6 +728,6 @@ def _describe_later_changes(result: Rerun) -> Iterator[str]:
         prefix = f"links.{owner}." if is_link else f"dominance.{owner}."
         if any(key.startswith(prefix) for key in keys_set_by_user):
             yield (
-                f"{owner} changes during the run, in the log and in the rerun: from that "
-                "change on the setting of the run holds"
+                f"{owner} changes during the run, in the log and in the rerun: the new setting "
+                "applies only until its first change"
             )

@@ -92,7 +92,7 @@ class AdaptiveBox(Adaptive):
                 raise ScenarioError(problem, path=f"{path}.theta_high[{n}]")
             if not low <= first <= high:
                 bounds = f"theta_low = {low:g} and theta_high = {high:g}"
-                problem = f"must lie between {bounds}, not be {first:g}"
+                problem = f"must be between {bounds}, but is {first:g}"
                 raise ScenarioError(problem, path=f"{path}.theta_hat0[{n}]")
 
     @classmethod

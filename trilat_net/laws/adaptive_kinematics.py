@@ -335,7 +335,7 @@ class AdaptiveKinematics(ControlLaw):
         text = (
             "e and qd go to zero for every constant delay and irreducible alpha, while "
             f"abs(sin q2) > {LEAST_SINE:g} and the lengths are between {self.least_m:g} and "
-            f"{self.most_m:g} m (sufficient); the run shows if elbows stay bent"
+            f"{self.most_m:g} m (sufficient); the run shows whether the elbows stay bent"
         )
         return StabilityCondition(None, text)
 

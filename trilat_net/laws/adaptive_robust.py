@@ -129,7 +129,7 @@ class AdaptiveRobust(AdaptiveBox):
         bound_w = ROBUST_RESIDUE * sum(bounds_per_joint)
         # The longest delay is NaN if any delay varies.
         delays_vary = bool(np.isnan(situation.longest_s))
-        delays = "to be constant, and vary here" if delays_vary else "constant"
+        delays = "assumed constant, but vary here" if delays_vary else "constant"
         text = (
             f"delays are {delays}, theta is in its box: with torque of at most rho_nm that no "
             "estimate explains, the mean of beta times r'Kp r and the disagreement is at most "

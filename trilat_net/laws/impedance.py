@@ -257,8 +257,8 @@ class Impedance(ControlLaw):
         master_hands = _select_master_hands(hands, slave)
         if slave_loads is None or master_hands is None:
             text = (
-                "known for springs and dampers per joint, but a hand at a master or what the "
-                "slave touches is of another kind (a hand at a master may void the bound)"
+                "known for springs and dampers per joint, but a hand at a master or the "
+                "environment of the slave is of another kind (such a hand may void the bound)"
             )
             return StabilityCondition(None, text)
 
@@ -490,8 +490,8 @@ def _select_master_hands(
 def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     """Returns a phrase about the walls against which a slave in free motion is stable.
 
-    Example: "at a spring of up to 250 N m/rad at the slave ...". The bound is the smallest over
-    all combinations of hands at the masters. Without a bound, the phrase gives the reason.
+    Example: "with a spring of up to 250 N m/rad at the slave, ...". The bound is the smallest
+    over all combinations of hands at the masters. Without a bound, the phrase gives the reason.
 
     Args:
         situation: All sites, their laws and their hands.
@@ -510,7 +510,7 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     stiffest = min(stiffnesses)
     limit = "of any stiffness" if stiffest == np.inf else f"of up to {stiffest:.4g} N m/rad"
     return (
-        f"at a spring {limit} at the slave for constant delays of any length, with and without "
+        f"with a spring {limit} at the slave, for constant delays of any length, with and without "
         "the hands at the masters (small gain: sufficient, in continuous time)"
     )
 

@@ -262,13 +262,13 @@ def _allow_file(
     if not keys:
         names = ", ".join(sorted({key.code for key in logged})) or "no external code"
         raise UsageError(
-            f"--law {file}: does not contain code that the log names; the log names {names}"
+            f"--law {file} does not contain code that the log names; the log names {names}"
         )
     for key in keys:
         if key.sha256 != sha256 and not other_version:
             versions = _compare_hashes(key, sha256)
             problem = f"is not the file that ran as {key.code}: {versions}"
-            raise UsageError(f"--law {file}: {problem}; --other-version accepts it")
+            raise UsageError(f"--law {file} {problem}; --other-version accepts it")
         check_class(source, key.code, "--law", logged[key].method)
         allowed_code[key] = CodeConsent(source.file, sha256)
     return sha256, keys
