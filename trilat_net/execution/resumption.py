@@ -158,7 +158,7 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 
     Returns:
         The operator's grip, target and velocity, in the order of `HandInForce`. Empty if the
-        site had no operator with a live connection.
+        site had no live operator.
     """
     if not site_log.layout.hand:
         return []

@@ -121,10 +121,10 @@ class FourChannel(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: stores the torque limits and creates a work space.
+        """Prepares the law before a run: stores the torque limits and allocates buffers.
 
         If the law sends the acceleration of its arm, it computes the acceleration from the
-        equation of motion. This computation needs the limits and the work space.
+        equation of motion. This computation needs the limits and the buffers.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.

@@ -524,7 +524,7 @@ def _settle_follower(
     drift_velocity: float,
     available_J: float,
 ) -> None:
-    """Computes the torque of a following joint so that known energy covers its work.
+    """Computes the torque of a following joint so that the available energy covers its work.
 
     The follower is the arm that follows its peers, the other arms, in one coupling each. The
     torque depends on the velocity with which the spring's goal moves. The velocity depends on

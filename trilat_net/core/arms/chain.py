@@ -859,7 +859,7 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
     """Returns the torque of the mechanical stops at the ends of a joint's range, N m.
 
     A stop acts only beyond the end of the range: a spring and a damper push the joint back, and
-    never pull. Within the range the torque is 0. For a joint that slides it is a force, N.
+    never pull. Within the range the torque is 0. For a sliding joint, it is a force, N.
 
     Args:
         row: Data of the joint.

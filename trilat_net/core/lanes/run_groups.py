@@ -64,7 +64,7 @@ class RunGroup:
         self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the simulated runs of the group up to a time. It may be called repeatedly.
+        """Continues the simulated runs of the group up to a time. Repeated calls are allowed.
 
         Args:
             until_s: The time, s, later than that of the previous call.

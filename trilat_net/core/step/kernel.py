@@ -93,7 +93,7 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate of the arm's parameters by theta_hat - gain_s Gamma Yr, in bounds.
+    """Advances the estimated parameters to theta_hat - gain_s Gamma Yr, within their bounds.
 
     Gamma is the adaptation gain, and Yr the product Y' r of the regressor and the filtered
     error.

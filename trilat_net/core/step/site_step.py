@@ -450,7 +450,7 @@ class Site:
 
     @property
     def parts(self) -> "TickParts":
-        """Internal parts by which `recorded_ticks` computes many control periods at once."""
+        """Internal parts with which `recorded_ticks` computes many control periods at once."""
         return TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
