@@ -28,7 +28,7 @@ RETURN_NS = 1_000_000_000
 After a reconnection, samples may arrive before the new liveliness token.
 """
 _INBOX_CAPACITY = 256
-"""Number of events of a member that wait at most."""
+"""Largest number of events of a member that wait to be read."""
 
 
 class PeerMonitor:

@@ -175,7 +175,8 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     """
     if channel != LINK:
         return ticks
-    # Rounded up, as statistics are published after tick 0: -(-a // b) rounds a / b up.
+    # The number is rounded up, because statistics are published after tick 0: -(-a // b) rounds
+    # a / b up.
     return -(-ticks // ticks_per_stats(rate_hz))
 
 

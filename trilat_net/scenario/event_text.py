@@ -26,7 +26,7 @@ def describe_event(kind: str, text: str, command: str) -> str:
         command: JSON text of the change that the event reports. Empty for other events.
     """
     if kind == "change" and command and command in text:
-        # The command of an untrusted log may lack the keys of a change: the text then stays.
+        # The command of an untrusted log may lack the keys of a change. The text is then kept.
         with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
             return describe_change(msgspec.json.decode(command, type=Change))
     return text

@@ -8,7 +8,7 @@ Invariant:
     - The state that a plant returns is treated as a measurement, like the state of a real
       robot. The log stores it as the joint positions q, the joint velocities qd and the
       external torques tau_x. Therefore the control can be executed again from a log without the
-      plant, and no check of a log judges the motion of the plant.
+      plant, and the checks of a log do not judge the motion of the plant.
 """
 
 import math
@@ -78,7 +78,7 @@ class _PlantProgram(Protocol):
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns the current poses of the bodies that the model moves besides the arm.
+        """Returns the current poses of the bodies that the model moves in addition to the arm.
 
         The order is that of `PlantContext.bodies_m`. The method is called only if there are
         bodies.
@@ -90,7 +90,7 @@ class _PlantProgram(Protocol):
 
 
 class PlantPlayer:
-    """Runs a user's arm model (plant) at one arm, one control period after another.
+    """Runs a user's arm model (plant) for one site, one control period after another.
 
     A plant is a class that computes the motion of an arm from the torques of its motors.
 

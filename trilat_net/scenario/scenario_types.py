@@ -1,4 +1,4 @@
-"""Defines the types of a complete scenario: the whole, its arms, limits and planned changes.
+"""Defines the types of a complete scenario: the scenario, its arms, limits and planned changes.
 
 A scenario describes an experiment. Each arm is controlled by a process called a site, and each
 pair of sites is connected by two directed links. `Scenario.setup` translates a scenario into
@@ -76,11 +76,11 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     Every arm's process (site) sends its state, a sample, in each period of its control loop.
 
     Attributes:
-        action: What the site does. "use": It goes on with the old sample. "hold": It keeps its
-            last reference. "brake": It keeps the position where its arm is. "glide": At the
-            start, it waits for all peers. If no sample of a peer has come into use for
-            `silence_ms`, its reference decelerates to rest. Later it aligns with its peers
-            without a jump.
+        action: What the site does. "use": The site continues with the old sample. "hold": The
+            site keeps its last reference. "brake": The site holds the present position of its
+            arm. "glide": At the start, the site waits for all peers. If no sample of a peer has
+            come into use for `silence_ms`, its reference decelerates to rest. Later it aligns
+            with its peers without a jump.
         age_ms: Age of a sample beyond which it is too old, in ms. Not used by "glide".
         return_s: Duration of the return to the reference after a fresh sample has come into
             use, in s. Not used by "glide".
@@ -91,8 +91,8 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         align_limit_rad: For "glide": longest path that the site moves by itself, in rad, or in
             m if the sites share a position.
         on_lost: For "glide": reaction to a silent peer. "hold": The site waits for the peer.
-            "degrade": It goes on without a silent master, as long as the remaining sites all
-            reach each other.
+            "degrade": The site continues without a silent master, as long as the remaining
+            sites all reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -158,10 +158,11 @@ class Limits(Frozen, frozen=True):
         tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
             default, the efforts in the URDF file of a chain.
         qd_limit_rad_s: Joint speed beyond which a run counts as diverged and ends, in rad/s.
-            Under the stale rule "glide", only the site stops with a fault, and the run goes on.
-            By default, the speeds in the URDF file of a chain.
+            Under the stale rule "glide", only the site stops with a fault, and the run
+            continues. By default, the speeds in the URDF file of a chain.
         tau_rate_limit_nm_s: Largest rate of change of a joint's control torque, in N m/s. By
-            default there is no limit, but `GLIDE_TAU_RATE_NM_S` under the stale rule "glide".
+            default, there is no limit, except under the stale rule "glide", where it is
+            `GLIDE_TAU_RATE_NM_S`.
         qd_des_limit_rad_s: Largest speed of the reference, in rad/s, or in m/s if the sites
             share a position.
         q_min_rad: Smallest angle of a joint, in rad. Beyond it, the site stops with a fault.
@@ -180,7 +181,7 @@ class Limits(Frozen, frozen=True):
     def motion(self) -> MotionLimits:
         """Limits of angles, reference speed and torque rate, as the control loop reads them.
 
-        A limit that the author left out is infinite, so that the loop needs no special case.
+        A limit that the author left out is infinite, so the loop needs no special case.
         """
         return MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -259,7 +260,7 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):
-    """Change during a run: of a network link, of weights, or a command to one arm's process.
+    """Change of a network link or of weights during a run, or a command to one arm's process.
 
     The weights (dominance factors) state how much an arm follows the others. A scenario plans
     changes, and users request further ones. Exactly one of `link`, `dominance` and `site` is
@@ -270,15 +271,15 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
     def start_ns(self) -> int:
         """Time at which the change takes effect, in ns after the common start of the session.
 
-        Times of the simulation are integers, so that they are the same on every machine.
+        Times of the simulation are integers, so they are the same on every machine.
         """
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """All settings of a network link after this change, also those that stay the same.
+        """All settings of a network link after this change, including those that stay the same.
 
-        Only a change of a link has them.
+        Only a change of a link has this property.
         """
         return msgspec.convert(self.to, Link)
 
@@ -310,8 +311,8 @@ _ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
 }
 """Values that mean the same as a missing key, for keys that were added in later versions.
 
-They are left out of the canonical text. Otherwise the text of an older scenario, and with it
-the hash, would change.
+They are left out of the canonical text. Otherwise the text of an older scenario, and thereby
+its hash, would change.
 """
 _POSE_NUMBERS = 7
 """Number of values of the pose of a body: three for the position, four for the quaternion."""
@@ -344,7 +345,7 @@ def _drop_absent_values(table: dict[str, Any]) -> None:
 
 
 def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers that TOML text spreads over several lines as one line."""
+    """Returns a list of numbers, which TOML text spreads over several lines, on one line."""
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 
@@ -439,8 +440,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Matrix of the weights with which the arms follow each other, shape (N, N), Eq. (6).
 
         The entry of row i and column j states how much arm i follows arm j at the start of the
-        run; it is called a dominance factor. An arm without an entry for another one does not
-        follow it.
+        run; it is called a dominance factor. An arm with the factor 0 for another arm does not
+        follow that arm.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
@@ -462,9 +463,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
         N is the number of sites, the processes of the arms. The dominance matrix alpha contains
         the weights with which the sites follow each other. The weights beta are positive, have
-        the sum 1 and satisfy beta' alpha = beta', where the prime denotes the transpose. None
-        if a site follows another site neither directly nor through other sites, because beta is
-        not unique then.
+        the sum 1 and satisfy beta' alpha = beta', where the prime denotes the transpose. The
+        value is None if a site follows some other site neither directly nor through other
+        sites, because beta is not unique then.
         """
         if not dominance.is_irreducible(self.alpha):
             return None
@@ -489,7 +490,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             _drop_absent_values(site["control"])
             _drop_absent_values(site["limits"])
 
-        # Texts for people have several lines. The tables with numbers do not.
+        # Texts for people may have several lines. Lists of numbers are written on one line.
         urdf_texts = tables.pop("urdf", None)
         description_text = tomli_w.dumps(descriptions, multiline_strings=True)
         number_text = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
@@ -510,17 +511,17 @@ class Scenario(Frozen, frozen=True, dict=True):
     def assign_colours(self, colours: int) -> list[int]:
         """Chooses a colour for each arm, for figures.
 
-        The slave, the arm that works at the environment, gets a fixed colour, so that it looks
-        the same in all figures. This colour is reserved until a slave has been met. The other
-        arms get the first free colours.
+        The slave, the arm that touches the environment, gets a fixed colour, so that it looks
+        the same in all figures. No other arm gets this colour before the slave. The other arms
+        get the first free colours.
 
         Args:
             colours: Number of colours of the palette.
 
         Returns:
-            A permutation of the colours. The first entries belong to the sites in their order;
-            the others are not used. If there are more sites than colours, the caller starts
-            again from the first entry.
+            A permutation of the colours. The first entries belong to the sites in their order,
+            and further entries are not used. If there are more sites than colours, the caller
+            repeats the entries from the first one.
         """
         free = list(range(colours))
         assigned = []
@@ -571,7 +572,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number of the experiment is random: another seed gives another run.
+        """True if any number of the experiment is random, so that the seed changes the run.
 
         The numbers may be drawn when the scenario is loaded, or during the run.
         """
@@ -581,8 +582,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def links_random(self) -> bool:
         """True if a link draws its delays, losses or duplicates at random during the run.
 
-        This includes links that do so only after a planned change. Results then depend on the
-        seed, and one run is only an example.
+        This includes links with such draws only after a planned change. Results then depend on
+        the seed, and one run is only an example.
         """
         return any(link.random for link in self._all_links())
 
@@ -604,10 +605,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the slave, the arm that works at the environment.
+        """Name of the slave, the arm that touches the environment.
 
-        If several arms have the role "slave", it is the first of them. If none has, it is the
-        last arm of the experiment.
+        If several arms have the role "slave", it is the first of them. If no arm has this role,
+        it is the last arm of the experiment.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
@@ -625,7 +626,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Names of the sites whose arms any member of the session may move.
 
         A member is a process that takes part in the session, such as a page or a bridge. The
-        arm of a user's program is not open: that program alone moves it.
+        arm of a user's program is not open, because only that program moves the arm.
         """
         return tuple(
             name
@@ -654,7 +655,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns which numbers the control law of an arm sends to the others, in their order.
+        """Returns the vectors that the control law of an arm sends to others, in their order.
 
         Most laws send nothing but the state of the arm. A law that sends waves, for example,
         has a vector for them.
@@ -700,8 +701,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns all settings from which the compiled control loop of a site is built.
 
         A site is the process that runs one arm. The result contains its arm, control law,
-        network connections and limits. It is kept, because the check of a scenario needs it
-        before the run does.
+        network connections and limits. The result is cached, because both the check of a
+        scenario and the run need it.
 
         Args:
             site: Name of the site.
@@ -716,7 +717,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return {}
 
     def _build_setup(self, site: str) -> SiteSetup:
-        """Builds the result of `setup`.
+        """Builds the settings that `setup` returns and caches.
 
         Args:
             site: Name of the site.
@@ -803,9 +804,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def _rest_gains(self, site: str) -> RestGains:
         """Returns the gains of the controller that brings an arm to rest.
 
-        It acts, for example, when another arm has fallen silent. The gains depend on the
-        inertia of the arm, its largest torque, the control period, and the damping of the
-        control law.
+        This controller acts, for example, when another arm has fallen silent. The gains depend
+        on the inertia of the arm, its largest torque, the control period, and the damping of
+        the control law.
         """
         spec = self.sites[site]
         arm = self.arms[site]

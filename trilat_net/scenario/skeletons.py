@@ -4,8 +4,8 @@
 user then edits code that works instead of starting from an empty file.
 
 Invariant:
-    - The skeletons are files of this package, such as `scenarios/_law.txt`. The class gets its
-      name from the file: mylaw.py contains the class MyLaw.
+    - The skeletons are files of this package, such as `scenarios/_law.txt`. The name of the
+      class is derived from the file name: mylaw.py contains the class MyLaw.
     - The written code runs unchanged, and its test passes.
 """
 
@@ -29,7 +29,7 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
     Args:
         path: File to write, which is a Python module. mylaw.py contains the class MyLaw.
-        force: If True, existing files of these names are replaced.
+        force: If True, existing files with these names are replaced.
 
     Returns:
         The written files.
@@ -117,7 +117,7 @@ def name_skeleton_class(module: str, kind: str) -> str:
 
     Args:
         module: Name of the Python module that contains the skeleton.
-        kind: What the class is: "law" (a control law), "hand" (an operator) or "plant".
+        kind: Kind of the class: "law" (a control law), "hand" (an operator) or "plant".
     """
     parts = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
     return "".join(part[:1].upper() + part[1:] for part in parts) or kind.title()

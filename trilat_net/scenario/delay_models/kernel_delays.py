@@ -57,7 +57,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
     def derive_keys(cls, table: TomlTable) -> TomlTable:
         """Returns the default width of the distribution: half of the mean to each side.
 
-        Therefore the description of a link may state the mean delay alone.
+        Because of this default, the description of a link may state the mean delay alone.
 
         Args:
             table: Settings of the link as the author of the scenario wrote them.
@@ -89,7 +89,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the half width exceeds the mean, so that delays are negative."""
+        """Returns a problem if the half width exceeds the mean, as delays would be negative."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -174,7 +174,7 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay of each message whose logarithm is normal: mostly short, at times very long.
+    """Delay whose logarithm is normally distributed: mostly short, and very long at times.
 
     The author of a scenario states the mean and the standard deviation of the delay itself.
     """
@@ -347,7 +347,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the amplitude exceeds the mean, so that delays are negative."""
+        """Returns a problem if the amplitude exceeds the mean, as delays would be negative."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -362,7 +362,7 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
     Attributes:
         trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
             sample has "lost" in place of its delay.
-        at_end: What happens after the last point. "hold": The last delay continues. "loop": The
+        at_end: What happens after the last point. "hold": The last delay is kept. "loop": The
             table is repeated.
     """
 
@@ -425,7 +425,7 @@ class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN twice, because the delay of the real network is not known beforehand."""
+        """Returns NaN twice, because the delay of the real network is not known in advance."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:
