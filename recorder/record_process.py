@@ -302,7 +302,7 @@ class Recorder:
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
-        """Tells the recording which processes have joined the session's network or left it.
+        """Informs the recording which processes have joined the session's network or left it.
 
         Zenoh, the network library, reports both. From these reports the recording decides which
         sites (processes that control an arm) it still has to wait for before it closes the log.

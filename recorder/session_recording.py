@@ -412,8 +412,8 @@ class Recording:
     def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
         """Writes an event or statistics of a site, unless they were written before.
 
-        The log states two times of a message: that of sending, in ns since the epoch (the start
-        of the session), and that of arrival, as Unix time.
+        The log states two times of a message: the sending time, in ns since the epoch (the
+        start of the session), and the arrival time, as Unix time.
 
         Args:
             key: Key under which the message arrived. It names the site and the channel.
@@ -476,7 +476,7 @@ class Recording:
         of the recorder.
 
         Args:
-            key: Key of the message, that of the events or of the statistics of recorders.
+            key: Key of the message: the key of recorders' events or of their statistics.
             payload: The message.
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
@@ -546,8 +546,8 @@ class Recording:
         When a connection is established again, the network may report the return of a site
         first, and its earlier disappearance afterwards. The report "gone" is then wrong, which
         only the messages of the site reveal: a message that arrives more than `_UNDER_WAY_NS`
-        after the report cannot have been in transit. In this case, the wait begins anew with
-        each message. As long as messages arrive, the site is thus never given up.
+        after the report cannot have been in transit. In this case, the wait restarts with each
+        message. As long as messages arrive, the site is thus never given up.
 
         Args:
             site: Name of the site.
@@ -568,7 +568,7 @@ class Recording:
         return last_message_ns
 
     def is_over(self, now_ns: int) -> bool:
-        """Finds out whether the recording can end, because no site can send any more messages.
+        """Determines whether the recording can end, because no site can send any more messages.
 
         The recorder then completes the log file and ends.
 
@@ -585,7 +585,7 @@ class Recording:
         return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
-        """Finds out whether the recorder need not wait for any more messages of a site.
+        """Returns True if the recorder need not wait for any more messages of a site.
 
         This is the case if all messages of the site are stored, or if the site has been absent
         from the network for so long that it is regarded as gone for good.
@@ -621,7 +621,7 @@ class Recording:
         return now_ns - absent_since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """Finds out whether the recorder has every message that the sites have sent so far.
+        """Determines whether the recorder has every message that the sites have sent by now.
 
         The recorder calls this method repeatedly after it was told to end while the session
         still runs. A site is a process that runs one arm. There are three cases for each site:
@@ -833,7 +833,7 @@ class RecorderReport:
         """Publishes the statistics of the recording now, and also writes them into the log.
 
         People see losses during the session, and readers of the log see them afterwards. The
-        longest duration of a flush is counted anew for the next statistics.
+        longest duration of a flush is reset for the next statistics.
         """
         payload = encode(self._make_stats())
         self._flush_max_ns = 0

@@ -396,7 +396,7 @@ class SiteReception:
             record: State = decode(payload)
             tick = record.tick
             if tick >= possible_ticks or record.site != name or record.boot != boot:
-                # Finds out which condition the record violates, and raises the error.
+                # Determines which condition the record violates, and raises the error.
                 self._check(
                     channel=topics.STATE,
                     sender=record.site,

@@ -96,7 +96,7 @@ class HandProcess(SiteClient):
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Lets the user's operator class decide how to move the arm, and sends the decision.
+        """Calls the user's operator class with a view of the arm, and sends the decision.
 
         The site of the arm regularly sends a view, which describes its present state. The
         oldest waiting view that is not too old is used. If no view is waiting, nothing is

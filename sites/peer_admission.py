@@ -91,8 +91,8 @@ class PeerAdmission:
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
         """Returns True if another arm's process left longer ago than the user permits.
 
-        The run then ends. The limit is the option `leave_timeout_s`. Without it, a process may
-        stay away for ever.
+        The run then ends. The limit is the option `leave_timeout_s`. Without this option, a
+        process may stay away forever.
 
         Args:
             t_ns: Present time, ns since the epoch.

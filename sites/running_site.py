@@ -48,9 +48,9 @@ class RunningSite:
     ticks in which something changed, and `run_housekeeping` ten times a second.
 
     If at least a quarter of the period is left after a block of records was published, the loop
-    also calls `use_slack`, which answers one query of a recorder for lost messages. It returns
-    True if it has answered one. The loop then calls it again after the next tick, because more
-    queries may wait.
+    also calls `use_slack`, which answers one query of a recorder for lost messages. If
+    `use_slack` has answered a query and returns True, the loop calls it again after the next
+    tick, because more queries may wait.
 
     Args:
         parts: Parts of the site.

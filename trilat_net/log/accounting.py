@@ -281,7 +281,7 @@ class Account:
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Gives up the missing messages below a number, because nobody can send them any more.
+        """Gives up the missing messages below a number, which no process can send any more.
 
         They are no longer requested, but still count as missing. Such a message still counts as
         received if it arrives.
@@ -373,7 +373,8 @@ class Account:
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Formats the first ranges of missing numbers for a message to the user.
 
-        For example ["10-12", "40-40"] if the numbers 10 to 12 and 40 are missing.
+        The result is, for example, ["10-12", "40-40"] if the numbers 10 to 12 and 40 are
+        missing.
 
         Args:
             most: Largest number of ranges to return.
@@ -465,7 +466,7 @@ class StartGap:
         self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
-        """Takes into account how many messages the site published before it was killed.
+        """Updates the gap with the number of messages that the killed site had published.
 
         Other sites (arm controllers) report this number, because they received samples, the
         states that a site sends. Missing messages before the next start first count as

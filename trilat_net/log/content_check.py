@@ -67,7 +67,7 @@ class MessageOrigins(NamedTuple):
 
 
 def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
-    """Finds out from which sessions and senders the first messages of a chunk come.
+    """Determines the sessions and senders of the first messages of a chunk.
 
     A damaged file may contain a chunk, a block of messages, of another file. Two facts reveal
     such a chunk: the start time (epoch) of the session, and the boots of the senders, random
@@ -202,7 +202,7 @@ class ContentCheck:
         return key.member in self._scenario.sites and key.channel in SITE_CHANNELS
 
     def identify(self, payload: bytes) -> str:
-        """Finds out from the content of a message to which topic it belongs.
+        """Determines the topic of a message from its content.
 
         A recovery needs this for messages whose channel is damaged.
 

@@ -779,7 +779,7 @@ def _to_word(text: str) -> str:
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
-    """Makes the column of one entry of a statistics field whose values are maps.
+    """Creates the column of one entry of a statistics field whose values are maps.
 
     For example, the field `delay_us` maps each peer to a delay. Its entry of the peer m2
     becomes the column delay_m2_us. A field without a unit is a count: the entry m2 of

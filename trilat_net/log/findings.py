@@ -72,7 +72,7 @@ class Finding:
 
         Args:
             file: Name of the file in which the problem was found.
-            offset: Place of the problem in the file, in bytes. None if it concerns the whole
+            offset: Offset of the problem in the file, in bytes. None if it concerns the whole
                 file.
             text: Description of the problem.
         """

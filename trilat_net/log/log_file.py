@@ -321,7 +321,7 @@ class LogFile:
         1. There was no error so far. Before the data are written, disk space is reserved for
            them and for the end of the file.
         2. The disk refuses the data for the first time. The reserved space is released, and the
-           data are written once more. If this succeeds, they are in the file, but the error is
+           data are written again. If this succeeds, they are in the file, but the error is
            still raised, so that the caller stops and writes only the end of the file.
         3. The disk refuses the data even then. The file is cut off at the end of the previous
            flush. Every later call raises the first error.

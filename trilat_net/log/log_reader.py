@@ -589,10 +589,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
         A tick is one period of the control loop. A process may be killed and started again, or
         may join a session late. For each start in `starts`, a range (first tick, last tick)
-        ends just before that start. The range begins after the last earlier tick that was
-        executed, as far as is known. Such a tick is known from a record, from the "end" event
-        of the earlier process, or because another site received the state that was sent in that
-        tick.
+        ends just before that start. The range begins after the last earlier tick that is known
+        to have been executed. Such a tick is known from a record, from the "end" event of the
+        earlier process, or because another site received the state that was sent in that tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 

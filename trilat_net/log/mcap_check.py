@@ -7,8 +7,8 @@ compare it with the index in the file. Other programs (pymcap-cli doctor) check 
 conforms to every rule of the format.
 
 Invariant:
-    - Each problem is reported once, with its offset. Problems that follow from another one are
-      not reported.
+    - Each problem is reported once, with its offset. Problems that follow from another problem
+      are not reported.
     - An index is compared with the records in the file, and never used to find them.
     - Every MCAP file is accepted, not only logs of trilat-net.
 """

@@ -288,7 +288,7 @@ class McapReader:
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
-        """Parts of the file that could not be read, among the parts examined so far.
+        """Unreadable parts among the parts of the file that have been examined.
 
         A channel of which only some messages were read, because of the memory limit, is listed
         as well.

@@ -333,7 +333,7 @@ class RecoverySurvey:
     def _find_unnamed_chunks(self) -> dict[int, str]:
         """Finds the chunks (blocks of messages) that the index of the file does not name.
 
-        Such a chunk may come from an older file at the same place of the disk. If bytes were
+        Such a chunk may come from an older file in the same part of the disk. If bytes were
         inserted or removed, chunks have other offsets than the index states. Therefore a chunk
         is also accepted if the index names a missing chunk with the same sizes and times at
         another offset.

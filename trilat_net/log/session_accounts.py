@@ -319,7 +319,7 @@ class SessionAccounts:
                 yield channel, gap
 
     def add_expected_ticks(self, site: str, ticks: int) -> None:
-        """Takes into account that a site executed at least a given number of ticks.
+        """Updates the accounts for a site that executed at least a given number of ticks.
 
         Records and statistics of these ticks (control periods) that have not been received
         count as missing from now on.

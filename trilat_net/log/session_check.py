@@ -514,7 +514,7 @@ class _SessionCheck:
         log into several files. The scenario, the description of the experiment, is also
         checked. For the first file, the counts of the messages are prepared.
 
-        Nothing happens if no file so far, including this one, is a log of trilat-net. `ours`
+        Nothing happens if neither this file nor an earlier one is a log of trilat-net. `ours`
         remains False in this case.
 
         Args:

@@ -234,8 +234,8 @@ def _estimate_bytes(state: State) -> int:
 class RecordsByTick(Mapping[int, State]):
     """Read-only mapping from ticks (control periods) to the records of a site (arm controller).
 
-    It is used for long logs: a record is decoded only when it is accessed. If several records
-    have the same tick, the mapping contains the last of them.
+    It is used for long logs, because a record is decoded only when it is accessed. If several
+    records have the same tick, the mapping contains the last of them.
 
     Args:
         states: The K records, in the order of their ticks.

@@ -94,7 +94,7 @@ class TornChunk(NamedTuple):
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Unpacks the chunk block by block, as far as it is intact.
+        """Unpacks the intact part of the chunk block by block.
 
         A block is a piece of the compressed data that can be unpacked as a whole. A record that
         continues in the next block is yielded with the block that contains its end.
@@ -217,7 +217,7 @@ def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked blocks of a Zstandard frame, as far as they are complete.
+    """Yields the unpacked complete blocks of a Zstandard frame.
 
     A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The head of a block has
     3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
@@ -241,7 +241,7 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
 
 
 def _unpack_lz4(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked data of an LZ4 frame, page by page, as far as they are complete."""
+    """Yields the unpacked data of an LZ4 frame by pages, up to the first incomplete part."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     for page in _iterate_pages(packed):
         yield unpacker.decompress(page)

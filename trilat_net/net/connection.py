@@ -397,9 +397,9 @@ class Connection:
             The connection, with the keys.
 
         Raises:
-            UsageError: One of three cases: The keys cannot be used. There are keys, but an
-                endpoint is not encrypted or the user's settings contradict the keys. There are
-                no keys, although other machines can reach an endpoint.
+            UsageError: The keys cannot be used or contradict the user's settings, an endpoint
+                is not encrypted although there are keys, or other machines can reach an
+                endpoint although there are no keys.
         """
         if isinstance(keys, str | Path):
             from .member_keys import read_member_keys  # takes time: it loads cryptography

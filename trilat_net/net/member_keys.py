@@ -12,9 +12,9 @@ access rules are derived. No other user of the machine can read the private key 
 in the folder. The private key of the authority has a separate folder, which should be stored
 safely.
 
-The validity of the keys ends one day earlier than that of their certificate. During this day,
-no member can start with the keys, but `trilat stop` can still connect and stop the arms. Zenoh
-needs a valid certificate for each new connection, and each time a connection is opened again.
+The keys expire one day earlier than their certificate. During this day, no member can start
+with the keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid
+certificate for each new connection, and each time a connection is opened again.
 """
 
 import datetime
@@ -149,13 +149,13 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Checks names of members (processes of a session), and returns what is wrong with them.
+    """Checks names of members (processes of a session), and describes the first fault.
 
     Args:
         members: The names.
 
     Returns:
-        The first fault, as a sentence for the user. Empty if all names are valid.
+        The fault, as a sentence for the user. Empty if all names are valid.
     """
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)

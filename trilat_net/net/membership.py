@@ -1,4 +1,4 @@
-"""Finds out which processes take part in a session, and which of them are present.
+"""Determines which processes take part in a session, and which of them are present.
 
 These processes are called members. A member is a site, which runs one arm and its control loop,
 or a recorder, which writes the log. Members find each other in two ways. Each member declares a

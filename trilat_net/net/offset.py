@@ -224,8 +224,8 @@ class OffsetEstimator:
                 the stored limits.
 
         Returns:
-            The estimate. None if there is no ceiling or no floor: the offset is then not
-            limited on both sides.
+            The estimate. None if there is no ceiling or no floor, because the offset is then
+            limited on one side at most.
         """
         while self._ceilings and self._floors:
             lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
@@ -496,7 +496,7 @@ class SlewedOffset:
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
-        """Lets the offset approach a new estimate gradually, instead of jumping to it.
+        """Makes the offset approach a new estimate gradually, instead of jumping to it.
 
         The offset reaches the estimate after the time SLEW_NS, and then follows its drift.
 

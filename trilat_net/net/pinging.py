@@ -66,7 +66,7 @@ class RepeatedQuery:
         return True
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns the next reply to the query that has arrived, without waiting.
+        """Returns the next reply that has arrived for the query, without waiting.
 
         Returns:
             The time at which the query was sent in ns, the key and the payload of the reply.

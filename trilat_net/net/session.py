@@ -56,7 +56,7 @@ LATE_GATHER_NS = 1_500_000_000
 
 
 class SessionJoin:
-    """Lets one process join a session, and finds the epoch, the common time of tick 0.
+    """Makes one process join a session, and finds the epoch, the common time of tick 0.
 
     The process first declares its subscriptions, because the other members may send messages to
     it as soon as they know it. It then creates this object, which announces the process, and
@@ -101,7 +101,7 @@ class SessionJoin:
         # The newest request of this site to join a running session: its event and its epoch.
         self._coming: tuple[Event, Epoch] | None = None
         self._admitted_by: set[str] = set()  # running sites that have granted that request
-        self._admitted_boots: dict[str, int] = {}  # boots of others that joined meanwhile
+        self._admitted_boots: dict[str, int] = {}  # boots of other sites that joined since then
 
         # What this member receives from the others.
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)

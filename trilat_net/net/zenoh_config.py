@@ -501,7 +501,7 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Finds out which settings Zenoh refuses, by trying each setting alone.
+    """Finds the settings that Zenoh refuses, by trying each setting alone.
 
     Args:
         settings: Settings below `path`.

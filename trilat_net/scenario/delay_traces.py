@@ -175,7 +175,7 @@ def read_trace(path: Path, link: str) -> str:
         link: Name of the link whose delays are taken from a log, for example "m1->s".
 
     Returns:
-        The trace in the text form of `format_trace`.
+        The trace as text in the format of `format_trace`.
 
     Raises:
         ScenarioError: The file cannot be read, or contains no trace.
@@ -243,7 +243,7 @@ def format_trace(points: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Converts the text form of a delay trace to an array.
+    """Converts a delay trace from text to an array.
 
     A delay trace is a table of send times and the delay that each message had. The result is
     cached, because the trace of a link is needed many times.

@@ -534,7 +534,7 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns what happens if an arm is stopped, as ends of sentences.
+    """Returns descriptions of an arm's motion after a stop, as ends of sentences.
 
     They say when the arm comes to rest, and whether its motors are strong enough.
     """

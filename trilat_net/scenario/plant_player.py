@@ -80,8 +80,8 @@ class _PlantProgram(Protocol):
     def poses(self) -> Sequence[Sequence[float]]:
         """Returns the current poses of the bodies that the model moves in addition to the arm.
 
-        The order is that of `PlantContext.bodies_m`. The method is called only if there are
-        bodies.
+        The bodies have the order of `PlantContext.bodies_m`. The method is called only if there
+        are bodies.
 
         Returns:
             Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
@@ -141,7 +141,7 @@ class PlantPlayer:
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
     def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Lets the user's arm model compute the motion from one control period to the next.
+        """Computes the motion from one control period to the next by the user's arm model.
 
         The result is stored in `state`.
 

@@ -170,7 +170,7 @@ def _join_path(path: str, location: Location) -> str:
 
 
 def _describe_wrong_type(value: Any, expected: str) -> str:
-    """Explains what is wrong with a value from a scenario file that has the wrong type.
+    """Explains why a value from a scenario file has the wrong type.
 
     Args:
         value: The value as it was read from TOML.
@@ -194,7 +194,7 @@ def _describe_wrong_type(value: Any, expected: str) -> str:
 def _describe_wrong_value(
     message: str, table: Any, kind: Any, location: Location, path: str
 ) -> str:
-    """Explains what is wrong with a value that has a wrong type or is out of range.
+    """Explains why a value has a wrong type or is out of range.
 
     Args:
         message: Message of msgspec without the location.
@@ -333,7 +333,7 @@ def _isolate(table: Any, location: Location, value: Any) -> Any:
 
 
 def _value_at(table: Any, location: Location) -> Any:
-    """Returns the value at a place inside nested tables and lists."""
+    """Returns the value at a location inside nested tables and lists."""
     value = table
     for part in location:
         value = value[part]
@@ -355,7 +355,7 @@ def _find_table_for_number(table: Any, kind: Any, location: Location) -> Locatio
 
 
 def _list_hints(kind: Any, location: Location) -> list[Any]:
-    """Returns the types that a value may have at a given place of a scenario's table.
+    """Returns the types that a value may have at a location in a scenario's table.
 
     Args:
         kind: Type of the table.

@@ -389,8 +389,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def links_random(self) -> bool:
         """True if a link draws its delays, losses or duplicates at random during the run.
 
-        This includes links with such draws only after a planned change. Results then depend on
-        the seed, and one run is only an example.
+        A link also counts if it has such draws only after a planned change. Results then depend
+        on the seed, and one run is only an example.
         """
         return any(link.random for link in self._all_links())
 
@@ -578,7 +578,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def _setups(self) -> dict[str, SiteSetup]:
-        """The results of `setup` so far, by the name of the site."""
+        """The results of earlier calls of `setup`, by the name of the site."""
         return {}
 
     def _build_setup(self, site: str) -> SiteSetup:

@@ -274,7 +274,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _normalise_change(change: Change) -> Change:
-    """Returns a change with its link written in the same form as the links of the scenario.
+    """Returns a change with its link written in the same format as the links of the scenario.
 
     Authors may write 350 or 350.0. Both must give the same text, so that both are the same
     experiment with the same hash.

@@ -280,7 +280,7 @@ class IndexedRecords:
     def change_counts(self) -> NDArray[np.int32]:
         """Number of changes of settings that each record contains, shape (K,).
 
-        They are the strings of the field `cmd`. Most records contain none.
+        The changes are the strings of the field `cmd`. Most records contain no changes.
         """
         return self._counts[:, record_scan.CHANGE_COUNT]
 

@@ -61,7 +61,7 @@ _UNSIGNED, _SIGNED, _NEGATIVE = 0xCC, 0xD0, 0xE0
 
 
 def _list_sizes() -> NDArray[np.int64]:
-    """Returns the length of an encoded integer by its first byte. 0 if it is no integer."""
+    """Returns the length of an encoded integer by its first byte. 0 for other bytes."""
     sizes = np.zeros(256, np.int64)
     sizes[:_SHORT_MAP] = 1
     sizes[_NEGATIVE:] = 1
@@ -221,7 +221,7 @@ def _after_stamps(data: Bytes, offset: int, end: int) -> int:
 def _after_texts(data: Bytes, offset: int, end: int) -> int:
     """Returns the offset after a list of ASCII strings, such as the changes in a record.
 
-    The result is -1 if there is no such list. Other characters than ASCII are left to the
+    The result is -1 if there is no such list. Characters other than ASCII are left to the
     general decoder, which checks their encoding.
     """
     count = _list_count(data, offset, end)

@@ -183,7 +183,7 @@ _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
 
 
 def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
-    """Lists the names of an arm's joints, as ROS messages and the URDF for viewers state them.
+    """Lists the names of an arm's joints in ROS messages and in the URDF for viewers.
 
     Joints keep the names of their URDF. If no arm of the scenario has a URDF, the joints have
     the same names at all sites (arm controllers). The name of the site is therefore put in

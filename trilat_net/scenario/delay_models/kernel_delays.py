@@ -164,7 +164,7 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the distribution in the form in which the compiled simulation draws from it.
+        """Returns the parameters from which the compiled simulation draws the delays.
 
         For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
         / s^2, and its scale is s^2 / m.
@@ -180,7 +180,7 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the distribution in the form in which the compiled simulation draws from it.
+        """Returns the parameters from which the compiled simulation draws the delays.
 
         For the mean m and the standard deviation s, the logarithm of the delay is normal with
         the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.

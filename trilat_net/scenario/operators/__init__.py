@@ -363,7 +363,7 @@ def _check_values(
 def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: VectorCounts) -> str:
     """Returns the permitted values of a refused key, as text for the author of the scenario.
 
-    For example "one torque for both joints or two, ON the arm, N m".
+    An example is "one torque for both joints or two, ON the arm, N m".
 
     Args:
         refused: The key.

@@ -224,7 +224,7 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
         Returns:
             The setting `points` and the reason. None if every time is later than the previous
-                one.
+            time.
         """
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")
@@ -299,7 +299,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        """Returns the sines in the form that the compiled simulation reads.
+        """Returns the sines in the format that the compiled simulation reads.
 
         Each sine is a row of its frequency in Hz and its phase in turns.
         """

@@ -298,7 +298,7 @@ class HandPlayer:
 
         Args:
             k: Number of the first control period.
-            end: Number of the control period before which the result ends at the latest.
+            end: Number of the first control period that is not included in any case.
             arrays: State of the arm's process before period `k`.
 
         Returns:
@@ -308,7 +308,7 @@ class HandPlayer:
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
     def _prepare(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
-        """Lets the program that moves the arm decide, if a decision is due in control period k.
+        """Calls the program that moves the arm, if a decision is due in control period k.
 
         Returns:
             A function that returns the joint angles of the arm, in rad.
