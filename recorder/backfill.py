@@ -179,7 +179,7 @@ class GapRepair:
                 self._reception.give_up()
 
     def _probe_if_silent(self, now_ns: int) -> None:
-        """Requests the newest messages of a running site from which nothing arrives.
+        """Requests the newest messages of a running site whose messages have stopped arriving.
 
         If its last messages were lost, no later number shows a gap, so the recorder has to ask.
         The silence is counted from the last message or the last probe. A slow site may take

@@ -406,7 +406,7 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns what the arm must do because of its dead-man switch: stop, or move again.
+        """Returns the order that follows from the dead-man switch: to stop, or to move again.
 
         A dead-man switch is a button that a person holds while the arm may move. While the
         switch is released, every call returns the order to stop, until the arm has stopped for

@@ -330,7 +330,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages for sending them again, and publishes them in larger blocks.
+            """Stores messages to send them again on request, and publishes them in larger blocks.
 
             Args:
                 payloads: The encoded messages.
@@ -373,7 +373,7 @@ class SiteParts:
         return changes
 
     def _make_order_change(self, tick: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
-        """Returns the change with which an order of the site itself takes effect in a tick.
+        """Returns the change by which an order of the site itself takes effect in a tick.
 
         Such orders follow from an external arm, for example "released" if its dead-man switch
         was released. As a change, the order is part of the record, so that the run can be

@@ -519,7 +519,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return {**accounts.format_accounts(), **written_counts}
 
     def account(self, site: str) -> str:
-        """Returns how many records of a site were received and how many are missing.
+        """Returns the numbers of received and missing records of a site.
 
         The recorder counted them. They need not agree with the file if the file is damaged.
 
@@ -834,7 +834,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns which states of the other arms the user of a site saw on the screen.
+        """Returns the states of the other arms that the user of a site saw on the screen.
 
         The user usually sees the state that the control law uses. If the scenario has a table
         `[sites.NAME.view]`, the picture has its own delay, like a video that arrives later than

@@ -943,7 +943,7 @@ class ChannelMessages:
         self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns when each of the topic's K messages was sent and recorded, as arrays.
+        """Returns the arrival and sending times of the topic's K messages, as arrays.
 
         Returns:
             The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of

@@ -432,7 +432,7 @@ class McapWriter:
         self._stream.flush()
 
     def _pack_statistics(self) -> bytes:
-        """Encodes the MCAP record from which readers learn the size of the log.
+        """Encodes the MCAP record with the statistics of the file.
 
         It contains the numbers of all kinds of records, and the first and last arrival time.
         """

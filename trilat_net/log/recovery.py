@@ -152,7 +152,7 @@ class Recovery(Result):
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns what was recovered and lost as strings by name, for the recovered file.
+        """Returns the recovered data and the losses as strings by name, for the recovered file.
 
         They are stored as metadata of this file: the source file, the losses and the missing
         records. A reader can thus recognise it as a recovered log.

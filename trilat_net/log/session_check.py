@@ -124,7 +124,7 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
 
     Args:
         files: The file, or the parts of the log.
-        progress: Function that is called now and then with the number of bytes read and their
+        progress: Function that is called repeatedly with the number of bytes read and their
             total.
 
     Raises:
@@ -449,7 +449,7 @@ class _SessionCheck:
         Args:
             file: Name of the file.
             stream: The file, opened for reading.
-            progress: Function that is called now and then with the number of bytes read and
+            progress: Function that is called repeatedly with the number of bytes read and
                 their total.
 
         Raises:

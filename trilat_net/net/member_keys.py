@@ -729,7 +729,7 @@ def _write_new_file(path: Path, content: bytes) -> None:
 def _read_trusted(path: Path) -> bytes:
     """Reads a key file, after a check that no other user of the machine can change it.
 
-    A changed file would let a stranger into the session.
+    With a changed file, an unknown process could join the session.
 
     Raises:
         UsageError: Another user can change the file.

@@ -518,7 +518,7 @@ class Membership:
 
         known = self.others.get(info.member, info)
         if is_recorder and known.boot != info.boot:
-            return  # of several recorders, only the first one is a member
+            return  # of several recorders, only the first is a member
         is_in_scenario = not self._sites or info.member in self._sites
         if is_in_scenario or is_recorder:
             self.others[info.member] = info

@@ -460,7 +460,7 @@ class _SlewSegment:
 
 
 class SlewedOffset:
-    """Offset between two clocks (the other one minus the local one) that changes without steps.
+    """Offset between two clocks (other clock minus local clock) that changes without steps.
 
     Delays are computed with this offset and not with the latest estimate, because a new
     estimate would appear as a step of all delays. The smoothed offset instead approaches each
@@ -533,8 +533,8 @@ class SlewedOffset:
     def _select_segment(self, local_ns: int) -> _SlewSegment:
         """Returns the segment of the smoothed offset that holds at a local time.
 
-        There are two segments: the present approach to the latest estimate, and the one before,
-        for times that lie before the start of the present one.
+        There are two segments: the approach to the latest estimate, and the previous segment
+        for earlier times.
         """
         if local_ns >= self._segment.start_ns:
             return self._segment

@@ -149,7 +149,7 @@ class SentStamps:
         self._entries[slot + 1] = sent_ns
 
     def find_ns(self, tick: int) -> int | None:
-        """Returns when the sample of a tick was sent, on the local clock, in ns.
+        """Returns the time at which the sample of a tick was sent, on the local clock, in ns.
 
         The result is None if that time is not stored any more, or if no sample was sent in that
         tick.
@@ -436,7 +436,7 @@ ClockNotice = dict[str, Any]
 
 
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
-    """Returns how long after the start of a control period a site wakes up, in ns.
+    """Returns the delay of a site's wake-up after the start of a control period, in ns.
 
     If all sites (arm controllers) of a machine woke up at the same time, they would compete for
     its processors. The sites are spread over half of a period. A sample (sent state) of the
@@ -505,7 +505,7 @@ class SiteTiming:
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
-        """Returns how far the clocks of other sites differ at the start, as events for the log.
+        """Returns the initial offsets of other sites' clocks, as events for the log.
 
         Peers (other sites) on this machine have no offset and are left out.
 

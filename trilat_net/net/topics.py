@@ -200,7 +200,7 @@ def skipped_numbers(
     skipped: int,
     rate_hz: int,
 ) -> tuple[int, int]:
-    """Returns which numbers the messages of skipped ticks would have had.
+    """Returns the numbers that the messages of skipped ticks would have had.
 
     A site (arm controller) that is late may skip ticks, periods of its control loop, and then
     publishes no messages for them. Their numbers remain unused, and must not count as lost

@@ -381,7 +381,8 @@ class ZenohBus:
                 key replies.
             payload: Payload of the query.
         """
-        # Not a ring channel: it loses its replies when the last one has arrived.
+        # A ring channel is not used, because it loses its replies when the last reply has
+        # arrived.
         replies = self._session.get(
             key,
             handlers.FifoChannel(256),

@@ -1,4 +1,4 @@
-"""Computes which messages of other arms a controller used and a user saw, without running it.
+"""Computes which messages of other arms a controller used and a user saw, without a run.
 
 In each control period, an arm sends its state to the other arms. These messages are delayed and
 lost at random, but the random numbers follow from a seed in the scenario, the description of
@@ -274,7 +274,7 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns which state of each other arm the user sees in one control period.
+        """Returns the state of each other arm that the user sees in one control period.
 
         The states are called samples, and the other arms peers.
 
@@ -295,7 +295,7 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns which state of each other arm the user sees in each control period of a run.
+        """Returns the states of the other arms that the user sees in all control periods.
 
         The picture is delayed, so it shows states of earlier periods.
 

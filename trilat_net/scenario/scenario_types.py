@@ -688,7 +688,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the network link between two arms as the compiled simulation reads it.
+        """Returns the network link between two arms in the format of the compiled simulation.
 
         It includes the planned changes of the link.
 
@@ -725,7 +725,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns which arms an arm follows, as an integer with bit n set for arm n.
+        """Returns the arms that an arm follows, as an integer with bit n set for arm n.
 
         For example, 0b101 stands for the first and the third arm. The compiled code needs this
         compact form.

@@ -252,7 +252,7 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 
     Args:
         arm: The arm.
-        table: Table from which the arm was built. It shows which keys the author wrote.
+        table: Table from which the arm was built. The table shows which keys the author wrote.
         chains: True if the arms of the scenario are general chains of joints.
         path: Path of the table, for error messages.
     """

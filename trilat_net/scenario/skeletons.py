@@ -20,7 +20,7 @@ from .named_files import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a file with an incomplete control law to start from, and a file with its test.
+    """Writes a template of a control law, and a test of the law.
 
     The corresponding command is `trilat new law`.
 
@@ -41,7 +41,7 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a file with an incomplete operator to start from, and a file with its test.
+    """Writes a template of an operator, and a test of the operator.
 
     An operator is a program that moves an arm in place of a person. The corresponding command
     is `trilat new hand`. The arguments are those of `new_law`.
@@ -53,7 +53,7 @@ def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a file with an incomplete plant to start from, and a file with its test.
+    """Writes a template of a plant, and a test of the plant.
 
     A plant is a program that computes the motion of an arm. The corresponding command is
     `trilat new plant`. The arguments are those of `new_law`.
@@ -65,7 +65,7 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes a Python file with an incomplete class to start from, and one with its test.
+    """Writes a Python file with a template of a class, and a file with its test.
 
     Args:
         kind: "law", "hand" or "plant".

@@ -464,7 +464,7 @@ def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Int
 
 @loop_leaf
 def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
-    """Reads which samples (states of other arms) arrived, and when, from every record.
+    """Reads the arrivals of samples (states of other arms) from every record.
 
     Args:
         data: The encoded records, followed by padding.

@@ -113,7 +113,7 @@ def _pack_stamp(stamp_ns: int) -> bytes:
 
 
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
-    """Returns how a list of floats is encoded in a ROS 2 message, for the module `struct`.
+    """Returns the `struct` format of a list of floats in a ROS 2 message.
 
     Args:
         offset: Position of the list, in bytes after the header.

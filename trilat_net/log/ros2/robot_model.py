@@ -1,4 +1,4 @@
-"""Builds the model with which a viewer draws an arm: its URDF, and the poses of its links.
+"""Builds the model of an arm that a viewer draws: its URDF, and the poses of its links.
 
 URDF is an XML description of a robot by its links (bodies) and joints. A viewer draws the arms
 of all sites (processes that run one arm) in one scene. They stand in a row, `SPACING_M` apart,

@@ -11,7 +11,7 @@ The wire format has three elements:
 - A key per topic: domain / name / DDS type / hash of the type's definition.
 - An attachment of 33 bytes to each message: its number, the time of sending, and an identifier
   of the sender.
-- A liveliness token per node and per endpoint, from which other programs learn what exists.
+- A liveliness token per node and per endpoint, which shows its existence to other programs.
 
 Source: ros2/rmw_zenoh, docs/develop/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
@@ -218,7 +218,7 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the text by which ROS 2 programs see that a node exists.
+        """Returns the text that shows ROS 2 programs that a node exists.
 
         The node exists for them as long as this program declares the text to Zenoh as a
         liveliness token.

@@ -235,7 +235,7 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Delay that changes slowly: if one message is slow, the next one probably is too.
+    """Delay that changes slowly: if one message is slow, the next message is probably slow too.
 
     The delays are normally distributed and correlated from message to message. Negative delays
     become zero.

@@ -69,7 +69,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment as the compiled simulation reads it."""
+        """Returns the operator or environment in the format of the compiled simulation."""
         raise NotImplementedError
 
     @property
@@ -188,7 +188,7 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment as the compiled simulation reads it.
+        """Returns the operator or environment in the format of the compiled simulation.
 
         The simulation calls its compiled method `act`.
         """

@@ -73,7 +73,7 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
     peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
-        """Returns the pulse of torque as the compiled simulation reads it."""
+        """Returns the pulse of torque in the format of the compiled simulation."""
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
@@ -145,7 +145,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring and its moving target as the compiled simulation reads them."""
+        """Returns the spring and its moving target in the format of the compiled simulation."""
         end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
         return TorqueSource(
             TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
@@ -231,7 +231,7 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         return None
 
     def _source(self) -> TorqueSource:
-        """Returns the recorded torques as the compiled simulation reads them."""
+        """Returns the recorded torques in the format of the compiled simulation."""
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
@@ -254,7 +254,7 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
-        """Returns the sine of changing frequency as the compiled simulation reads it."""
+        """Returns the sine of changing frequency in the format of the compiled simulation."""
         return TorqueSource(
             TorqueKind.CHIRP,
             start_s=self.start_s,
@@ -361,8 +361,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """Operator who takes hold of the arm during a live session.
 
     The operator is a person with a mouse or a haptic device, or a program. Until the operator
-    takes hold, nobody holds the arm. In virtual time nobody holds the arm at all, unless a log
-    is run again in which somebody held it.
+    takes hold, nobody holds the arm. In virtual time, nobody holds the arm, except in a rerun
+    of a log in which somebody held it.
 
     The force is computed once per tick and then constant until the next tick. In the mode
     "force", the operator commands the force itself. The work of such a force has an error of
@@ -558,7 +558,7 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     damping_nm_s_rad: fields.NotNegativeJoints
 
     def _source(self) -> TorqueSource:
-        """Returns the damping of the joints as the compiled simulation reads it."""
+        """Returns the damping of the joints in the format of the compiled simulation."""
         return TorqueSource(
             TorqueKind.VISCOUS,
             self.start_s,

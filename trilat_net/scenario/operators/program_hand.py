@@ -319,7 +319,7 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what the program observes in control period k, such as the arms' states.
+        """Returns the view of the program in control period k, such as the arms' states.
 
         Args:
             k: Number of the tick.
