@@ -561,10 +561,10 @@ def test_impossible_members_change_nothing(
             add_keys(folder, ["s2"])
     assert read_files(folder) == before
 
-    with pytest.raises(UsageError, match="there is no such folder of keys"):
+    with pytest.raises(UsageError, match="is not a folder of keys"):
         add_keys(tmp_path / "nothing", ["s2"])
     shutil.move(folder / "s", tmp_path / "elsewhere")
-    with pytest.raises(UsageError, match="no folder of the member s, whose list"):
+    with pytest.raises(UsageError, match="has no folder for s, but the list of members"):
         add_keys(folder, ["s2"])
     shutil.move(tmp_path / "elsewhere", folder / "s")
     shutil.rmtree(folder / "authority")
