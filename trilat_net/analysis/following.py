@@ -69,7 +69,7 @@ def find_task_reference(
 
 
 class JointFollowing(NamedTuple):
-    """How a site that follows joint by joint turns errors into motion and torque.
+    """Converts errors to motion and torque for a site that follows joint by joint.
 
     Its coordinates are the joint angles. Therefore every function is a product with a gain, or
     the identity. `TaskFollowing` has the same methods for sites that follow with the end
@@ -158,7 +158,7 @@ class JointFollowing(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskFollowing:
-    """How a site that follows with its end effector turns errors into motion and torque.
+    """Converts errors to motion and torque for a site that follows with its end effector.
 
     The arm has n joints, and its end effector follows along some of the m coordinates of the
     task. Joints that the task leaves free move towards a preferred posture. Near singular
@@ -279,7 +279,7 @@ class TaskFollowing:
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns by how much damping near singular poses violates two equations of the proof.
+        """Returns how much the damping near singular poses violates two equations of the proof.
 
         Without damping, the equations J r = xd + Lambda e and a = dv/dt hold exactly. Here J is
         the Jacobian, r the filtered error, xd the velocity of the end effector, e its error and

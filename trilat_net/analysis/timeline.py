@@ -33,9 +33,9 @@ from ..scenario import (
 def list_effective_commands(log: Log) -> list[Change]:
     """Lists the commands of a run that changed something.
 
-    A command that sets a link or the dominance factors of a site (the weights with which it
-    follows its peers) to what is in force already changes nothing and is left out. Orders to
-    sites, such as "stop", always count.
+    A command that sets a link, or the dominance factors of a site (the weights with which it
+    follows its peers), to their present values is left out. Orders to sites, such as "stop",
+    are always included.
 
     Args:
         log: The log of the run.
@@ -75,7 +75,7 @@ def list_effective_commands(log: Log) -> list[Change]:
 
 
 class _AppliedChange(NamedTuple):
-    """A change of a setting during the run, such as another network delay, at one arm.
+    """A change of a setting at one arm during the run, such as a new network delay.
 
     The scenario planned the change, or a command requested it.
 
@@ -83,9 +83,10 @@ class _AppliedChange(NamedTuple):
         change: The change of a link or of dominance factors, or the order to a site, with its
             time.
         site: The site that carried it out.
-        taken_at_tick: Tick of the record that names the change. None for a change that was
+        taken_at_tick: Tick of the record that names the change. `None` for a change that was
             planned in the scenario.
-        sentence: A sentence for people. It names whoever ordered the change, if known.
+        sentence: A sentence for users. It names the person or program that ordered the change,
+            if known.
     """
 
     change: Change
@@ -95,7 +96,7 @@ class _AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """What was changed: a link such as "m1->s", a site, or the shares of a site.
+        """The object that was changed: a link such as "m1->s", a site, or the shares of a site.
 
         The shares are the dominance factors with which the site follows its peers, for example
         "shares of s".
@@ -104,11 +105,11 @@ class _AppliedChange(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A phrase for the user: what applies after the change.
+        """A phrase for the user that describes the state after the change.
 
-        For an order to a site, it is the order and its length, for example "hold, 500 ticks".
-        For a link, it describes the new delay, and for shares it lists the new shares with the
-        time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
+        For an order to a site, the phrase is the order and its length, for example "hold, 500
+        ticks". For a link, it describes the new delay, and for shares it lists the new shares
+        with the time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
         """
         change = self.change
         if change.order:
@@ -162,8 +163,8 @@ class StatedModel(NamedTuple):
 def list_changes(log: Log) -> list[_AppliedChange]:
     """Lists all changes before the end of a run, in the order in which they took effect.
 
-    The records also name ticks that a site had to skip. Such an entry is included only if the
-    site skipped so many ticks that it held its position.
+    The records also name ticks that a site had to skip. They are included only if the site
+    skipped so many ticks that it held its position.
 
     Args:
         log: The log of the run.
@@ -292,7 +293,7 @@ class _RaisedAlarm(NamedTuple):
 def list_alarms(log: Log) -> list[_RaisedAlarm]:
     """Lists the alarms of all arms, in the order of their start.
 
-    If somebody ordered an arm to stop, the reason of the alarm names this person.
+    If a person ordered an arm to stop, the reason of the alarm names this person.
 
     Args:
         log: The log of the run.

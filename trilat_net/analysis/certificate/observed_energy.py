@@ -39,11 +39,15 @@ from .premise_quantities import (
 )
 
 LEAST_ENERGY_J = -1e-9
-"""Rounding error of an energy that is zero, in J. It is negative, as lower bounds use it."""
+"""Rounding error of an energy that is zero, in J. It is negative because it serves as a lower
+bound.
+"""
 ROUNDING_SHARE = 1e-12
-"""Further rounding error, as a share of the largest energy."""
+"""Additional rounding error, as a share of the largest energy."""
 SAMPLING_SHARE = 1e-2
-"""Energy that an arm may get beyond what its law books, as a share of the largest energy."""
+"""Largest energy that an arm may receive and its law does not count, as a share of the largest
+energy.
+"""
 
 
 class ObservedFinding(Enum):
@@ -61,7 +65,7 @@ class ObservedFinding(Enum):
 
     @property
     def meaning(self) -> str:
-        """What the finding means for a run, for the user. Empty if it needs no explanation.
+        """Explanation for the user of what the finding means for a run. Empty if it needs none.
 
         The package `presentation` writes it, in the same words wherever it is explained.
         """
@@ -107,7 +111,7 @@ class _EnergyCurve(NamedTuple):
 
 
 class _LeastEnergy(NamedTuple):
-    """Smallest value over time of an energy that must never be negative.
+    """Minimum over time of an energy that must never be negative.
 
     An example is the level of an energy tank, from which a control law takes the energy that it
     adds.
@@ -132,7 +136,7 @@ class _LeastEnergy(NamedTuple):
         return _name_energy(self.kind, self.site, self.peer)
 
     def to_json(self) -> JsonObject:
-        """Returns the minimum as values for JSON."""
+        """Converts the minimum to plain values for JSON."""
         return {"name": self.name, "amount_j": self.amount_j, "at_s": self.at_s}
 
 
@@ -150,22 +154,22 @@ class ObservedEnergy(NamedTuple):
     """Judgement of a run by the energies that its control laws declare, such as an energy tank.
 
     `ObservedEnergy.of_log` computes the declared energies, and compares them with recorded
-    torques and motion. A law that never gives back more energy than it took supports the
-    stability of the run.
+    torques and motion. If a law never gives back more energy than it took, this is evidence
+    that the run is stable.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
         premises: The conditions under which the energies count as evidence, each checked.
-        least: Minimum over time of every energy.
+        least: Minimum of every energy over time.
         largest_j: Largest of all energies, in J.
         residual_j: Largest difference between the energy that a law dissipated and the sum of
             the other energies that it declares, in J.
-        sampling_j: Largest energy that an arm received and its law did not count, in J. It
-            arises between ticks.
+        sampling_j: Largest energy that an arm received and its law did not count, in J. Such
+            energy arises because the torque is constant between ticks.
         curves: Every energy over time, and the energies that the arms gave to their laws.
         undeclared_sites: Sites whose laws declare no energies, although others do. The energies
             are then not judged.
-        incomplete_sites: Sites of which records are missing, so that the energies are not
+        incomplete_sites: Sites with missing records, because of which the energies are not
             judged.
     """
 
@@ -187,8 +191,8 @@ class ObservedEnergy(NamedTuple):
     def to_json(self) -> JsonObject:
         """Returns the verdict, its premises and the least energies as values for JSON.
 
-        The energies over time are left out, because they have a value per tick and serve for
-        figures.
+        The energies over time are left out, because they have a value per tick and are meant
+        for figures.
         """
         return {
             "finding": self.finding.name.lower(),
@@ -214,7 +218,7 @@ class ObservedEnergy(NamedTuple):
                 their code.
 
         Returns:
-            The verdict. None if no law declares energies.
+            The verdict. `None` if no law declares energies.
 
         Raises:
             LogError: A record cannot be read.
@@ -243,7 +247,7 @@ class ObservedEnergy(NamedTuple):
 
 
 class _SiteBooks(NamedTuple):
-    """Energies that a control law declares, next to those that follow from the records.
+    """Energies that a control law declares, together with those that follow from the records.
 
     Arrays have the shape (K,) and are in J. They start at the first tick (control period).
 
@@ -253,7 +257,7 @@ class _SiteBooks(NamedTuple):
         port: Energy that the arm gave to the law, according to the law.
         taken: Energy that the law dissipated.
         residual: Part of the dissipated energy that the other declared energies do not explain.
-        leak: Energy that the arm got beyond what the law counts.
+        leak: Energy that the arm received and the law does not count.
     """
 
     t_s: Array
@@ -311,7 +315,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
 
     arm_gave = -sum_work(held_torque, records.q)
     if site_setup.theta_known:
-        # holding the arm against gravity is no work of the law
+        # the torque that holds the arm against gravity is not counted as work of the law
         potential = build_arm_rows(log.scenario, site).potential_energy(records.q)
         arm_gave += declared.gravity * (potential - potential[0])
     arm_gave *= declared.weight
@@ -399,7 +403,7 @@ def _read_law_memory(
     site_log = log[site]
     rule = log.scenario.sites[site].on_stale.rule
     life_length = site_log.layout.count_life_memory(len(site_log.peers), degrades=rule.degrades)
-    # the law's memory follows the memory of the session's life, or of the reference
+    # the law's memory comes after the memory of the session state or of the reference
     first = site_log.layout.shared + 1
     if rule.action is StaleAction.GLIDE:
         first = life_length
@@ -559,7 +563,7 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
 def _largest_residual_j(account: _SiteBooks) -> float:
     """Returns the largest error in the energies that a control law declares, in J.
 
-    The energies must add up: the dissipated energy equals the sum of the others.
+    The energies must add up: the dissipated energy must equal the sum of the others.
     """
     return float(np.abs(account.residual).max())
 
@@ -568,8 +572,8 @@ def _check_books(log: Log, accounts: Mapping[str, _SiteBooks], scale_j: float) -
     """Checks the conditions under which the declared energies count as evidence.
 
     - books: the energies that each law declares add up;
-    - torque: each law books the torque that the arm received, even if it was cut off;
-    - sampling: arms get little energy between the ticks beyond what their laws book.
+    - torque: each law counts the torque that the arm received, even if the torque was cut off;
+    - sampling: arms receive little energy between the ticks that their laws do not count.
 
     Args:
         log: The log of the run.

@@ -24,7 +24,7 @@ torque, and h the tick. Both schemes store a number eta with eta_{k+1} = eta_k +
 
 The law `sync` uses the estimate eta_k + h/2 f_k in either scheme.
 
-A control law that a user wrote may have a memory, the numbers m_k that it stores at tick k. The
+A control law that a user wrote may have a memory, the values m_k that it stores at tick k. The
 memory takes the place of eta, with the rate f_k = (m_k - m_{k-1}) / h.
 
 Invariant:
@@ -291,7 +291,7 @@ DRAWN_SPAN_S = 30.0
 _LEAST_SPAN_S = 0.5
 """Shortest analysed span, in s.
 
-Shorter periods, and periods shorter than twice the ages, are repeated.
+If the period is shorter than this, or shorter than twice the ages, it is repeated.
 """
 _PART_TICKS = 100
 """Ticks of the fastest site after which columns are scaled.
@@ -307,16 +307,16 @@ _RESIDUAL = 1e-9
 _LOOSE_RESIDUAL = 1e-4
 """Largest residual once the Krylov space has its largest dimension."""
 _SMALLEST = 1e-7
-"""Smallest multiplier that is searched, as a share of the largest."""
+"""Smallest multiplier that is considered, as a share of the largest."""
 _SAME_ROOT = 1e-6
 """Largest absolute or relative difference of roots that count as equal."""
 
 
 class SamplesInUse(NamedTuple):
-    """Which message of each other arm every arm uses, in every tick of a span of time.
+    """The messages that every arm uses from each other arm, in every tick of a span of time.
 
     A tick is one period of a control loop. A sample is the message with an arm's state in one
-    tick. At the beginning of the span, all arms have a tick.
+    tick. At the beginning of the span, the ticks of all arms coincide.
 
     Attributes:
         span_s: Length of the span, in s.
@@ -324,7 +324,7 @@ class SamplesInUse(NamedTuple):
             an entry for each tick of site i. The sample that site j sends at the beginning of
             the span has the number 0.
         period_s: Time after which the pattern of ticks and delays repeats, in s. The span
-            contains it a whole number of times. None if the pattern does not repeat.
+            contains it a whole number of times. `None` if the pattern does not repeat.
         is_exact: True if the pattern repeats exactly, False if it repeats to within half a tick
             or not at all.
     """
@@ -336,7 +336,7 @@ class SamplesInUse(NamedTuple):
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Finds which samples of the other sites each site uses, in every tick of a span of time.
+    """Finds the samples of the other sites that each site uses, in every tick of a time span.
 
     A sample is the state that a site sends in one tick (period of its control loop). The
     pattern of used samples repeats after some time, and the span consists of whole repetitions.
@@ -454,7 +454,7 @@ def _plan_parts(
         stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
-                # as far as the peers' samples suffice that have been computed so far
+                # as far as the samples of the peers that have been computed so far suffice
                 known_until = [computable[i, j][done[j]] for j in peers[i]]
                 until = min([stop, *known_until])
                 first = done[i]
@@ -466,7 +466,7 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """Effect of one arm on another, and which of its messages the other uses at each tick.
+    """Effect of one arm on another, and the message of it that the other arm uses at each tick.
 
     A tick is a period of the control loop.
 
@@ -499,7 +499,7 @@ class _Tracks(NamedTuple):
 class _SpanMap:
     """The linear map of small motions from the start of a span of time to its end.
 
-    The sites act on each other by few numbers only. The sent values of a site are r_i
+    The sites act on each other through few quantities only. The sent values of a site are r_i
     combinations of its n_i states, from which the effects on all other sites follow. A column
     contains one motion: for each site, its sent values of the last ticks, as far back as a peer
     uses them, and then its present states. The matrix of the map would be very large, because
@@ -608,7 +608,7 @@ class _SpanMap:
     def divide_out_constant(self, V: Array) -> Array:
         """Removes motions that never change, such as a constant offset, from columns of states.
 
-        Their multipliers are exactly 1. Without them, the search finds the moving roots.
+        Their multipliers are exactly 1. After their removal, the search finds the other roots.
 
         Args:
             V: Columns, shape (size, columns).
@@ -672,7 +672,7 @@ class _SpanMap:
     ) -> tuple[Array, list[Array]]:
         """Computes how small motions of the arms develop over the analysed span of time.
 
-        If they grow over one span, they grow without limit, because the spans repeat.
+        Motions that grow over one span grow without limit, because the spans repeat.
 
         Args:
             V: Motions at the start of the span, shape (size, columns).
@@ -830,7 +830,7 @@ def compute_sampled_spectrum(
     wanted: int = 6,
     uses: SamplesInUse | None = None,
 ) -> Spectrum | None:
-    """Computes the rightmost characteristic roots of coupled arms with controllers in ticks.
+    """Computes the rightmost characteristic roots of coupled arms with sampled controllers.
 
     A tick is one period of the control loop. A small motion is followed over a span of T
     seconds, after which the pattern of delays and ticks repeats. This gives a linear map of the
@@ -840,11 +840,11 @@ def compute_sampled_spectrum(
         conditions: The sites (processes that each run one arm), gains and delays.
         rest: The pose of rest about which the loop is linearised.
         wanted: Number of roots. Fewer result if the others are too close to -infinity.
-        uses: Which samples of the other sites each site uses. None to derive this from the
-            links.
+        uses: The samples of the other sites that each site uses. If `None`, they are derived
+            from the links.
 
     Returns:
-        The roots. None if a control law can be linearised in continuous time only.
+        The roots. `None` if a control law can be linearised in continuous time only.
     """
     if conditions.has_forms:
         return None
@@ -860,8 +860,8 @@ class SampledLoop:
     Args:
         conditions: The sites (processes that each run one arm), gains and delays. All control
             laws can be linearised in ticks.
-        uses: Which samples of the other sites each site uses. None to derive this from the
-            links.
+        uses: The samples of the other sites that each site uses. If `None`, they are derived
+            from the links.
     """
 
     def __init__(
@@ -887,7 +887,7 @@ class SampledLoop:
         uses = self._uses
         span_s: float | None = uses.period_s or uses.span_s
         if uses.period_s is not None and uses.period_s * max(self._rates_hz) < 1.5:
-            # every tick is like the tick before
+            # every tick is like the previous tick
             span_s = None
 
         loop = couple_ticks(self._conditions, rest)
@@ -941,10 +941,12 @@ class SampledLoop:
 
         Args:
             pose: The pose about which the loop is linearised.
-            scale_per_s: The error is about a thousandth of this rate or less, in 1/s.
+            scale_per_s: Rate, in 1/s, that sets the accuracy: the error is at most about a
+                thousandth of it.
 
         Returns:
-            The real part, in 1/s. None if no root moves.
+            The real part of the rightmost root, in 1/s. `None` if all roots are zero by
+            structure.
         """
         loop = couple_ticks(self._conditions, pose)
         if not loop.names:
@@ -993,7 +995,8 @@ def _find_roots(
         span: The map.
         start: Columns from which the search of modes starts, shape (size, columns).
         span_s: Length of the span, in s.
-        wanted: Number of moving roots. Roots at zero are found in addition.
+        wanted: Number of roots that are not zero by structure. Roots at zero are found in
+            addition.
         largest_residual: Largest residual of a multiplier, relative to its modulus.
 
     Returns:
@@ -1084,7 +1087,7 @@ def _describe_modes(
 
 
 def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
-    """Returns how far the strongest frequency of a motion is from its principal root.
+    """Returns the distance from the principal root of a motion to its strongest frequency.
 
     The multiplier of a period determines a frequency only up to multiples of 2 pi / period. The
     strongest frequency selects one of them.
@@ -1105,13 +1108,13 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first known root that is equal to a new one, or None.
+    """Returns the index of the first known root that is equal to a new one, or `None`.
 
     A root is a complex growth rate of small motions. Equal roots must not be counted twice.
 
     Args:
         roots: The known roots.
-        s: A root, in 1/s. It may differ by `_SAME_ROOT`.
+        s: The new root, in 1/s. Roots that differ by at most `_SAME_ROOT` count as equal.
     """
     for index, known in enumerate(roots):
         if abs(known.s - s) <= _SAME_ROOT * (1.0 + abs(s)):

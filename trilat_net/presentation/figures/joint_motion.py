@@ -43,7 +43,7 @@ from .figure_entry import draws, unless
 _ROW_IN = 1.2
 """Height of every further row of panels, in inches."""
 _TRANSPOSED = {"col": "row", "none": "none"}
-"""Which panels share their value axis after rows and columns have been exchanged."""
+"""Setting for shared value axes after rows and columns have been exchanged."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
 """Smallest lower end of the axis of errors, in rad."""
 _PLANES = ((0, 1), (0, 2), (1, 2))
@@ -51,13 +51,13 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 _LOOP_PT = 0.8
 """Width of a line that crosses itself, in pt."""
 _PATH_STEP = 0.01
-"""Distance between two points of a thinned path, as a share of the extent of the path."""
+"""Distance between two points of a thinned path, relative to the extent of the path."""
 _LINK_PANEL_PT = 5.5
 """Type size of titles and time labels in the figure of link parameters, in pt."""
 NO_OPERATOR = "no site has an operator in this run"
 
 explain_absent_operator = unless(plot_signals.sites_with_operator, NO_OPERATOR)
-"""Returns the reason why a log has no torque of an operator. Empty if it has one."""
+"""Returns the reason why a log has no torque of an operator. Empty if it has such a torque."""
 
 
 @draws(
@@ -119,7 +119,7 @@ def draw_operator_displacement(
     Args:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
-        twin: The run without operators. None to simulate it.
+        twin: The run without operators. `None` to simulate it.
     """
     run_without_operators = simulate_without_operators(log) if twin is None else twin
     return _draw_joints(
@@ -135,8 +135,8 @@ def draw_operator_displacement(
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques that the controllers command at the joints of all arms, in N m.
 
-    They do not include the torques of operators and walls. If a controller reached its torque
-    limit, the limit is drawn too.
+    These torques do not include the torques of operators and walls. If a controller reached its
+    torque limit, the limit is drawn too.
 
     Args:
         log: Log of the run.
@@ -466,8 +466,8 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
     """Draws the estimates of the arms' inertial parameters over time, with the true values.
 
     Adaptive control laws estimate these parameters while the arm moves. The figure has the
-    estimates of all sites, whereas Fig. 6 of the paper has those of master 1. An arm in space
-    (a chain) has a row of panels per link, or two rows per link in a narrow figure.
+    estimates of all sites, whereas Fig. 6 of the paper shows only those of master 1. An arm in
+    space (a chain) has a row of panels per link, or two rows per link in a narrow figure.
 
     Args:
         log: Log of the run.

@@ -3,7 +3,7 @@
 A linear model describes small motions of the coupled arms around a pose of rest.
 
 - `draw_port_impedance` draws the impedance that operators feel at the joints that they move,
-  and `draw_port_passivity` whether the arms could supply energy to operators.
+  and `draw_port_passivity` shows whether the arms could supply energy to operators.
 - `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
   executed in ticks (periods of the control loop). A root with a positive real part means that
   the arms are unstable.
@@ -47,16 +47,18 @@ _PROOF: dict[str, Any] = {
     "linestyle": (0, (5, 1.5, 1, 1.5)),
 }
 _MAX_SHOWN_PARAMETER = 2.5
-"""Upper end of the axis of Llewellyn's parameter. All values far above 1 mean the same."""
+"""Upper end of the axis of Llewellyn's parameter. Differences between values far above 1 do not
+matter.
+"""
 _CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
-"""Ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
+"""Axis ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the impedance that operators feel along every joint over frequency.
 
-    The impedance is the ratio of force to velocity. A joint has a panel of the magnitude above
-    a panel of the phase. The panels of many joints are arranged in several rows.
+    The impedance is the ratio of force to velocity. For each joint, a panel of the magnitude is
+    above a panel of the phase. The panels of many joints are arranged in several rows.
 
     Args:
         ports: Analysis of the ports, the places at which operators hold the arms.
@@ -340,7 +342,7 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        spectrum: The roots, of which each complex pair is listed once.
+        spectrum: The roots. Each complex pair is listed once.
         mark: Marker of Matplotlib.
         colour: Colour of the markers.
         label: Text in the legend.
@@ -362,7 +364,7 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
 _MARKS = ("o", "s", "^", "v")
 _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
 _TRANSPORT_STEP = 0.22
-"""Distance between the transports of one case, in distances between cases."""
+"""Distance between the transports of one case, relative to the distance between cases."""
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
